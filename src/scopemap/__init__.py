@@ -1,0 +1,1 @@
+"""scopemap: from a monocular endoscope video to camera poses and a tissue surface."""

@@ -1,0 +1,53 @@
+"""Camera models: points to pixels and back.
+
+OpenCV axes (x right, y down, z forward) and pixel centres (the top-left pixel's centre is (0, 0)). A model projects
+points of any unit and unprojects to rays with z = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Pinhole camera: focal lengths and principal point in px, image size in px."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The (3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """(H, W, 3) float32 rays with z = 1, one per pixel."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return self.unproject(np.stack([u, v], -1)).astype(np.float32)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN for points not in front of the camera."""
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        return np.stack([self.fx * points[..., 0] / z + self.cx, self.fy * points[..., 1] / z + self.cy], -1)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2)."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], -1)
+
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        sx, sy = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return PinholeCamera(self.fx * sx, self.fy * sy, cx, cy, width, height)

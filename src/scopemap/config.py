@@ -1,0 +1,254 @@
+"""Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
+
+Order of precedence: defaults < preset < TOML file < single settings (`--set odometry.huber=2`). An unknown key is an
+error that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its constants (section "WEMA-RTDL"),
+so the values here were chosen by measurement (BENCHMARK.md).
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from scopemap.errors import SettingsError
+
+Preset = Literal["paper", "default", "realtime"]
+
+
+class Settings(BaseModel):
+    """A group of settings: frozen, validated, no unknown key."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class MaskSettings(Settings):
+    """Which pixels count as usable tissue."""
+
+    field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
+    dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
+    bright_level: int = Field(250, ge=0, le=255, description="level of the brightest channel that counts as saturated")
+    highlights: bool = Field(True, description="find specular highlights and leave them out")
+    highlight_ratio: float = Field(1.6, gt=1, description="brightness over the local median that makes a highlight")
+    highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
+    border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
+
+
+class DepthSettings(Settings):
+    """Where depth comes from and what fixes its scale."""
+
+    backend: str = Field("shading", description="shading | depth-anything | depth-pro | files:FOLDER")
+    model: str = Field("", description="hub id or local folder for the network back ends; empty: the pinned default")
+    anchor: Literal["auto", "near-far", "depth-pro", "shading"] = Field(
+        "auto", description="metric anchor of frame 1; auto: near-far if given, else shading"
+    )
+    near_far_mm: tuple[float, float] | None = Field(None, description="nearest and farthest tissue in frame 1, mm")
+    fit_shift: bool = Field(True, description="fit scale and shift to the anchor; False: the paper's baseline only")
+    files_kind: Literal["auto", "disparity", "depth", "measured"] = Field(
+        "auto", description="auto: 8 bit is disparity, else measured depth; depth: predicted, its scale may float"
+    )
+    files_scale_mm: float | None = Field(None, gt=0, description="mm per unit of depth files; None: found or assumed")
+    shading_median_mm: float = Field(35.0, gt=0, description="stated prior: median distance of tissue in frame 1, mm")
+    shading_exponent: float = Field(0.5, gt=0, le=1, description="distance = k * brightness^-exponent")
+    max_depth_mm: float = Field(300.0, gt=0, description="depth beyond this is unknown")
+
+
+class MapisSettings(Settings):
+    """Depth consistency over time (METHOD section MAPIS-Depth)."""
+
+    order: Literal["track-first", "refine-first"] = Field(
+        "track-first", description="refine-first is the paper's: warp values as they are, then track"
+    )
+    frame_scale: Literal["auto", "none", "robust"] = Field(
+        "auto", description="robust scale of each frame against the warped previous depth; auto: not for measured depth"
+    )
+    blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = Field(
+        "auto", description="weight of the warped depth; auto: exponential, none for measured depth"
+    )
+    tau: float = Field(0.15, gt=0, description="LPIPS distance at which the exponential weight falls to 1/e")
+    constant_weight: float = Field(0.5, ge=0, le=1, description="weight of the warped depth with blend = constant")
+    recursive: bool = Field(True, description="warp the refined previous depth; False: the unrefined, as the paper")
+    compare_warped: bool = Field(True, description="LPIPS of the warped previous image; False: of the images as are")
+    perceptual_score: bool = Field(False, description="one LPIPS score per pair instead of the map")
+    filter_sigma_px: float = Field(2.0, ge=0, description="sigma_d of the bilateral filter, px; 0: off")
+    filter_sigma_mm: float = Field(2.0, gt=0, description="sigma_r of the bilateral filter, mm")
+    consistency_px: float = Field(1.0, gt=0, description="largest forward-backward flow error, px")
+
+
+class NetworkSettings(Settings):
+    """Flow and perceptual networks."""
+
+    flow: str = Field("dis", description="raft-small | raft-large | dis | none")
+    flow_iterations: int = Field(12, ge=1, description="RAFT's refinement steps")
+    perceptual: Literal["auto", "lpips", "structure"] = Field(
+        "auto", description="lpips: AlexNet; structure: local structural similarity, no weights; auto: what is at hand"
+    )
+    device: str = Field("auto", description="auto | cpu | cuda")
+
+
+class OdometrySettings(Settings):
+    """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
+
+    keyframe_every: int = Field(5, ge=1, description="every n-th frame becomes a keyframe (the paper's first alpha: 2)")
+    levels: int = Field(5, ge=1, description="pyramid levels, factor 0.5")
+    finest_level: int = Field(1, ge=0, description="0: full working size, 1: half")
+    min_side_px: int = Field(16, ge=4, description="no level with a shorter side than this")
+    rotation_first: bool = Field(True, description="SO(3) only at the coarsest level")
+    solver: Literal["dogleg", "gauss-newton"] = "dogleg"
+    max_iterations: int = Field(30, ge=1, description="steps per level")
+    radius: float = Field(0.1, gt=0, description="rho, first trust radius: rad, and translation over mean depth")
+    huber: float = Field(1.0, gt=0, description="Huber threshold in robust standard deviations (MAD)")
+    normalise: bool = Field(True, description="grey values minus local mean, over local deviation")
+    normalise_sigma_px: float = Field(4.0, gt=0, description="width of the local mean, px at each level")
+    lamp: bool = Field(True, description="predict the fall-off of the lamp that moves with the camera")
+    gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
+    start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
+    min_inlier_share: float = Field(0.3, ge=0, le=1, description="a frame below this is lost")
+    min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
+    max_step: float = Field(0.5, gt=0, description="largest jump between frames: rad, and mm over mean depth")
+
+
+class SmoothingSettings(Settings):
+    """WEMA: weighted mean of the last three poses, on the group (METHOD section WEMA)."""
+
+    method: Literal["none", "wema"] = "none"
+    alpha: float = Field(0.6, ge=0, le=1, description="weight of pose i")
+    beta: float = Field(0.3, ge=0, le=1, description="weight of pose i-1")
+    gamma: float = Field(0.1, ge=0, le=1, description="weight of pose i-2")
+    omega: float = Field(0.1, gt=0, description="s = 1 - exp(-i omega); frames count from 0")
+    dynamic: bool = Field(True, description="False: s = 1 (the paper's ablation without DyEMA)")
+
+    @model_validator(mode="after")
+    def _weights_sum_to_one(self) -> SmoothingSettings:
+        total = self.alpha + self.beta + self.gamma
+        if abs(total - 1.0) > 1e-6:
+            raise ValueError(f"alpha + beta + gamma must be 1, got {total:g}")
+        return self
+
+
+class FusionSettings(Settings):
+    """Volumetric fusion; voxel and truncation as Endo-Depth-and-Motion uses on the same kind of data."""
+
+    enabled: bool = True
+    voxel_mm: float = Field(1.0, gt=0)
+    truncation_mm: float = Field(5.0, gt=0)
+    max_depth_mm: float = Field(150.0, gt=0, description="depth beyond this is not fused")
+    min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
+    min_weight: float = Field(1.5, ge=0, description="voxels with less weight give no surface")
+    min_component_share: float = Field(0.02, ge=0, le=1, description="floaters below this share of the faces go")
+    every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
+
+
+class Config(Settings):
+    """All settings of a run."""
+
+    preset: Preset = "default"
+    mask: MaskSettings = MaskSettings()
+    depth: DepthSettings = DepthSettings()
+    mapis: MapisSettings = MapisSettings()
+    networks: NetworkSettings = NetworkSettings()
+    odometry: OdometrySettings = OdometrySettings()
+    smoothing: SmoothingSettings = SmoothingSettings()
+    fusion: FusionSettings = FusionSettings()
+
+    @classmethod
+    def load(
+        cls, preset: Preset = "default", file: Path | None = None, settings: dict[str, Any] | None = None
+    ) -> Config:
+        """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
+
+        `settings` maps names such as "odometry.huber" to values or to their text. Raises `SettingsError`.
+        """
+        if preset not in PRESETS:
+            raise SettingsError(f"unknown preset '{preset}': choose one of {', '.join(PRESETS)}")
+        tree: dict[str, Any] = {"preset": preset}
+        for key, value in PRESETS[preset].items():
+            _insert(tree, key, value)
+        if file is not None:
+            for key, value in _flatten(_read_toml(file)).items():
+                _insert(tree, key, value)
+        for key, value in (settings or {}).items():
+            _insert(tree, key, value)
+        try:
+            return cls.model_validate(tree)
+        except ValidationError as error:
+            raise SettingsError("; ".join(_explain(item) for item in error.errors())) from None
+
+    def replace(self, **settings: Any) -> Config:
+        """Return a copy with dotted settings changed; dots are written as double underscores: `odometry__huber=2`."""
+        tree = self.model_dump()
+        for key, value in settings.items():
+            _insert(tree, key.replace("__", "."), value)
+        return type(self).model_validate(tree)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "depth.backend": "depth-anything",
+        "depth.anchor": "depth-pro",
+        "depth.fit_shift": False,
+        "mapis.order": "refine-first",
+        "mapis.frame_scale": "none",
+        "mapis.blend": "linear",
+        "mapis.recursive": False,
+        "mapis.compare_warped": False,
+        "networks.flow": "raft-large",
+        "networks.perceptual": "lpips",
+        "odometry.keyframe_every": 2,
+        "odometry.finest_level": 0,
+        "odometry.normalise": False,
+        "odometry.lamp": False,
+        "odometry.gain_bias": False,
+        "odometry.start": "identity",
+        "smoothing.method": "wema",
+    },
+    "realtime": {
+        "networks.flow": "dis",
+        "networks.perceptual": "structure",
+        "odometry.max_iterations": 15,
+        "fusion.voxel_mm": 1.5,
+        "fusion.every": 2,
+    },
+}
+
+
+def setting_names() -> list[str]:
+    """Return the dotted names of all settings."""
+    return list(_flatten(Config().model_dump()))
+
+
+def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
+    names = setting_names()
+    if dotted not in names:
+        near = difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)
+        raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{near[0]}'?" if near else ""))
+    *groups, name = dotted.split(".")
+    for group in groups:
+        tree = tree.setdefault(group, {})
+    tree[name] = value
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(Path(file).read_text())
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"cannot read the settings in {file}: {error}") from None
+
+
+def _explain(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {error['input']!r})"

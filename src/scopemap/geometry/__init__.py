@@ -1,0 +1,1 @@
+"""Mathematics only: rigid motion, warping, alignment."""
