@@ -1,15 +1,41 @@
 """Camera models: points to pixels and back.
 
 OpenCV axes (x right, y down, z forward) and pixel centres (the top-left pixel's centre is (0, 0)). A model projects
-points of any unit and unprojects to rays with z = 1.
+points of any unit and unprojects to rays with z = 1. Lenses that bend straight lines are in `lenses.py`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
+
+
+class CameraModel(Protocol):
+    """What every camera model can do: pinhole, OpenCV, fisheye, omnidirectional."""
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The pinhole camera that agrees with this one near its principal point."""
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN for points outside the field of the model."""
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN for pixels outside the field of the model."""
+
+    def resized(self, width: int, height: int) -> CameraModel:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +48,11 @@ class PinholeCamera:
     cy: float
     width: int
     height: int
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The camera itself: a pinhole agrees with itself everywhere."""
+        return self
 
     @property
     def matrix(self) -> np.ndarray:

@@ -1,0 +1,6 @@
+"""Folder or file on disk -> sequence of (Frame, Truth or None)."""
+
+from scopemap.datasets.opening import DATASETS, open_sequence
+from scopemap.datasets.sequence import Sequence, Source, SourceFrame, SourceTruth
+
+__all__ = ["DATASETS", "Sequence", "Source", "SourceFrame", "SourceTruth", "open_sequence"]

@@ -1,0 +1,118 @@
+"""A folder of images, sorted by the numbers in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.calibration import read_calibration
+from scopemap.camera import CameraModel
+from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.errors import InputError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+FOLDER_RATE_HZ = 30.0
+_COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
+
+
+def numeric_order(path: Path) -> list[tuple[int, int, str]]:
+    """Sorting key: digits in the name count as numbers, so that 10 comes after 9."""
+    parts = re.split(r"(\d+)", path.stem)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def frame_number(path: Path) -> int | None:
+    """Return the last number in a file's name, or None."""
+    numbers = re.findall(r"\d+", path.stem)
+    return int(numbers[-1]) if numbers else None
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the colour images in `folder` in numeric order; depth, masks and hidden files are not among them."""
+    files = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    return sorted((file for file in files if not _COMPANION.search(file.stem)), key=numeric_order)
+
+
+def read_image(file: Path) -> np.ndarray | None:
+    """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
+    # imdecode also reads names that imread cannot open on some systems.
+    data = np.fromfile(file, dtype=np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+class ImageFolder:
+    """A folder of images; the layouts of data sets build on it.
+
+    The calibration is `camera.yaml` beside the images where it is there. Time stamps are frame number / 30 s. Raises
+    `InputError` where no image can be read.
+    """
+
+    name = "images"
+    pixel_aspect = 1.0
+
+    def __init__(self, path: Path, files: list[Path] | None = None) -> None:
+        self.path = path
+        self.files = image_files(path) if files is None else files
+        self.numbers = _numbers(self.files)
+        self.count: int | None = len(self.files)
+        self.notes = [f"time stamps: frame number / {FOLDER_RATE_HZ:g} s (the folder holds none)"]
+        self.warnings: list[str] = []
+        self.height, self.width = self._size()
+        self.camera: CameraModel | None = None
+        self.camera_source = ""
+        self.depth_scale_mm: float | None = None
+        calibration_file = path / "camera.yaml"
+        if calibration_file.is_file():
+            calibration = read_calibration(calibration_file, (self.width, self.height))
+            self.camera, self.camera_source = calibration.camera, f"{calibration.source} beside the frames"
+            self.depth_scale_mm = calibration.depth_scale_mm
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether `path` is a folder with images."""
+        return path.is_dir() and bool(image_files(path))
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames; an unreadable file is left out with a warning, another size is an `InputError`."""
+        for number, file in list(zip(self.numbers, self.files, strict=True))[selection]:
+            rgb = read_image(file)
+            if rgb is None:
+                self._warn(f"{file} cannot be read and was left out")
+                continue
+            height, width = rgb.shape[:2]
+            if (width, height) != (self.width, self.height):
+                raise InputError(
+                    f"reading {file}: it is {width}x{height} px, those before it {self.width}x{self.height} px; "
+                    "a sequence needs frames of one size"
+                )
+            yield SourceFrame(number, number / FOLDER_RATE_HZ, rgb, file.name)
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """A plain folder knows no truth."""
+        return None
+
+    def _size(self) -> tuple[int, int]:
+        for file in self.files:
+            image = read_image(file)
+            if image is not None:
+                return image.shape[0], image.shape[1]
+        found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
+        raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings:
+            self.warnings.append(message)
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    """Return the files' own numbers where they have them and these increase, else their positions."""
+    numbers = [frame_number(file) for file in files]
+    known = [number for number in numbers if number is not None]
+    increase = len(known) == len(files) and all(a < b for a, b in pairwise(known))
+    return known if increase else list(range(len(files)))

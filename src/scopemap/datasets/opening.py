@@ -1,0 +1,99 @@
+"""Opening an input: which data set it is, which camera took it, which size to work at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.calibration import read_calibration
+from scopemap.camera import CameraModel
+from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.datasets.images import ImageFolder
+from scopemap.datasets.sequence import Sequence, Source, assumed_camera
+from scopemap.datasets.sevenscenes import SevenScenesFolder
+from scopemap.datasets.video import VideoFile
+from scopemap.errors import InputError
+from scopemap.rectification import Rectifier, working_camera, working_size
+
+DATASETS: dict[str, type[C3vdFolder | SevenScenesFolder | VideoFile | ImageFolder]] = {
+    kind.name: kind for kind in (C3vdFolder, SevenScenesFolder, VideoFile, ImageFolder)
+}
+"""The readers by name, in the order in which they are asked whether they recognise an input."""
+
+_SMALLEST_SIDE_PX = 32
+_DEEPEST_NESTING = 3
+
+
+def open_sequence(
+    path: Path | str,
+    *,
+    dataset: str | None = None,
+    camera: Path | str | None = None,
+    fov_deg: float = 70.0,
+    size: tuple[int, int] | None = None,
+    frames: slice | None = None,
+) -> Sequence:
+    """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
+
+    `dataset` names the reader (`DATASETS`), None: told from what lies there. The camera comes from the calibration
+    file `camera`, else from the data set, else it is a pinhole with horizontal field of view `fov_deg`. `size` is the
+    working size (width, height), px; None: the input's, divided by the smallest whole number that brings it to 400 px.
+    `frames` selects positions in the input. Raises `InputError` and `CalibrationError`.
+    """
+    selection = slice(None) if frames is None else frames
+    if selection.step is not None and selection.step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
+    source = _open_source(Path(path), dataset)
+    model, camera_source, calibrated = _camera_of(source, camera, fov_deg)
+    if size is None:
+        size, size_source = working_size(source.width, source.height), "chosen"
+    else:
+        size_source = "given (--size)"
+    if min(size) < _SMALLEST_SIDE_PX:
+        raise InputError(
+            f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
+        )
+    size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
+    rectifier = Rectifier(model, working_camera(model, size))
+    sequence = Sequence(source, source.path, rectifier, camera_source, size_source, calibrated, selection)
+    if sequence.count is not None and sequence.count < 2 and not isinstance(source, VideoFile):
+        raise InputError(f"reading {source.path}: {sequence.count} frame(s) selected, two are needed")
+    return sequence
+
+
+def _open_source(path: Path, dataset: str | None) -> C3vdFolder | SevenScenesFolder | VideoFile | ImageFolder:
+    if dataset is not None and dataset not in DATASETS:
+        raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
+    if not path.exists():
+        raise InputError(f"reading {path}: no such file or folder")
+    path = _innermost(path)
+    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
+    if (kind == VideoFile.name) != path.is_file():
+        raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
+    return DATASETS[kind](path)
+
+
+def _innermost(path: Path) -> Path:
+    """Step into a folder that holds nothing but one folder, or that keeps its frames in `images`."""
+    for _ in range(_DEEPEST_NESTING):
+        if any(kind.recognises(path) for kind in DATASETS.values()):
+            return path
+        inner = [folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
+        images = [folder for folder in inner if folder.name == "images"]
+        if len(images or inner) != 1:
+            return path
+        path = (images or inner)[0]
+    return path
+
+
+def _camera_of(source: Source, file: Path | str | None, fov_deg: float) -> tuple[CameraModel, str, bool]:
+    if file is not None:
+        calibration = read_calibration(file, (source.width, source.height))
+        return calibration.camera, calibration.source, True
+    if source.camera is not None:
+        return source.camera, source.camera_source, True
+    if not 1 <= fov_deg <= 170:
+        raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
+    focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
+    return assumed_camera(source, float(focal_px)), f"assumed: horizontal field of view {fov_deg:g} deg (--fov)", False

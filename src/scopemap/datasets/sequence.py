@@ -1,0 +1,168 @@
+"""The contract of a data set, and the sequence of rectified frames that everything above works on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.errors import CalibrationError, InputError
+from scopemap.frame import Frame, Truth, TruthQuality
+from scopemap.rectification import Rectifier, working_camera
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One image as it is in the file, not rectified.
+
+    Attributes
+    ----------
+    index : number of the frame in the input.
+    time_s : time stamp, s.
+    rgb : (h, w, 3) uint8, sRGB.
+    name : the file's own name, or "".
+    """
+
+    index: int
+    time_s: float
+    rgb: np.ndarray
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class SourceTruth:
+    """What is known to be true of an image, in the geometry of the file.
+
+    Attributes
+    ----------
+    T_world_camera : (4, 4) float64, mm, or None.
+    depth_mm : (h, w) float32 along the optical axis, of the image's view at any size, NaN = unknown; or None.
+    quality : how the truth came about.
+    """
+
+    T_world_camera: np.ndarray | None
+    depth_mm: np.ndarray | None
+    quality: TruthQuality
+
+
+class Source(Protocol):
+    """Something that holds frames: a video, a folder of one data set's layout.
+
+    Attributes
+    ----------
+    name : the data set's name.
+    width, height : size of the images, px.
+    count : number of frames, or None where only reading on would tell.
+    camera : the camera of the images, or None where it is unknown.
+    camera_source : how the camera is known, one phrase, or "".
+    pixel_aspect : width of a pixel over its height.
+    notes : what had to be assumed.
+    warnings : what was found wrong so far; grows while frames are read.
+    """
+
+    name: str
+    width: int
+    height: int
+    count: int | None
+    camera: CameraModel | None
+    camera_source: str
+    pixel_aspect: float
+    notes: list[str]
+    warnings: list[str]
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return what is known of the frame with this `SourceFrame.index`, or None."""
+
+
+def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:
+    """Return a pinhole camera with horizontal focal length `focal_px` and its axis through the image's centre."""
+    cx, cy = (source.width - 1) / 2, (source.height - 1) / 2
+    return PinholeCamera(focal_px, focal_px * source.pixel_aspect, cx, cy, source.width, source.height)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames of one input, rectified to a pinhole camera of the working size, with their truth where it is known.
+
+    Iterating yields `(Frame, Truth | None)`; frames are decoded one at a time, and it may be iterated again. Raises
+    `InputError` at the end where fewer than two frames could be read.
+
+    Attributes
+    ----------
+    source : where the frames come from.
+    path : the file or folder, as found.
+    rectifier : from the source's camera to the working camera.
+    camera_source : how the camera is known, one phrase.
+    size_source : where the working size comes from, one phrase.
+    calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
+    selection : slice over the input's frames.
+    """
+
+    source: Source
+    path: Path
+    rectifier: Rectifier
+    camera_source: str
+    size_source: str
+    calibrated: bool
+    selection: slice = field(default_factory=lambda: slice(None))
+
+    @property
+    def name(self) -> str:
+        """The input's own name: of its file or folder."""
+        return self.path.stem if self.path.is_file() else self.path.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The working camera, which every frame carries."""
+        return self.rectifier.target
+
+    @property
+    def count(self) -> int | None:
+        """Number of selected frames, or None where only reading on would tell; a video's is its header's claim."""
+        return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
+
+    @property
+    def notes(self) -> list[str]:
+        """What had to be assumed about the input."""
+        return [*self.source.notes, *([] if self.calibrated else [f"camera {self.camera_source}"])]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found wrong while reading, so far."""
+        return list(self.source.warnings)
+
+    def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
+        """Yield each frame, rectified, with its truth."""
+        found = 0
+        for item in self.source.frames(self.selection):
+            rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
+            yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name), self._truth(item.index)
+            found += 1
+        if found < 2:
+            raise InputError(f"reading {self.path}: {found} readable frame(s) in the selection, two are needed")
+
+    def with_focal(self, focal_px: float, source: str) -> Sequence:
+        """Return the sequence with another guess of an unknown camera.
+
+        `focal_px` is the horizontal focal length at the working size; `source` says how it is known. Raises
+        `CalibrationError` where the camera is known.
+        """
+        if self.calibrated:
+            raise CalibrationError(f"the focal length of {self.path} is known ({self.camera_source}); it stays")
+        camera = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
+        target = working_camera(camera, (self.camera.width, self.camera.height))
+        return replace(self, rectifier=Rectifier(camera, target), camera_source=source)
+
+    def _truth(self, index: int) -> Truth | None:
+        truth = self.source.truth(index)
+        if truth is None:
+            return None
+        depth_mm = None if truth.depth_mm is None else self.rectifier.nearest(truth.depth_mm)
+        return Truth(index, truth.T_world_camera, depth_mm, truth.quality)

@@ -1,0 +1,89 @@
+"""7-Scenes: RGB-D sequences of rooms (Shotton et al., CVPR 2013), for odometry and fusion with measured depth.
+
+`frame-NNNNNN.color.png`, `.depth.png` (uint16 mm, 65535 = unknown), `.pose.txt` (4x4 camera-to-world, metres), optional
+`camera-intrinsics.txt` (3x3).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.camera import PinholeCamera
+from scopemap.datasets.images import ImageFolder, image_files
+from scopemap.datasets.sequence import SourceTruth
+from scopemap.errors import CalibrationError, InputError
+from scopemap.geometry.se3 import orthonormalised
+
+CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
+"""The depth camera's intrinsics as published; colour is registered to it only roughly."""
+
+_UNKNOWN = (0, 65535)
+_MM_PER_METRE = 1000.0
+
+
+class SevenScenesFolder(ImageFolder):
+    """One 7-Scenes sequence, or a folder in its layout."""
+
+    name = "7-scenes"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, [file for file in image_files(path) if file.stem.endswith(".color")])
+        self._file_of = dict(zip(self.numbers, self.files, strict=True))
+        if self.camera is None:
+            file = path / "camera-intrinsics.txt"
+            self.camera = _read_intrinsics(file, (self.width, self.height)) if file.is_file() else self._published()
+            self.camera_source = "camera-intrinsics.txt" if file.is_file() else "published 7-Scenes intrinsics"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether `path` holds `frame-*.color.*` and poses beside them."""
+        return any(path.glob("frame-*.color.*")) and any(path.glob("frame-*.pose.txt"))
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return pose and measured depth; a pose that tracking lost (not finite) is None."""
+        stem = self._file_of[index].as_posix().split(".color.")[0]
+        return SourceTruth(
+            _read_pose(Path(stem + ".pose.txt")), self._depth_mm(Path(stem + ".depth.png")), "registered"
+        )
+
+    def _depth_mm(self, file: Path) -> np.ndarray | None:
+        if not file.is_file():
+            return None
+        values = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if values is None or values.dtype != np.uint16 or values.ndim != 2:
+            raise InputError(f"reading {file}: expected a depth image of one 16-bit channel")
+        depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
+        return np.where(np.isin(values, _UNKNOWN), np.nan, depth_mm).astype(np.float32)
+
+    def _published(self) -> PinholeCamera:
+        if self.width * CAMERA.height != self.height * CAMERA.width:
+            raise CalibrationError(
+                f"the 7-Scenes intrinsics are for 640x480 px, but the images are {self.width}x{self.height} px: "
+                "give a calibration (--camera)"
+            )
+        return CAMERA.resized(self.width, self.height)
+
+
+def _read_intrinsics(file: Path, size: tuple[int, int]) -> PinholeCamera:
+    K = _read_matrix(file, (3, 3))
+    return PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *size)
+
+
+def _read_pose(file: Path) -> np.ndarray | None:
+    if not file.is_file():
+        return None
+    T_world_camera = _read_matrix(file, (4, 4))
+    if not np.isfinite(T_world_camera).all():
+        return None
+    T_world_camera[:3, 3] *= _MM_PER_METRE
+    return orthonormalised(T_world_camera)
+
+
+def _read_matrix(file: Path, shape: tuple[int, int]) -> np.ndarray:
+    try:
+        return np.array(file.read_text().split(), dtype=np.float64).reshape(shape)
+    except ValueError as error:
+        raise InputError(f"reading {file}: expected {shape[0]}x{shape[1]} numbers ({error})") from None

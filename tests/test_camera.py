@@ -1,0 +1,168 @@
+"""Camera models: round trips, agreement with OpenCV, closed forms, resizing."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.lenses import FisheyeCamera, OmnidirectionalCamera, OpenCvCamera
+
+PINHOLE = PinholeCamera(520.0, 525.0, 318.0, 245.0, 640, 480)
+OPENCV = OpenCvCamera(PINHOLE, (-0.3, 0.1, 1e-3, -5e-4, -0.01))
+RATIONAL = OpenCvCamera(PINHOLE, (0.6, -0.1, -3e-4, 2e-4, 0.02, 0.9, 0.05, 0.01))
+FISHEYE = FisheyeCamera(
+    PinholeCamera(717.7, 718.0, 734.7, 552.1, 1440, 1080), (-0.1397, -0.000314, 0.001506, -0.000132)
+)
+OMNI = OmnidirectionalCamera(
+    (769.2436, 0.0, -8.12770624e-4, 6.25674244e-7, -1.19662182e-9),
+    678.5448, 542.9759, 1350, 1080, (0.99998688, 0.00288274, -0.00296316),
+)  # fmt: skip
+MODELS = {"pinhole": PINHOLE, "opencv": OPENCV, "rational": RATIONAL, "fisheye": FISHEYE, "omnidirectional": OMNI}
+
+
+@pytest.fixture(params=MODELS.values(), ids=MODELS.keys())
+def camera(request: pytest.FixtureRequest) -> CameraModel:
+    return request.param
+
+
+def grid(camera: CameraModel, step: int = 7) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
+    return np.stack([u, v], -1).astype(float)
+
+
+def test_project_undoes_unproject_over_the_whole_image(camera: CameraModel) -> None:
+    pixels = grid(camera)
+    rays = camera.unproject(pixels)
+    seen = np.isfinite(rays).all(-1)
+    assert seen.mean() > 0.9
+    np.testing.assert_allclose(rays[seen][:, 2], 1.0)
+    assert np.abs(camera.project(rays[seen]) - pixels[seen]).max() < 1e-6
+
+
+def test_project_does_not_depend_on_the_distance(camera: CameraModel) -> None:
+    rays = camera.unproject(grid(camera, 97))
+    np.testing.assert_allclose(camera.project(37.5 * rays), camera.project(rays), rtol=0, atol=1e-7)
+
+
+def test_points_behind_the_camera_have_no_pixel(camera: CameraModel) -> None:
+    assert np.isnan(camera.project(np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 0.0]]))).all()
+
+
+def test_the_principal_point_looks_along_the_axis(camera: CameraModel) -> None:
+    pixel = camera.project(np.array([0.0, 0.0, 2.0]))
+    np.testing.assert_allclose(pixel, [camera.central.cx, camera.central.cy])
+    np.testing.assert_allclose(camera.unproject(pixel), [0, 0, 1], atol=1e-12)
+
+
+def test_the_central_pinhole_agrees_near_the_axis(camera: CameraModel) -> None:
+    points = np.array([[1e-4, 0, 1], [0, 1e-4, 1], [-1e-4, 1e-4, 1]])
+    np.testing.assert_allclose(camera.project(points), camera.central.project(points), atol=3e-3 * 1e-4 * 770)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (337, 270), (1000, 300)])
+def test_resized_keeps_the_view(camera: CameraModel, size: tuple[int, int]) -> None:
+    pixels = grid(camera, 53)
+    scale = np.array(size) / np.array([camera.width, camera.height])
+    small = camera.resized(*size)
+    assert (small.width, small.height) == size
+    np.testing.assert_allclose(
+        small.unproject((pixels + 0.5) * scale - 0.5), camera.unproject(pixels), rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("camera", [OPENCV, RATIONAL], ids=["opencv", "rational"])
+def test_opencv_model_agrees_with_cv2(camera: OpenCvCamera) -> None:
+    rays = camera.unproject(grid(camera, 11)).reshape(-1, 3)
+    matrix, distortion = camera.central.matrix, np.array(camera.distortion)
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, distortion)
+    np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-9)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-13)
+    back = cv2.undistortPointsIter(expected, matrix, distortion, np.eye(3), np.eye(3), criteria)
+    np.testing.assert_allclose(rays[:, :2], back[:, 0], atol=1e-7)
+
+
+def test_fisheye_model_agrees_with_cv2() -> None:
+    pixels = grid(FISHEYE, 31).reshape(-1, 2)
+    rays = FISHEYE.unproject(pixels)
+    rays = rays[np.isfinite(rays).all(-1)]
+    matrix, distortion = FISHEYE.central.matrix, np.array(FISHEYE.distortion)
+    expected, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, distortion)
+    np.testing.assert_allclose(FISHEYE.project(rays), expected[:, 0], atol=1e-6)
+
+
+def test_omnidirectional_ray_is_the_published_formula() -> None:
+    u, v = 1000.0, 200.0
+    c, d, e = OMNI.stretch
+    a, b = np.linalg.solve([[c, d], [e, 1.0]], [u - OMNI.cx, v - OMNI.cy])
+    rho = np.hypot(a, b)
+    ray = np.array([a, b, np.polynomial.polynomial.polyval(rho, OMNI.polynomial)])
+    np.testing.assert_allclose(OMNI.unproject(np.array([u, v])), ray / ray[2])
+    np.testing.assert_allclose(OMNI.project(12.0 * ray), [u, v], atol=1e-8)
+
+
+def test_omnidirectional_corners_look_sideways_and_are_not_seen() -> None:
+    assert np.isnan(OMNI.unproject(np.array([[0.0, 0.0], [1349.0, 1079.0]]))).all()
+
+
+def test_a_lens_that_turns_back_has_no_pixel_beyond_its_field() -> None:
+    # r (1 - r^2 / 3) increases up to r = 1 and then falls back: without a limit, r = 1.6 would land inside the image.
+    camera = OpenCvCamera(PINHOLE, (-1 / 3, 0.0, 0.0, 0.0))
+    assert camera.field_radius == pytest.approx(1.0)
+    assert np.isfinite(camera.project(np.array([0.99, 0, 1]))).all()
+    assert np.isnan(camera.project(np.array([1.6, 0, 1]))).all()
+    edge = PINHOLE.cx + PINHOLE.fx * 2 / 3
+    assert np.isnan(camera.unproject(np.array([edge + 1, PINHOLE.cy]))).all()
+    just_inside = camera.project(np.array([0.9999, 0, 1]))
+    np.testing.assert_allclose(camera.unproject(just_inside), [0.9999, 0, 1], atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    k1=st.floats(-0.4, 0.4), k2=st.floats(-0.1, 0.1), p1=st.floats(-2e-3, 2e-3), p2=st.floats(-2e-3, 2e-3),
+    share=st.floats(0, 0.9), angle=st.floats(0, 6.3),
+)  # fmt: skip
+def test_opencv_round_trip_anywhere_in_the_field(
+    k1: float, k2: float, p1: float, p2: float, share: float, angle: float
+) -> None:
+    camera = OpenCvCamera(PINHOLE, (k1, k2, p1, p2))
+    r = share * min(camera.field_radius, 1.5)
+    pixel = camera.project(np.array([r * np.cos(angle), r * np.sin(angle), 1.0]))
+    assert np.abs(camera.project(camera.unproject(pixel)) - pixel).max() < 1e-6
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    a0=st.floats(200, 1000), bend=st.floats(-0.8, 0.2), c=st.floats(0.95, 1.05), d=st.floats(-0.01, 0.01),
+    share=st.floats(0, 0.99), angle=st.floats(0, 6.3),
+)  # fmt: skip
+def test_omnidirectional_round_trip_anywhere_in_the_field(
+    a0: float, bend: float, c: float, d: float, share: float, angle: float
+) -> None:
+    camera = OmnidirectionalCamera((a0, 0.0, bend / a0), 320.0, 240.0, 640, 480, (c, d, -d))
+    tangent = share * 4.0
+    pixel = camera.project(np.array([tangent * np.cos(angle), tangent * np.sin(angle), 1.0]))
+    if np.isfinite(pixel).all():
+        ray = camera.unproject(pixel)
+        np.testing.assert_allclose(np.hypot(ray[0], ray[1]), tangent, rtol=1e-9, atol=1e-12)
+        assert np.abs(camera.project(ray) - pixel).max() < 1e-6
+
+
+def test_a_rational_lens_ends_at_its_pole() -> None:
+    # r / (1 - r^2): infinite at 1, and back from minus infinity beyond.
+    camera = OpenCvCamera(PINHOLE, (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0))
+    assert camera.field_radius == pytest.approx(1.0)
+    assert np.isnan(camera.project(np.array([1.2, 0, 1]))).all()
+    np.testing.assert_allclose(camera.unproject(camera.project(np.array([0.9, 0.3, 1]))), [0.9, 0.3, 1], rtol=1e-9)
+
+
+def test_impossible_lenses_are_refused() -> None:
+    with pytest.raises(ValueError, match="4, 5 or 8"):
+        OpenCvCamera(PINHOLE, (0.1, 0.2))
+    with pytest.raises(ValueError, match="expected 4"):
+        FisheyeCamera(PINHOLE, (0.1,))
+    with pytest.raises(ValueError, match="a0 must be positive"):
+        OmnidirectionalCamera((-769.0, 0.0, 1e-3), 0, 0, 10, 10)

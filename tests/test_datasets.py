@@ -1,0 +1,388 @@
+"""Reading inputs: videos, folders, C3VD, 7-Scenes; what is wrong with them; and the real folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_inputs import SIZE, frames_of, number_in, picture, poses, save, write_c3vd, write_sevenscenes, write_video
+
+from scopemap.calibration import write_calibration
+from scopemap.camera import PinholeCamera
+from scopemap.datasets import open_sequence
+from scopemap.datasets.c3vd import CAMERA, read_poses
+from scopemap.errors import CalibrationError, InputError
+from scopemap.geometry.se3 import inverse, se3_exp, transform
+
+# ---- folders of images
+
+
+def test_images_are_sorted_by_number_and_keep_it(tmp_path: Path) -> None:
+    for number in (9, 10, 2, 100):
+        save(tmp_path / f"img_{number}.png", picture(number % 20))
+        save(tmp_path / f"img_{number}_mask.png", picture(0))
+    (tmp_path / "notes.txt").write_text("not an image")
+    sequence = open_sequence(tmp_path)
+    frames = frames_of(sequence)
+    assert [f.index for f in frames] == [2, 9, 10, 100]
+    assert [number_in(f.rgb) for f in frames] == [2, 9, 10, 0]
+    assert [f.time_s for f in frames] == pytest.approx([2 / 30, 9 / 30, 10 / 30, 100 / 30])
+    assert frames[0].name == "img_2.png"
+    assert sequence.count == 4
+    assert sequence.source.name == "images"
+    assert any("time stamps" in note for note in sequence.notes)
+    assert all(truth is None for _, truth in sequence)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "bmp"])
+def test_kinds_of_images(suffix: str, tmp_path: Path) -> None:
+    for i in range(3):
+        save(tmp_path / f"{i}.{suffix}", picture(i))
+    assert [number_in(f.rgb) for f in frames_of(open_sequence(tmp_path))] == [0, 1, 2]
+
+
+def test_grey_deep_and_transparent_images_become_rgb(tmp_path: Path) -> None:
+    grey = picture(3)[..., 1]
+    cv2.imwrite(str(tmp_path / "0.png"), grey)
+    cv2.imwrite(str(tmp_path / "1.png"), grey.astype(np.uint16) * 256)
+    cv2.imwrite(str(tmp_path / "2.png"), np.dstack([grey, grey, grey, 255 - grey]))
+    for frame in frames_of(open_sequence(tmp_path)):
+        np.testing.assert_array_equal(frame.rgb, np.repeat(grey[..., None], 3, -1))
+
+
+def test_names_without_numbers_are_counted(tmp_path: Path) -> None:
+    for name in ("b.png", "a.png"):
+        save(tmp_path / name, picture(1))
+    assert [(f.index, f.name) for f in frames_of(open_sequence(tmp_path))] == [(0, "a.png"), (1, "b.png")]
+
+
+@pytest.mark.parametrize("nesting", ["video1", "video1/video1", "scene/images"])
+def test_a_nested_folder_is_found(nesting: str, tmp_path: Path) -> None:
+    folder = tmp_path / nesting
+    folder.mkdir(parents=True)
+    (tmp_path / "readme.txt").write_text("hello")
+    for i in range(2):
+        save(folder / f"{i}.png", picture(i))
+    assert open_sequence(tmp_path).path == folder
+
+
+@pytest.mark.parametrize(
+    ("selection", "expected"),
+    [
+        (slice(2, 6), [2, 3, 4, 5]),
+        (slice(None, None, 3), [0, 3, 6, 9]),
+        (slice(-2, None), [9, 10]),
+        (slice(8, 99), [8, 9, 10]),
+    ],
+)
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_selections_are_python_slices(selection: slice, expected: list[int], kind: str, tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", 11) if kind == "video" else write_c3vd(tmp_path / "c")
+    sequence = open_sequence(path, frames=selection)
+    frames = frames_of(sequence)
+    assert [f.index for f in frames] == expected
+    assert [number_in(f.rgb) for f in frames] == expected
+    assert sequence.count == len(expected)
+
+
+def test_frames_are_decoded_one_at_a_time(tmp_path: Path) -> None:
+    for i in range(3):
+        save(tmp_path / f"{i}.png", picture(i))
+    walk = iter(open_sequence(tmp_path))
+    assert next(walk)[0].index == 0
+    (tmp_path / "2.png").unlink()
+    save(tmp_path / "2.png", picture(7))
+    assert [number_in(f.rgb) for f, _ in walk] == [1, 7]
+
+
+# ---- the camera
+
+
+def test_an_unknown_camera_is_assumed_from_the_field_of_view_and_can_be_bettered(tmp_path: Path) -> None:
+    for i in range(2):
+        save(tmp_path / f"{i}.png", picture(i, (800, 600)))
+    sequence = open_sequence(tmp_path, fov_deg=90.0)
+    found = sequence.camera
+    np.testing.assert_allclose([found.fx, found.fy, found.cx, found.cy], [200.0, 200.0, 199.5, 149.5])
+    assert "90 deg" in sequence.camera_source
+    assert any("field of view" in note for note in sequence.notes)
+    better = sequence.with_focal(300.0, "estimated by a network")
+    assert better.camera.fx == pytest.approx(300.0)
+    assert better.camera_source == "estimated by a network"
+    assert frames_of(better)[0].camera.fx == pytest.approx(300.0)
+    np.testing.assert_array_equal(frames_of(better)[0].rgb, frames_of(sequence)[0].rgb)
+
+
+def test_a_calibration_file_wins_and_is_said(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    (tmp_path / "mine.txt").write_text("120 121 67 54")
+    sequence = open_sequence(folder, camera=tmp_path / "mine.txt")
+    assert sequence.camera.fx == 120
+    assert sequence.camera_source == "calibration file mine.txt"
+    with pytest.raises(CalibrationError, match="is known"):
+        sequence.with_focal(100.0, "a guess")
+
+
+def test_a_calibration_for_other_images_is_refused(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    write_calibration(PinholeCamera(900.0, 900.0, 960.0, 540.0, 1920, 1080), tmp_path / "hd.yaml")
+    with pytest.raises(CalibrationError, match=r"1920x1080 px.*135x108 px"):
+        open_sequence(folder, camera=tmp_path / "hd.yaml")
+
+
+def test_the_working_size_is_chosen_or_given(tmp_path: Path) -> None:
+    for i in range(2):
+        save(tmp_path / f"{i}.png", picture(i, (800, 600)))
+    assert open_sequence(tmp_path).size_source == "400x300 px chosen for input of 800x600 px"
+    given = open_sequence(tmp_path, size=(200, 150))
+    assert (given.camera.width, given.camera.height) == (200, 150)
+    assert "given" in given.size_source
+    assert frames_of(given)[0].rgb.shape == (150, 200, 3)
+
+
+# ---- C3VD
+
+
+@pytest.mark.parametrize("transposed", [True, False], ids=["stored", "literal"])
+@pytest.mark.parametrize("name", ["{}_color.png", "{:04d}_color.png"])
+def test_c3vd(transposed: bool, name: str, tmp_path: Path) -> None:
+    sequence = open_sequence(write_c3vd(tmp_path / "c", transposed=transposed, name=name))
+    assert sequence.source.name == "c3vd"
+    assert sequence.rectifier.source == CAMERA.resized(*SIZE)
+    pairs = list(sequence)
+    assert [f.index for f, _ in pairs] == list(range(11))
+    for (frame, truth), T_world_camera in zip(pairs, poses(13), strict=False):
+        assert number_in(frame.rgb) == frame.index == truth.index
+        np.testing.assert_allclose(truth.T_world_camera, T_world_camera, atol=1e-6)
+        assert truth.depth_mm[54, 67] == pytest.approx(32768 / 65535 * 100)
+        assert truth.depth_mm.dtype == np.float32
+        assert truth.quality == "registered"
+    assert np.isnan(sequence.source.truth(0).depth_mm[[0, -1]]).all()
+
+
+def test_poses_without_motion_are_read_as_stored(tmp_path: Path) -> None:
+    rotation = se3_exp(np.array([0.3, -0.2, 0.5, 0, 0, 0]))
+    (tmp_path / "pose.txt").write_text(",".join(str(x) for x in rotation.T.ravel()))
+    np.testing.assert_allclose(read_poses(tmp_path / "pose.txt")[0], rotation)
+
+
+def test_a_calibration_beside_the_frames_wins_with_its_depth_scale(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    write_calibration(PinholeCamera(100.0, 100.0, 67.0, 53.5, *SIZE), folder / "camera.yaml", depth_scale_mm=0.005)
+    sequence = open_sequence(folder)
+    assert sequence.camera.fx == 100
+    assert "camera.yaml" in sequence.camera_source
+    _, truth = next(iter(sequence))
+    assert truth.depth_mm[54, 67] == pytest.approx(32768 * 0.005)
+    assert truth.quality == "exact"
+
+
+def test_c3vd_without_depth_has_poses_only(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    for file in folder.glob("*_depth.tiff"):
+        file.unlink()
+    _, truth = next(iter(open_sequence(folder)))
+    assert truth.depth_mm is None
+    assert truth.T_world_camera is not None
+
+
+def test_an_image_without_a_pose_is_named(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c", count=4)
+    save(folder / "17_color.png", picture(17))
+    with pytest.raises(InputError, match=r"17_color\.png has no line in pose\.txt"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("text", ["1,2,3\n", "", "a b c", ",".join(["1.5"] * 16)])
+def test_poses_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "pose.txt").write_text(text)
+    with pytest.raises(InputError, match="reading the poses"):
+        read_poses(tmp_path / "pose.txt")
+
+
+# ---- 7-Scenes
+
+
+def test_sevenscenes(tmp_path: Path) -> None:
+    folder = write_sevenscenes(tmp_path / "s")
+    sequence = open_sequence(folder)
+    assert sequence.source.name == "7-scenes"
+    assert sequence.camera.fx == pytest.approx(292.5)
+    for (frame, truth), T_world_camera in zip(sequence, poses(3), strict=True):
+        assert number_in(frame.rgb) == frame.index
+        np.testing.assert_allclose(truth.T_world_camera, T_world_camera, atol=1e-6)
+        assert np.isnan(truth.depth_mm[:4]).all()
+        np.testing.assert_allclose(truth.depth_mm[6:], 1500)
+    np.savetxt(folder / "camera-intrinsics.txt", [[500, 0, 310], [0, 501, 250], [0, 0, 1]])
+    (folder / "frame-000001.pose.txt").write_text("nan " * 16)
+    changed = open_sequence(folder)
+    assert changed.camera.fx == pytest.approx(250)
+    assert [truth.T_world_camera is None for _, truth in changed] == [False, True, False]
+
+
+# ---- video
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "avi", "mov", "mkv"])
+def test_videos(suffix: str, tmp_path: Path) -> None:
+    sequence = open_sequence(write_video(tmp_path / f"scope.{suffix}", 8))
+    frames = frames_of(sequence)
+    assert [number_in(f.rgb) for f in frames] == list(range(8))
+    np.testing.assert_allclose(np.diff([f.time_s for f in frames]), 0.04, atol=2e-3)
+    assert (sequence.name, sequence.count, sequence.warnings) == ("scope", 8, [])
+    assert len(frames_of(sequence)) == 8  # a second walk starts anew
+
+
+@pytest.mark.parametrize(("suffix", "options"), [("avi", {}), ("mkv", {}), ("mp4", {"movflags": "faststart"})])
+def test_a_video_that_breaks_off_is_used_with_a_warning(suffix: str, options: dict[str, str], tmp_path: Path) -> None:
+    file = write_video(tmp_path / f"v.{suffix}", 40, options)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(0.6 * len(data))])
+    sequence = open_sequence(file)
+    frames = frames_of(sequence)
+    assert 15 < len(frames) < 30
+    assert [number_in(f.rgb) for f in frames[:-1]] == list(range(len(frames) - 1))
+    assert len(sequence.warnings) == 1
+    assert "breaks off" in sequence.warnings[0]
+    part = open_sequence(file, frames=slice(0, 5))
+    assert len(frames_of(part)) == 5
+    assert part.warnings == []
+
+
+# ---- bad input
+
+
+def _one_image(folder: Path) -> Path:
+    save(folder / "0.png", picture(0))
+    return folder
+
+
+def _empty_file(folder: Path) -> Path:
+    (folder / "v.mp4").write_bytes(b"")
+    return folder / "v.mp4"
+
+
+def _noise_file(folder: Path) -> Path:
+    (folder / "v.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
+    return folder / "v.mp4"
+
+
+def _headless_video(folder: Path) -> Path:
+    file = write_video(folder / "v.mp4", 20)
+    file.write_bytes(file.read_bytes()[:5000])
+    return file
+
+
+def _broken_images(folder: Path) -> Path:
+    for i in range(3):
+        (folder / f"{i}.png").write_bytes(b"no image")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: folder / "nowhere", "no such file or folder"),
+        (lambda folder: folder, "there is no image"),
+        (_one_image, "two are needed"),
+        (_empty_file, r"v\.mp4"),
+        (_noise_file, r"v\.mp4"),
+        (_headless_video, r"v\.mp4"),
+        (_broken_images, "none of the 3 images can be read"),
+        (lambda folder: write_video(folder / "v.mp4", 1), "holds one frame, two are needed"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_clear_line(make: Callable[[Path], Path], message: str, tmp_path: Path) -> None:
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=message) as caught:
+        open_sequence(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_frames_of_changing_size_are_named(tmp_path: Path) -> None:
+    for i in range(3):
+        save(tmp_path / f"{i}.png", picture(i, SIZE if i < 2 else (64, 48)))
+    with pytest.raises(InputError, match=r"2\.png: it is 64x48 px"):
+        frames_of(open_sequence(tmp_path))
+
+
+def test_one_broken_image_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    for i in range(4):
+        save(tmp_path / f"{i}.png", picture(i))
+    (tmp_path / "1.png").write_bytes(b"")
+    sequence = open_sequence(tmp_path)
+    assert [f.index for f in frames_of(sequence)] == [0, 2, 3]
+    assert "1.png" in sequence.warnings[0]
+
+
+def test_options_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    video = write_video(tmp_path / "v.mp4", 4)
+    with pytest.raises(InputError, match="choose one of c3vd, 7-scenes, video, images"):
+        open_sequence(folder, dataset="scared")
+    with pytest.raises(InputError, match="it is a folder"):
+        open_sequence(folder, dataset="video")
+    with pytest.raises(InputError, match="it is a file"):
+        open_sequence(video, dataset="c3vd")
+    with pytest.raises(InputError, match="step must be positive"):
+        open_sequence(folder, frames=slice(None, None, -1))
+    with pytest.raises(InputError, match="1 frame"):
+        open_sequence(folder, frames=slice(3, 4))
+    with pytest.raises(InputError, match="1 readable frame"):
+        frames_of(open_sequence(video, frames=slice(3, 4)))
+    with pytest.raises(InputError, match="too small"):
+        open_sequence(folder, size=(8, 6))
+    with pytest.raises(InputError, match="field of view"):
+        open_sequence(video, fov_deg=0)
+
+
+def test_a_named_data_set_is_believed(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path / "c")
+    sequence = open_sequence(folder, dataset="images")
+    assert sequence.source.name == "images"
+    assert not sequence.calibrated
+    (folder / "pose.txt").unlink()
+    with pytest.raises(InputError, match=r"pose\.txt"):
+        open_sequence(folder, dataset="c3vd")
+
+
+# ---- the real folders
+
+
+def reprojection_error_mm(a: tuple, b: tuple) -> np.ndarray:
+    """How far surface seen in frame a lies from the surface seen in frame b, along b's axis, mm (NaN where unseen)."""
+    (frame_a, truth_a), (_, truth_b) = a, b
+    camera = frame_a.camera
+    points = camera.rays.astype(np.float64) * truth_a.depth_mm[..., None]
+    in_b = transform(inverse(truth_b.T_world_camera) @ truth_a.T_world_camera, points)
+    u, v = np.moveaxis(camera.project(in_b), -1, 0).astype(np.float32)
+    there = cv2.remap(truth_b.depth_mm, u, v, cv2.INTER_LINEAR, borderValue=float("nan"))
+    return np.abs(there - in_b[..., 2])
+
+
+@pytest.mark.real
+def test_real_c3vd_frames_agree_with_each_other_through_the_rectification(real_data: Path) -> None:
+    """Polynomial, pixel centres, pose form, depth scale: a fault in any of them would show here."""
+    pairs = list(open_sequence(real_data / "endoscopy" / "c3vd" / "trans_t1_a"))
+    assert [f.index for f, _ in pairs] == list(range(1, 11))
+    error_mm = reprojection_error_mm(pairs[0], pairs[-1])
+    assert np.isfinite(error_mm).mean() > 0.5
+    assert np.nanmedian(error_mm) < 0.1
+
+
+@pytest.mark.real
+def test_real_c3vd_video_without_depth(real_data: Path) -> None:
+    sequence = open_sequence(real_data / "endoscopy" / "c3vd" / "cecum_t1_a")
+    assert (sequence.count, sequence.camera.width, sequence.camera.height) == (276, 337, 270)
+    centres = sequence.source.poses[:, :3, 3]
+    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).sum() == pytest.approx(54.7, abs=0.1)
+
+
+@pytest.mark.real
+def test_real_sevenscenes(real_data: Path) -> None:
+    pairs = list(open_sequence(real_data / "rgbd" / "7scenes_kitchen_100f", frames=slice(0, 11, 10)))
+    assert np.nanmedian(reprojection_error_mm(*pairs)) < 10

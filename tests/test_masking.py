@@ -1,0 +1,156 @@
+"""Masking: field of view, highlights and exposure on drawn images, whose right mask is known, and on real frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import MaskSettings
+from scopemap.datasets import open_sequence
+from scopemap.frame import Frame
+from scopemap.masking import Masker, is_constant
+
+SETTINGS = MaskSettings(
+    dark_level=12, bright_level=240, highlight_ratio=1.5, highlight_grow_px=2, border_px=3, field_of_view=True,
+    highlights=True,
+)  # fmt: skip
+CAMERA = PinholeCamera(200.0, 200.0, 159.5, 119.5, 320, 240)
+CENTRE, RADIUS = (160, 120), 105
+
+
+def tissue(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(rng.normal(0, 60, (240, 320)).astype(np.float32), (0, 0), 4)
+    return np.clip(np.array([170.0, 90.0, 80.0]) + texture[..., None], 40, 220).astype(np.uint8)
+
+
+def disc(radius: float) -> np.ndarray:
+    return cv2.circle(np.zeros((240, 320), np.uint8), CENTRE, int(radius), 1, -1).astype(bool)
+
+
+def frame(rgb: np.ndarray, valid: np.ndarray | None = None) -> Frame:
+    return Frame(0, 0.0, rgb, CAMERA, np.ones(rgb.shape[:2], bool) if valid is None else valid)
+
+
+def in_circle(seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 9, (240, 320, 3), dtype=np.uint8)
+    return np.where(disc(RADIUS)[..., None], tissue(seed), noise).astype(np.uint8)
+
+
+def test_sound_tissue_that_fills_the_image_stays() -> None:
+    assert Masker(SETTINGS)(frame(tissue())).valid.all()
+
+
+def test_the_image_circle_is_found_and_shrunk() -> None:
+    valid = Masker(SETTINGS)(frame(in_circle())).valid
+    assert not valid[~disc(RADIUS)].any()
+    assert valid[disc(RADIUS - 6)].all()
+    assert not valid[disc(RADIUS) & ~disc(RADIUS - 2)].any()
+
+
+def test_an_octagon_and_black_bars_are_found() -> None:
+    octagon = np.array([[60, 10], [260, 10], [300, 60], [300, 180], [260, 230], [60, 230], [20, 180], [20, 60]])
+    inside = cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), octagon, 1).astype(bool)
+    valid = Masker(SETTINGS)(frame(np.where(inside[..., None], tissue(), 0).astype(np.uint8))).valid
+    assert not valid[~inside].any()
+    assert valid.sum() > 0.94 * inside.sum()
+
+
+def test_a_dark_lumen_is_in_the_field_and_a_hole_only_by_exposure() -> None:
+    image = in_circle()
+    image[disc(40)] = 3
+    masker = Masker(SETTINGS)
+    assert not masker(frame(image)).valid[disc(39)].any()
+    # The lumen comes into the light: nothing of the first frame may keep it out.
+    assert masker(frame(in_circle(1))).valid[disc(RADIUS - 6)].all()
+
+
+def test_a_dark_side_is_learnt_when_it_is_lit() -> None:
+    dark = in_circle()
+    dark[:, 200:] = 4
+    masker = Masker(SETTINGS)
+    assert not masker(frame(dark)).valid[:, 204:].any()
+    assert masker(frame(in_circle(2))).valid[disc(RADIUS - 6)].all()
+
+
+def test_text_outside_the_circle_is_not_tissue() -> None:
+    image = in_circle()
+    cv2.putText(image, "12:34", (2, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1)
+    assert not Masker(SETTINGS)(frame(image)).valid[~disc(RADIUS)].any()
+
+
+def test_what_rectification_could_not_fill_stays_out_with_a_margin() -> None:
+    rectified = disc(RADIUS)
+    image = np.where(rectified[..., None], tissue(), 0).astype(np.uint8)
+    valid = Masker(SETTINGS)(frame(image, rectified)).valid
+    assert not valid[~disc(RADIUS - 2)].any()
+    assert valid[disc(RADIUS - 6)].all()
+
+
+def test_highlights_are_found_and_widened_but_bright_tissue_is_not_one() -> None:
+    image = tissue()
+    cv2.circle(image, (100, 100), 4, (235, 230, 228), -1)
+    red = cv2.circle(np.zeros((240, 320), np.uint8), (220, 120), 30, 1, -1).astype(bool)
+    image[red] = np.clip(image[red] * np.array([1.45, 1.2, 1.1]), 0, 255).astype(np.uint8)
+    valid = Masker(SETTINGS)(frame(image)).valid
+    spot = cv2.circle(np.zeros((240, 320), np.uint8), (100, 100), 5, 1, -1).astype(bool)
+    assert not valid[spot].any()
+    assert valid[red].all()
+    assert (~valid).sum() < 2.5 * spot.sum()
+    kept = Masker(SETTINGS.model_copy(update={"highlights": False}))(frame(image)).valid
+    assert kept.all()
+
+
+def test_clipped_pixels_go_but_red_alone_may_clip() -> None:
+    image = tissue()
+    image[50:90, 50:90] = (255, 250, 180)
+    image[150:190, 50:90] = (255, 120, 100)
+    valid = Masker(SETTINGS)(frame(image)).valid
+    assert not valid[50:90, 50:90].any()
+    assert valid[150:190, 50:90].all()
+
+
+def test_each_part_can_be_switched_off() -> None:
+    settings = SETTINGS.model_copy(update={"field_of_view": False, "highlights": False, "dark_level": 0})
+    image = np.maximum(in_circle(), 1)
+    assert Masker(settings)(frame(image)).valid.all()
+
+
+def test_a_black_frame_has_no_tissue_and_does_not_fail() -> None:
+    black = np.zeros((240, 320, 3), np.uint8)
+    masker = Masker(SETTINGS)
+    assert not masker(frame(black)).valid.any()
+    assert masker(frame(in_circle())).valid[disc(RADIUS - 6)].all()
+
+
+def test_constant_images_are_told_from_dark_ones() -> None:
+    noise = np.random.default_rng(0).integers(0, 4, (240, 320, 3), dtype=np.uint8)
+    assert is_constant(np.zeros((240, 320, 3), np.uint8))
+    assert is_constant(noise)
+    assert is_constant(noise + np.array([200, 30, 30], np.uint8))
+    assert not is_constant(in_circle())
+    assert not is_constant(tissue() // 2)
+    assert not is_constant(in_circle() // 4)
+
+
+@pytest.mark.real
+def test_the_round_field_of_a_laparoscope(real_data: Path) -> None:
+    """The clip shows a circle of 552 px in 1280x720, cut off above and below (measured by hand in the picture)."""
+    masker = Masker(SETTINGS)
+    video = real_data / "endoscopy" / "video" / "laparoscopy_rvim.mp4"
+    valid = [masker(f).valid for f, _ in open_sequence(video, frames=slice(0, 60, 10))][-1]
+    columns = np.flatnonzero(valid[80:100].any(0))
+    assert 12 <= columns[0] <= 24
+    assert 286 <= columns[-1] <= 298
+    assert 0.65 < valid.mean() < 0.8
+
+
+@pytest.mark.real
+def test_a_colon_that_fills_the_image_is_nearly_all_usable(real_data: Path) -> None:
+    masker = Masker(SETTINGS)
+    for f, _ in open_sequence(real_data / "endoscopy" / "c3vd" / "cecum_t1_a", frames=slice(0, 200, 40)):
+        assert masker(f).valid.mean() > 0.95

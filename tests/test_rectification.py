@@ -1,0 +1,146 @@
+"""Rectification: straight lines, exact positions, resolutions, unknown values, working size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.errors import CalibrationError
+from scopemap.lenses import FisheyeCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.rectification import Rectifier, working_camera, working_size
+
+PINHOLE = PinholeCamera(300.0, 302.0, 318.0, 245.0, 640, 480)
+LENSES = {
+    "pinhole": PINHOLE,
+    "opencv": OpenCvCamera(PINHOLE, (-0.2, 0.03, 1e-3, -5e-4)),
+    "fisheye": FisheyeCamera(PINHOLE, (-0.05, 2e-3, 0.0, 0.0)),
+    "omnidirectional": OmnidirectionalCamera((300.0, 0.0, -1e-3), 318.0, 245.0, 640, 480, (0.999, 0.002, -0.003)),
+}
+
+
+@pytest.fixture(params=LENSES.values(), ids=LENSES.keys())
+def source(request: pytest.FixtureRequest) -> CameraModel:
+    return request.param
+
+
+def coordinates(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((1350, 1080), (337, 270)),
+        ((640, 480), (320, 240)),
+        ((1920, 1080), (384, 216)),
+        ((384, 384), (384, 384)),
+        ((400, 300), (400, 300)),
+        ((401, 300), (200, 150)),
+        ((1024, 1280), (256, 320)),
+    ],
+)
+def test_working_size(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    assert working_size(*size) == expected
+
+
+def test_the_working_camera_has_the_focal_length_of_the_centre(source: CameraModel) -> None:
+    camera = working_camera(source, (320, 240))
+    assert camera.fx == pytest.approx(source.central.fx / 2)
+    assert camera.cx == pytest.approx((source.central.cx + 0.5) / 2 - 0.5)
+    assert working_camera(source, (320, 240), zoom=0.5).fx == pytest.approx(source.central.fx / 4)
+
+
+def test_maps_lead_where_the_cameras_say(source: CameraModel) -> None:
+    """A ramp image holds its own coordinates: rectified, it must hold the source pixel of each target pixel."""
+    rectifier = Rectifier(source, working_camera(source, (160, 120)))
+    u, v = coordinates(640, 480)
+    expected = rectifier.source_pixel(*coordinates(160, 120))
+    inside = rectifier.valid
+    for axis, ramp in enumerate((u, v)):
+        np.testing.assert_allclose(rectifier.smooth(ramp)[inside], expected[inside][:, axis], atol=0.02)
+        assert np.abs(rectifier.nearest(ramp)[inside] - expected[inside][:, axis]).max() <= 0.501
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_an_array_of_another_resolution_is_taken_from_the_same_place(source: CameraModel, factor: float) -> None:
+    rectifier = Rectifier(source, working_camera(source, (160, 120)))
+    u, _ = coordinates(int(640 * factor), int(480 * factor))
+    ramp = (u + 0.5) / factor - 0.5  # u of the full-size image
+    expected = rectifier.source_pixel(*coordinates(160, 120))[..., 0]
+    deep = rectifier.valid & (expected > 2) & (expected < 637)
+    np.testing.assert_allclose(rectifier.smooth(ramp)[deep], expected[deep], atol=0.05)
+    assert np.abs(rectifier.nearest(ramp)[deep] - expected[deep]).max() <= 0.501 / factor
+
+
+def test_a_straight_edge_in_the_world_is_straight_in_the_rectified_image() -> None:
+    source = LENSES["opencv"]
+    rays = source.unproject(np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1))
+    image = np.where(rays[..., 0] > 0.3 + 0.2 * rays[..., 1], 255, 0).astype(np.uint8)
+    target = working_camera(source, (320, 240))
+    rectified = Rectifier(source, target).image(np.repeat(image[..., None], 3, -1))[..., 0].astype(float)
+    rows = np.arange(20, 220)
+    edge_px = 320 - rectified[rows].sum(1) / 255 - 0.5
+    y = (rows - target.cy) / target.fy
+    np.testing.assert_allclose(edge_px, target.fx * (0.3 + 0.2 * y) + target.cx, atol=0.35)
+
+
+def test_a_wider_view_has_an_invalid_border_and_says_so(source: CameraModel) -> None:
+    rectifier = Rectifier(source, working_camera(source, (160, 120), zoom=0.5))
+    image = np.full((480, 640, 3), 200, np.uint8)
+    valid = rectifier.valid
+    assert 0.1 < valid.mean() < 0.9
+    assert valid[60, 80]
+    rectified = rectifier.image(image)
+    assert (rectified[~valid] == 0).all()
+    assert (rectified[valid] == 200).all()
+    depth = rectifier.nearest(np.ones((480, 640), np.float32))
+    np.testing.assert_array_equal(np.isfinite(depth), valid)
+    assert (rectifier.nearest(np.ones((480, 640), np.uint8)) == valid).all()
+
+
+def test_valid_is_a_copy() -> None:
+    rectifier = Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240)))
+    rectifier.valid[:] = False
+    assert rectifier.valid.all()
+
+
+def test_the_same_view_is_not_touched_or_only_resized() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    same = Rectifier(PINHOLE, PINHOLE)
+    assert same.only_resizes
+    np.testing.assert_array_equal(same.image(image), image)
+    half = Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240)))
+    blocks = image.reshape(240, 2, 320, 2, 3).mean((1, 3))
+    assert half.only_resizes
+    assert np.abs(half.image(image) - blocks).max() <= 1
+    assert not Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240), zoom=0.9)).only_resizes
+
+
+def test_fine_texture_does_not_alias() -> None:
+    """Stripes one pixel wide are beyond what a four times coarser image can show: they must become even grey."""
+    source = LENSES["fisheye"]
+    image = np.zeros((480, 640, 3), np.uint8)
+    image[:, ::2] = 255
+    rectified = Rectifier(source, working_camera(source, (160, 120))).image(image)
+    assert rectified[10:-10, 10:-10].std() < 4
+
+
+def test_unknown_disparity_takes_no_part() -> None:
+    disparity = np.full((480, 640), 3.0, np.float32)
+    disparity[100:200, 100:200] = np.nan
+    rectifier = Rectifier(PINHOLE, working_camera(PINHOLE, (213, 160)))
+    smooth = rectifier.smooth(disparity)
+    assert np.isnan(smooth).mean() == pytest.approx(1e4 / (640 * 480), rel=0.1)
+    np.testing.assert_allclose(smooth[np.isfinite(smooth)], 3.0, rtol=1e-5)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    rectifier = Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240)))
+    with pytest.raises(CalibrationError, match="aspect"):
+        rectifier.nearest(np.zeros((480, 480), np.float32))
+    with pytest.raises(ValueError, match="image"):
+        rectifier.image(np.zeros((240, 320, 3), np.uint8))
+    away = PinholeCamera(300.0, 300.0, 5000.0, 240.0, 640, 480)
+    with pytest.raises(CalibrationError, match="no pixel"):
+        Rectifier(PINHOLE, away)
