@@ -1,0 +1,81 @@
+"""Depth Pro (Bochkovskii et al., ICLR 2025) through `transformers`: metric depth and focal length of a single image."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from scopemap.depth.estimate import DepthEstimate
+from scopemap.depth.pretrained import load_pretrained
+from scopemap.device import choose_device
+from scopemap.errors import WeightsError
+from scopemap.frame import Frame
+
+if TYPE_CHECKING:
+    from transformers import DepthProForDepthEstimation, DepthProImageProcessor
+
+MM_PER_M = 1000.0
+
+
+class DepthPro:
+    """A Depth Pro network and its image processor behind the `DepthEstimator` contract.
+
+    The network gives canonical inverse depth c and a field of view; depth is f / (W c) with the focal length f and the
+    width W in px (paper, section 3.2). `use_known_focal` takes f from the frame's camera instead of the network: say
+    False where the camera is itself a guess.
+    """
+
+    name = "depth-pro"
+
+    def __init__(
+        self,
+        network: DepthProForDepthEstimation,
+        processor: DepthProImageProcessor,
+        *,
+        device: str = "auto",
+        use_known_focal: bool = True,
+        origin: dict[str, str] | None = None,
+    ) -> None:
+        if not (use_known_focal or network.config.use_fov_model):
+            raise WeightsError("this Depth Pro model finds no focal length: name another, or calibrate the camera")
+        self.use_known_focal = use_known_focal
+        self._device = choose_device(device)
+        untyped: Any = network
+        self._network = untyped.to(self._device).eval()
+        self._processor: Any = processor
+        self._origin = origin or {}
+
+    @classmethod
+    def from_folder_or_hub(cls, model: str = "", device: str = "auto", *, use_known_focal: bool = True) -> DepthPro:
+        """Return the estimator with the weights `model`: a local folder, a pulled hub id, or "" = Apple's own.
+
+        Never downloads. Raises `WeightsError` that says what to pull.
+        """
+        from transformers import DepthProForDepthEstimation
+
+        network, processor, origin = load_pretrained(DepthProForDepthEstimation, model or cls.name)
+        return cls(network, processor, device=device, use_known_focal=use_known_focal, origin=origin)
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Return depth, mm, of the frame's size, and the focal length that the network found (None if it cannot).
+
+        Every pixel has a value; what the network holds for infinitely far is 1e7 mm.
+        """
+        import torch
+
+        inputs = self._processor(images=frame.rgb, input_data_format="channels_last", return_tensors="pt")
+        with torch.inference_mode():
+            outputs = self._network(inputs["pixel_values"].to(self._device))
+        found_deg = outputs.field_of_view
+        width = frame.camera.width
+        if self.use_known_focal:
+            known_deg = 2.0 * math.degrees(math.atan(0.5 * width / frame.camera.fx))
+            outputs.field_of_view = torch.tensor([known_deg], device=self._device)
+        size = (frame.camera.height, width)
+        result = self._processor.post_process_depth_estimation(outputs, target_sizes=[size])[0]
+        focal_px = None if found_deg is None else 0.5 * width / math.tan(0.5 * math.radians(float(found_deg)))
+        return DepthEstimate(result["predicted_depth"].float().cpu().numpy() * MM_PER_M, "depth", focal_px)
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name, whose focal length scaled the depth, the model, its commit and its weights' hashes."""
+        return {"depth": self.name, "focal": "camera" if self.use_known_focal else "network", **self._origin}

@@ -1,0 +1,47 @@
+"""The contract of depth estimators: what comes out of one, and of what kind it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from scopemap.errors import check_shape
+from scopemap.frame import Frame
+
+DepthKind = Literal["disparity", "depth", "measured"]
+
+
+@dataclass(frozen=True)
+class DepthEstimate:
+    """What an estimator says of one frame.
+
+    Attributes
+    ----------
+    values : (H, W) float32, NaN = unknown; meaning and unit by `kind`.
+    kind : "disparity": unitless, larger is nearer, known up to a scale and a shift; "depth": predicted, mm along the
+        optical axis, whose scale may float from frame to frame; "measured": mm, to be trusted.
+    focal_px : focal length that the estimator found in the image, px of this frame's width, or None.
+    """
+
+    values: np.ndarray
+    kind: DepthKind
+    focal_px: float | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("DepthEstimate.values", self.values, (None, None))
+
+
+class DepthEstimator(Protocol):
+    """Depth from one frame."""
+
+    name: str
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        """Return the estimate for a frame, of the frame's size."""
+        ...
+
+    def provenance(self) -> dict[str, str]:
+        """Return what the result depends on, as text: names, versions, hashes."""
+        ...

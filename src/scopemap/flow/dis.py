@@ -1,0 +1,27 @@
+"""Dense inverse search flow (Kroeger et al., ECCV 2016) of OpenCV: light, no weights."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from scopemap.flow.estimator import FlowEstimator
+
+
+class DisFlow(FlowEstimator):
+    """OpenCV's DIS flow on grey values, preset "medium"."""
+
+    name = "dis"
+
+    def __init__(self) -> None:
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
+        """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
+        grey_from, grey_to = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_from, rgb_to))
+        start = np.zeros((*grey_from.shape, 2), np.float32)
+        return np.asarray(self._dis.calc(grey_from, grey_to, start), np.float32)
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name and OpenCV's version."""
+        return {"flow": self.name, "opencv": cv2.__version__}

@@ -1,0 +1,167 @@
+"""Perceptual distances: zero for equal images, symmetric, and the same as the packages they stand on."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.errors import SettingsError, WeightsError
+from scopemap.perceptual import LpipsAlex, StructureDistance, create_perceptual
+
+SHAPE = (70, 93, 3)
+
+
+def _random_image(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(0, 255, SHAPE).astype(np.float32)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def _alexnet_state(seed: int = 4) -> dict[str, torch.Tensor]:
+    """The parameters of AlexNet's convolutions, random, under torchvision's names."""
+    shapes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
+    random = torch.Generator().manual_seed(seed)
+    state = {}
+    for layer, (outputs, inputs, side) in shapes.items():
+        weight = torch.randn(outputs, inputs, side, side, generator=random)
+        state[f"features.{layer}.weight"] = weight * (2 / (inputs * side * side)) ** 0.5
+        state[f"features.{layer}.bias"] = 0.1 * torch.randn(outputs, generator=random)
+    return state
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A random AlexNet's convolutions, and a classifier's layer as in torchvision's whole file."""
+    path = tmp_path_factory.mktemp("weights") / "alexnet.pth"
+    torch.save(_alexnet_state() | {"classifier.1.bias": torch.zeros(3)}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def random_lpips(checkpoint: Path) -> LpipsAlex:
+    return LpipsAlex(device="cpu", checkpoint=checkpoint)
+
+
+def _by_hand(state: dict[str, torch.Tensor], rgb_a: np.ndarray, rgb_b: np.ndarray, *, spatial: bool) -> np.ndarray:
+    """LPIPS of the package itself, its backbone's parameters taken in the order in which they come."""
+    import lpips
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        network = lpips.LPIPS(net="alex", pnet_rand=True, verbose=False, spatial=spatial)
+    with torch.no_grad():
+        for mine, theirs in zip(network.net.parameters(), state.values(), strict=True):
+            mine.copy_(theirs)
+        a, b = (torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255 for rgb in (rgb_a, rgb_b))
+        return network(a, b, normalize=True)[0, 0].numpy()
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**16), st.integers(0, 2**16))
+def test_structure_is_a_distance(seed_a: int, seed_b: int) -> None:
+    a, b = _random_image(seed_a), _random_image(seed_b)
+    measure = StructureDistance()
+    there, back = measure.compare(a, b), measure.compare(b, a)
+    np.testing.assert_allclose(there.map, back.map, atol=1e-5)
+    assert there.map.min() >= 0
+    assert there.map.max() <= 1
+    assert there.map.dtype == np.float32
+    assert there.map.shape == SHAPE[:2]
+    assert measure.compare(a, a).score == pytest.approx(0, abs=1e-6)
+
+
+def test_structure_sees_where_and_how_much() -> None:
+    image = _random_image(1)
+    spoilt, worse = image.copy(), image.copy()
+    spoilt[20:40, 20:40] = 255 - spoilt[20:40, 20:40]
+    worse[20:40, 20:60] = 255 - worse[20:40, 20:60]
+    measure = StructureDistance()
+    result = measure.compare(image, spoilt)
+    assert result.map[24:36, 24:36].mean() > 0.5
+    assert result.map[50:, 70:].max() < 1e-5
+    assert measure.compare(image, worse).score > result.score
+    assert result.score == pytest.approx(result.map.mean(), rel=1e-5)
+
+
+def test_lpips_is_a_distance(random_lpips: LpipsAlex) -> None:
+    a, b = _random_image(1), _random_image(2)
+    there, back = random_lpips.compare(a, b), random_lpips.compare(b, a)
+    np.testing.assert_allclose(there.map, back.map, rtol=1e-4, atol=1e-6)
+    assert there.map.shape == SHAPE[:2]
+    assert there.map.dtype == np.float32
+    assert there.map.min() >= 0
+    assert there.score > 0
+    assert random_lpips.compare(a, a).score == 0
+    nearer = cv2.addWeighted(a, 0.8, b, 0.2, 0)
+    assert random_lpips.compare(a, nearer).score < there.score
+
+
+def test_lpips_agrees_with_the_package(random_lpips: LpipsAlex) -> None:
+    a, b = _random_image(1), _random_image(2)
+    result = random_lpips.compare(a, b)
+    np.testing.assert_allclose(result.map, _by_hand(_alexnet_state(), a, b, spatial=True), rtol=1e-3, atol=1e-5)
+    score = _by_hand(_alexnet_state(), a, b, spatial=False).item()
+    assert result.score == pytest.approx(score, rel=0.01)
+
+
+def test_making_lpips_is_quiet_and_draws_no_random_numbers(checkpoint: Path, capfd: Any) -> None:
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LpipsAlex(device="cpu", checkpoint=checkpoint)
+    assert torch.equal(torch.rand(3), expected)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_unfit_backbones_are_refused(tmp_path: Path) -> None:
+    state = _alexnet_state()
+    torch.save({name: value for name, value in state.items() if "features.8" not in name}, tmp_path / "short.pth")
+    torch.save(state | {"features.12.weight": torch.zeros(1)}, tmp_path / "long.pth")
+    for file in ("short.pth", "long.pth"):
+        with pytest.raises(WeightsError, match="does not hold AlexNet's convolutions"):
+            LpipsAlex(device="cpu", checkpoint=tmp_path / file)
+
+
+def test_auto_takes_what_is_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    assert create_perceptual("auto", "cpu").name == "structure"
+    with pytest.raises(WeightsError, match="scopemap models pull alexnet"):
+        create_perceptual("lpips", "cpu")
+    with pytest.raises(SettingsError, match="unknown perceptual distance 'vgg'"):
+        create_perceptual("vgg")
+    torch.save(_alexnet_state(), tmp_path / "alexnet_features_torch.pth")
+    with pytest.raises(WeightsError, match="damaged"):
+        create_perceptual("auto", "cpu")
+
+
+def test_images_must_fit(random_lpips: LpipsAlex) -> None:
+    for measure in (random_lpips, StructureDistance()):
+        with pytest.raises(ValueError, match="rgb_b"):
+            measure.compare(_random_image(1), _random_image(1)[:-1])
+    assert set(StructureDistance().provenance()) == {"perceptual", "scikit-image"}
+
+
+@pytest.mark.real
+def test_real_lpips(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(real_data / "weights"))
+    measure = create_perceptual("auto", "cpu")
+    assert measure.name == "lpips"
+    assert len(measure.provenance()["sha256"]) == 64
+    files = [real_data / "endoscopy/c3vd/cecum_t1_a" / f"{index}_color.jpg" for index in (50, 51, 90)]
+    start, next_, later = (cv2.resize(cv2.imread(str(f)), (337, 270), interpolation=cv2.INTER_AREA) for f in files)
+    near, far = measure.compare(start, next_), measure.compare(start, later)
+    assert measure.compare(start, start).score == 0
+    np.testing.assert_allclose(far.map, measure.compare(later, start).map, rtol=1e-3, atol=1e-5)
+    assert near.score < 0.5 * far.score
+    state = torch.load(real_data / "weights/alexnet_features_torch.pth", weights_only=True)
+    np.testing.assert_allclose(far.map, _by_hand(state, start, later, spatial=True), rtol=1e-3, atol=1e-5)
+    assert far.score == pytest.approx(_by_hand(state, start, later, spatial=False).item(), rel=1e-3)
