@@ -30,9 +30,9 @@ class MaskSettings(Settings):
 
     field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
     dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
-    bright_level: int = Field(250, ge=0, le=255, description="level of the brightest channel that counts as saturated")
+    bright_level: int = Field(240, ge=0, le=255, description="level of the second-brightest channel that counts as saturated")
     highlights: bool = Field(True, description="find specular highlights and leave them out")
-    highlight_ratio: float = Field(1.6, gt=1, description="brightness over the local median that makes a highlight")
+    highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median that makes a highlight")
     highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
     border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
 
@@ -43,7 +43,7 @@ class DepthSettings(Settings):
     backend: str = Field("shading", description="shading | depth-anything | depth-pro | files:FOLDER")
     model: str = Field("", description="hub id or local folder for the network back ends; empty: the pinned default")
     anchor: Literal["auto", "near-far", "depth-pro", "shading"] = Field(
-        "auto", description="metric anchor of frame 1; auto: near-far if given, else shading"
+        "auto", description="metric anchor of frame 1; auto: near-far if given, else the depth's own mm, else shading"
     )
     near_far_mm: tuple[float, float] | None = Field(None, description="nearest and farthest tissue in frame 1, mm")
     fit_shift: bool = Field(True, description="fit scale and shift to the anchor; False: the paper's baseline only")
@@ -52,7 +52,7 @@ class DepthSettings(Settings):
     )
     files_scale_mm: float | None = Field(None, gt=0, description="mm per unit of depth files; None: found or assumed")
     shading_median_mm: float = Field(35.0, gt=0, description="stated prior: median distance of tissue in frame 1, mm")
-    shading_exponent: float = Field(0.5, gt=0, le=1, description="distance = k * brightness^-exponent")
+    shading_exponent: float = Field(0.6, gt=0, le=1, description="distance = k * brightness^-exponent")
     max_depth_mm: float = Field(300.0, gt=0, description="depth beyond this is unknown")
 
 
@@ -101,9 +101,13 @@ class OdometrySettings(Settings):
     max_iterations: int = Field(30, ge=1, description="steps per level")
     radius: float = Field(0.1, gt=0, description="rho, first trust radius: rad, and translation over mean depth")
     huber: float = Field(1.0, gt=0, description="Huber threshold in robust standard deviations (MAD)")
-    normalise: bool = Field(True, description="grey values minus local mean, over local deviation")
+    channels: Literal["grey", "normalised", "both"] = Field(
+        "both", description="what is compared: grey values, or grey values minus local mean over local deviation, or both"
+    )
     normalise_sigma_px: float = Field(4.0, gt=0, description="width of the local mean, px at each level")
-    lamp: bool = Field(True, description="predict the fall-off of the lamp that moves with the camera")
+    lamp_falloff: float = Field(
+        0.9, ge=0, description="grey values fall as distance^-x from the lamp; inverse square through sRGB: 2/2.2; 0: off"
+    )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.3, ge=0, le=1, description="a frame below this is lost")
@@ -200,8 +204,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "networks.perceptual": "lpips",
         "odometry.keyframe_every": 2,
         "odometry.finest_level": 0,
-        "odometry.normalise": False,
-        "odometry.lamp": False,
+        "odometry.channels": "grey",
+        "odometry.lamp_falloff": 0.0,
         "odometry.gain_bias": False,
         "odometry.start": "identity",
         "smoothing.method": "wema",

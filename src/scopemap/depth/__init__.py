@@ -1,0 +1,60 @@
+"""Image to depth: estimators behind one protocol, chosen by name, and the anchor that makes them metric."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scopemap.config import DepthSettings
+from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
+from scopemap.depth.files import FilesDepth
+from scopemap.depth.shading import ShadingDepth
+from scopemap.errors import SettingsError
+from scopemap.rectification import Rectifier
+
+__all__ = ["AnchoredDepth", "DepthEstimate", "DepthEstimator", "DepthKind", "create_anchor", "create_depth"]
+
+_FILES = "files:"
+
+
+def create_depth(
+    settings: DepthSettings, rectifier: Rectifier, device: str, depth_scale_mm: float | None = None
+) -> DepthEstimator:
+    """Return the estimator that `settings.backend` names: shading, depth-anything, depth-pro or files:FOLDER.
+
+    rectifier : from the source camera to the working camera, for depth files.
+    device : "auto", "cpu" or "cuda", for networks.
+    depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+
+    Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
+    """
+    if settings.backend.startswith(_FILES):
+        return FilesDepth(Path(settings.backend.removeprefix(_FILES)), rectifier, settings, depth_scale_mm)
+    if settings.backend == "shading":
+        return ShadingDepth(settings)
+    if settings.backend == "depth-pro":
+        return _depth_pro(settings.model, device)
+    if settings.backend == "depth-anything":
+        # Networks take seconds to import: only who asks for one waits.
+        from scopemap.depth.depth_anything import DepthAnything
+
+        return DepthAnything.from_folder_or_hub(settings.model, device)
+    raise SettingsError(
+        f"unknown depth '{settings.backend}': choose shading, depth-anything, depth-pro or files:FOLDER"
+    )
+
+
+def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
+    """Return the metric anchor of a sequence, with the estimator that it may have to ask.
+
+    Raises `SettingsError` where the range is missing or impossible, `WeightsError` where Depth Pro is asked for and
+    its weights are missing.
+    """
+    needs_network = settings.anchor == "depth-pro" and settings.backend != "depth-pro"
+    return AnchoredDepth(settings, _depth_pro("", device) if needs_network else ShadingDepth(settings))
+
+
+def _depth_pro(model: str, device: str) -> DepthEstimator:
+    from scopemap.depth.depth_pro import DepthPro
+
+    return DepthPro.from_folder_or_hub(model, device)

@@ -1,0 +1,150 @@
+"""The metric anchor: what turns a depth estimate of any kind into millimetres, fixed on the first frame and then held.
+
+METHOD section MAPIS-Depth, steps 1-4. Only scale (and shift, of a disparity) are fitted, once: a scale that floats from
+frame to frame is the business of the consistency stage, which knows how the camera moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scopemap.config import DepthSettings
+from scopemap.depth.baseline import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
+from scopemap.depth.estimate import DepthEstimate, DepthEstimator
+from scopemap.errors import SettingsError
+from scopemap.frame import Frame
+
+# A frame with fewer pixels that have both an estimate and an anchor cannot fix a scale: the next one is tried.
+_MIN_PIXELS = 16
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """Depth from a predicted depth by one factor."""
+
+    factor: float
+
+    def depth_mm(self, depth: np.ndarray) -> np.ndarray:
+        """Return depth (same shape, float32, mm); NaN stays NaN, and so becomes what is not positive."""
+        scaled = np.asarray(depth, dtype=np.float32) * np.float32(self.factor)
+        return np.where(scaled > 0, scaled, np.float32(np.nan))
+
+
+@dataclass(frozen=True)
+class _Target:
+    """What the anchor says: estimated values (N,) and the depth (N,) in mm they should come out as."""
+
+    values: np.ndarray
+    depth_mm: np.ndarray
+    focal_px: float
+
+
+class AnchoredDepth:
+    """Turns the estimates of one sequence into raw metric depth.
+
+    The first frame with enough usable pixels fixes the conversion, which is held for all later frames.
+    `settings.anchor` chooses what it is fitted to: a given range (`near-far`), a metric network's estimate of that
+    frame (`depth-pro`), the shading prior (`shading`), or (`auto`) the range if one is given, else the estimate's own
+    millimetres if it has them, else shading. Measured depth is never touched.
+
+    reference : the estimator that is asked, once, where the anchor is neither the range nor the estimate itself.
+    Raises `SettingsError` where `near-far` is asked for and no range, or an impossible one, is given.
+    """
+
+    def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
+        _check_range(settings)
+        self._settings = settings
+        self._reference = reference
+        self._conversion: AffineDisparity | DepthScale | None = None
+        self._description = "not anchored: no usable frame yet"
+
+    @property
+    def description(self) -> str:
+        """What fixed the scale, for people: for instance "near-far 13.5:100 mm"."""
+        return self._description
+
+    @property
+    def conversion(self) -> AffineDisparity | DepthScale | None:
+        """The conversion that holds for the sequence; None until a frame fixed it."""
+        return self._conversion
+
+    def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
+        """Return metric depth (H, W) float32 in mm, NaN = unknown, not positive or beyond `settings.max_depth_mm`.
+
+        All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
+        anchor.
+        """
+        first_mm = self._anchor(estimate, frame) if self._conversion is None else None
+        if self._conversion is None:
+            return np.full(estimate.values.shape, np.nan, dtype=np.float32)
+        depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
+        return np.where(depth_mm <= self._settings.max_depth_mm, depth_mm, np.float32(np.nan))
+
+    def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
+        """Fix the conversion; return this frame's depth (H, W) where it is the anchor's and not the conversion's."""
+        usable = frame.valid & np.isfinite(estimate.values)
+        if usable.sum() < _MIN_PIXELS:
+            return None
+        first_mm = None
+        source = self._source(estimate)
+        if source == "own":
+            self._conversion = DepthScale(1.0)
+        elif source == "near-far":
+            self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
+        else:
+            reference = self._reference.estimate(frame)
+            known = usable & (reference.values > 0) & (reference.values <= self._settings.max_depth_mm)
+            if known.sum() < _MIN_PIXELS:
+                return None
+            focal_px = reference.focal_px or frame.camera.fx
+            target = _Target(estimate.values[known], reference.values[known], focal_px)
+            self._conversion = self._fitted(estimate, target)
+            # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
+            first_mm = None if self._settings.fit_shift else reference.values
+        self._description = self._described(source, estimate, frame)
+        return first_mm
+
+    def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "reference"]:
+        anchor = self._settings.anchor
+        if estimate.kind == "measured" or anchor == self._settings.backend:
+            return "own"
+        if anchor == "near-far" or (anchor == "auto" and self._settings.near_far_mm is not None):
+            return "near-far"
+        return "own" if anchor == "auto" and estimate.kind == "depth" else "reference"
+
+    def _range_target(self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame) -> _Target:
+        values = estimate.values[usable]
+        near_far = (values.max(), values.min()) if estimate.kind == "disparity" else (values.min(), values.max())
+        return _Target(np.array(near_far, np.float64), np.array(self._settings.near_far_mm), frame.camera.fx)
+
+    def _fitted(self, estimate: DepthEstimate, target: _Target) -> AffineDisparity | DepthScale:
+        if estimate.kind == "depth":
+            return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
+        if self._settings.fit_shift:
+            farthest_mm = max(self._settings.max_depth_mm, *(self._settings.near_far_mm or (0.0,)))
+            return fit_affine_disparity(target.depth_mm, target.values, farthest_mm)
+        baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px)
+        return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
+
+    def _described(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
+        if estimate.kind == "measured":
+            return "measured depth"
+        if source == "near-far":
+            return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
+        name = self._settings.backend if source == "own" else self._reference.name
+        if name == "shading":
+            return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
+        return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"
+
+
+def _check_range(settings: DepthSettings) -> None:
+    if settings.near_far_mm is None:
+        if settings.anchor == "near-far":
+            raise SettingsError("depth.anchor=near-far needs a range: give it by --near-far NEAR:FAR (mm)")
+        return
+    near_mm, far_mm = settings.near_far_mm
+    if not 0 < near_mm < far_mm:
+        raise SettingsError(f"--near-far {near_mm:g}:{far_mm:g}: nearest must be positive and smaller than farthest")

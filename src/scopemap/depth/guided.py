@@ -1,0 +1,65 @@
+"""Edge-aware smoothing and filling of images with holes, from box filters alone.
+
+Guided filter: He, Sun and Tang, "Guided image filtering", ECCV 2010, eq. 5-8. Holes: normalised convolution, Knutsson
+and Westin, CVPR 1993.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from scopemap.errors import check_shape
+
+
+def masked_mean(image: np.ndarray, known: np.ndarray, radius_px: int) -> np.ndarray:
+    """Return the mean of the known pixels in a square window around every pixel.
+
+    image : (H, W) float32; what it holds where `known` is False does not matter, NaN included.
+    known : (H, W) bool.
+    radius_px : the window is 2 radius + 1 wide.
+
+    Returns (H, W) float32, NaN where the window holds no known pixel.
+    """
+    check_shape("known", known, np.shape(image))
+    window = (2 * radius_px + 1, 2 * radius_px + 1)
+    share = cv2.boxFilter(known.astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
+    mean = cv2.boxFilter(np.where(known, image, 0).astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
+    # Running sums leave rounding noise where a window holds nothing: half a pixel's share tells the two apart.
+    occupied = share > 0.5 / (window[0] * window[1])
+    return np.divide(mean, share, out=np.full_like(mean, np.nan), where=occupied)
+
+
+def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: float) -> np.ndarray:
+    """Smooth an image with itself as guide: differences well below `edge` go, those well above stay.
+
+    image : (H, W) float32.
+    known : (H, W) bool; other pixels have no say and come out NaN.
+    radius_px : radius of the window.
+    edge : standard deviation within a window that counts as an edge, unit of the image.
+
+    Returns (H, W) float32. Eq. 5-8 of He et al. with p = I and epsilon = edge^2.
+    """
+    mean = masked_mean(image, known, radius_px)
+    variance = np.maximum(masked_mean(image**2, known, radius_px) - mean**2, 0)
+    gain = variance / (variance + edge**2)
+    gain, offset = masked_mean(gain, known, radius_px), masked_mean((1 - gain) * mean, known, radius_px)
+    return np.where(known, gain * image + offset, np.nan).astype(np.float32)
+
+
+def filled(image: np.ndarray, known: np.ndarray, reach_px: int) -> np.ndarray:
+    """Fill unknown pixels from the nearest known ones, window by growing window.
+
+    image : (H, W) float32.
+    known : (H, W) bool.
+    reach_px : pixels farther than this (along rows or columns) from every known one stay NaN.
+
+    Returns (H, W) float32.
+    """
+    result = np.where(known, image, np.nan).astype(np.float32)
+    radius_px = 1
+    while radius_px < 2 * reach_px and np.isnan(result).any():
+        means = masked_mean(image, known, min(radius_px, reach_px))
+        result = np.where(np.isnan(result), means, result)
+        radius_px *= 2
+    return result

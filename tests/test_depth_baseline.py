@@ -1,0 +1,104 @@
+"""Disparity to depth: the optimiser against its closed form, and the affine fit against known scale and shift."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.depth.baseline import (
+    AffineDisparity,
+    baseline_closed_form,
+    fit_affine_disparity,
+    fit_baseline_lbfgsb,
+)
+from scopemap.errors import InputError
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=seeds, unit=st.floats(1e-6, 1e4), focal_px=st.floats(1, 5000), noise=st.floats(0, 0.5))
+def test_the_optimiser_agrees_with_the_closed_form(seed: int, unit: float, focal_px: float, noise: float) -> None:
+    rng = np.random.default_rng(seed)
+    depth_mm = rng.uniform(5, 200, (30, 40)) * np.exp(noise * rng.standard_normal((30, 40)))
+    disparity = unit / depth_mm * np.exp(noise * rng.standard_normal((30, 40)))
+    expected = baseline_closed_form(depth_mm, disparity, focal_px)
+    assert fit_baseline_lbfgsb(depth_mm, disparity, focal_px) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_true_baseline_comes_back_in_spite_of_unknown_and_far_pixels() -> None:
+    depth_mm = np.linspace(10, 90, 400).reshape(20, 20)
+    disparity = 570.0 * 4.3 / depth_mm
+    depth_mm[0, 0], depth_mm[1, 1], disparity[2, 2] = np.nan, -1.0, np.nan
+    disparity[3], disparity[4] = 0.0, 1e-9
+    for fit in (fit_baseline_lbfgsb, baseline_closed_form):
+        assert fit(depth_mm, disparity, 570.0) == pytest.approx(4.3, rel=1e-9)
+
+
+def test_the_closed_form_is_the_minimum_of_the_papers_sum() -> None:
+    rng = np.random.default_rng(1)
+    depth_mm, disparity = rng.uniform(10, 80, 500), rng.uniform(0.3, 1, 500)
+    baseline_mm = baseline_closed_form(depth_mm, disparity, 300.0)
+    cost = [np.mean((depth_mm - 300.0 * b / disparity) ** 2) for b in baseline_mm * np.array([0.999, 1, 1.001])]
+    assert cost[1] < min(cost[0], cost[2])
+
+
+def test_no_pixel_to_fit_a_baseline_to_is_an_error() -> None:
+    with pytest.raises(InputError, match="no pixel"):
+        fit_baseline_lbfgsb(np.ones(10), np.zeros(10), 300.0)
+
+
+def test_the_pseudo_stereo_form_is_an_affine_disparity_without_shift() -> None:
+    disparity = np.array([0.1, 0.5, 0.0, np.nan, -1.0])
+    depth_mm = AffineDisparity.from_baseline(4.0, 500.0).depth_mm(disparity)
+    assert depth_mm.dtype == np.float32
+    np.testing.assert_allclose(depth_mm[:2], [20000, 4000], rtol=1e-6)
+    assert np.isnan(depth_mm[2:]).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=seeds, scale=st.floats(1e-5, 10), far_mm=st.floats(30, 290), near_share=st.floats(0.05, 0.8))
+def test_exact_scale_and_shift_come_back(seed: int, scale: float, far_mm: float, near_share: float) -> None:
+    depth_mm = np.random.default_rng(seed).uniform(near_share * far_mm, far_mm, (20, 20))
+    shift = 0.7 / far_mm
+    found = fit_affine_disparity(depth_mm, (1 / depth_mm - shift) / scale, 300.0)
+    assert found.scale == pytest.approx(scale, rel=1e-6)
+    assert found.shift == pytest.approx(shift, rel=1e-6)
+
+
+def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
+    rng = np.random.default_rng(3)
+    depth_mm = rng.uniform(15, 100, 5000)
+    disparity = (1 / depth_mm - 0.008) / 0.07 + rng.normal(0, 0.01, depth_mm.size)
+    wrong = rng.random(depth_mm.size) < 0.2
+    disparity[wrong] = rng.uniform(0, 1, int(wrong.sum()))
+    found = fit_affine_disparity(depth_mm, disparity, 300.0)
+    plain = np.polyfit(disparity, 1 / depth_mm, 1)
+    error_mm = np.abs(found.depth_mm(disparity[~wrong]) - depth_mm[~wrong])
+    assert np.median(error_mm) < 2.0
+    assert np.median(error_mm) < 0.5 * np.median(np.abs(1 / np.polyval(plain, disparity[~wrong]) - depth_mm[~wrong]))
+
+
+def test_depth_stays_positive_over_the_range_of_the_fit() -> None:
+    """A line through these pixels crosses zero before the farthest of them: the fit must not."""
+    disparity = np.concatenate([np.linspace(0.5, 1, 200), [0.0]])
+    depth_mm = np.concatenate([1 / (0.1 * np.linspace(0.5, 1, 200) - 0.04), [80.0]])
+    found = fit_affine_disparity(depth_mm, disparity, 150.0)
+    converted = found.depth_mm(disparity)
+    assert np.isfinite(converted).all()
+    assert converted[-1] == pytest.approx(150.0, rel=1e-5)
+    assert (np.diff(converted[:-1]) < 0).all()
+
+
+@pytest.mark.parametrize("disparity", [np.full(100, 0.3), np.full(100, np.nan), np.zeros(100)])
+def test_constant_or_unknown_disparity_is_refused(disparity: np.ndarray) -> None:
+    with pytest.raises(InputError, match="constant or empty"):
+        fit_affine_disparity(np.linspace(10, 50, 100), disparity, 300.0)
+
+
+def test_depth_taken_for_disparity_is_refused_with_advice() -> None:
+    depth_mm = np.linspace(10, 50, 100)
+    with pytest.raises(InputError, match=r"depth\.files_kind=depth"):
+        fit_affine_disparity(depth_mm, depth_mm / 255, 300.0)

@@ -1,0 +1,215 @@
+"""Depth from files: which file, what its numbers mean, in which geometry; and the registry of depth sources."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from scopemap.calibration import write_calibration
+from scopemap.camera import PinholeCamera
+from scopemap.config import DepthSettings
+from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.depth import AnchoredDepth, create_anchor, create_depth
+from scopemap.depth.files import FilesDepth, depth_files
+from scopemap.errors import InputError, SettingsError
+from scopemap.frame import Frame
+from scopemap.lenses import FisheyeCamera
+from scopemap.rectification import Rectifier, working_camera
+
+SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
+TARGET = SOURCE.resized(60, 50)
+SAME = Rectifier(TARGET, TARGET)
+
+
+def frame(index: int = 0, camera: PinholeCamera = TARGET) -> Frame:
+    size = (camera.height, camera.width)
+    return Frame(index, 0.0, np.zeros((*size, 3), np.uint8), camera, np.ones(size, bool))
+
+
+def files(folder: Path, scale_mm: float | None = None, rectifier: Rectifier = SAME, **settings: Any) -> FilesDepth:
+    return FilesDepth(folder, rectifier, DepthSettings(**settings), scale_mm)
+
+
+def write(folder: Path, name: str, array: np.ndarray) -> None:
+    if name.endswith(".npy"):
+        np.save(folder / name, array)
+    else:
+        assert cv2.imwrite(str(folder / name), array)
+
+
+def ramp(dtype: type, top: int) -> np.ndarray:
+    return np.linspace(0, top, 50 * 60).reshape(50, 60).astype(dtype)
+
+
+@pytest.mark.parametrize("extension", ["png", "tiff"])
+def test_8_bit_is_disparity_and_zero_is_its_farthest(tmp_path: Path, extension: str) -> None:
+    write(tmp_path, f"7.{extension}", ramp(np.uint8, 255))
+    estimate = files(tmp_path).estimate(frame(7))
+    assert estimate.kind == "disparity"
+    assert estimate.values.dtype == np.float32
+    np.testing.assert_allclose(estimate.values, ramp(np.uint8, 255) / 255, atol=1e-6)
+
+
+def test_16_bit_is_measured_mm_with_0_and_65535_unknown(tmp_path: Path) -> None:
+    array = ramp(np.uint16, 65535)
+    write(tmp_path, "frame-000003.depth.png", array)
+    source = files(tmp_path)
+    estimate = source.estimate(frame(3))
+    assert estimate.kind == "measured"
+    expected = np.where((array > 0) & (array < 65535), array, np.nan)
+    np.testing.assert_allclose(estimate.values, expected)
+    assert "assumed" in source.provenance()["depth_scale"]
+
+
+def test_8_bit_depth_where_the_setting_says_so(tmp_path: Path) -> None:
+    write(tmp_path, "frame-000000.depth.png", ramp(np.uint8, 255))
+    estimate = files(tmp_path, files_kind="measured").estimate(frame())
+    assert estimate.kind == "measured"
+    np.testing.assert_allclose(estimate.values, np.where(ramp(np.uint8, 255) > 0, ramp(np.uint8, 255), np.nan))
+
+
+def test_16_bit_disparity_and_predicted_depth_where_the_setting_says_so(tmp_path: Path) -> None:
+    array = ramp(np.uint16, 65535)
+    write(tmp_path, "0.png", array)
+    np.testing.assert_allclose(
+        files(tmp_path, files_kind="disparity").estimate(frame()).values, array / 65535, rtol=1e-5
+    )
+    assert files(tmp_path, files_kind="depth").estimate(frame()).kind == "depth"
+
+
+def test_arrays_of_floats(tmp_path: Path) -> None:
+    depth_mm = ramp(np.float64, 80)
+    depth_mm[0, 5], depth_mm[1, 5] = np.nan, -3
+    write(tmp_path, "0001.npy", depth_mm)
+    measured = files(tmp_path).estimate(frame(1))
+    assert measured.kind == "measured"
+    np.testing.assert_allclose(measured.values, np.where(depth_mm > 0, depth_mm, np.nan), rtol=1e-6)
+    other = tmp_path / "other"
+    other.mkdir()
+    write(other, "disp_0001.npy", depth_mm)
+    relative = files(other).estimate(frame(1))
+    assert relative.kind == "disparity"
+    assert relative.values[0, 0] == 0.0
+    assert np.isnan(relative.values[1, 5])
+
+
+def _calibrate(folder: Path) -> None:
+    write_calibration(SOURCE, folder / "camera.yaml", 0.004)
+
+
+def test_the_scale_and_its_order_of_precedence(tmp_path: Path) -> None:
+    write(tmp_path, "0000_depth.tiff", np.full((50, 60), 1000, np.uint16))
+
+    def value_mm(scale_mm: float | None = None, **settings: Any) -> float:
+        return float(files(tmp_path, scale_mm, **settings).estimate(frame()).values[20, 20])
+
+    assert value_mm() == pytest.approx(1000 * 100 / 65535)
+    assert value_mm(0.003) == pytest.approx(3.0)
+    _calibrate(tmp_path)
+    assert value_mm(0.003) == pytest.approx(4.0)
+    (tmp_path / "depth.json").write_text(json.dumps({"scale_mm": 0.005}))
+    assert value_mm(0.003) == pytest.approx(5.0)
+    assert value_mm(0.003, files_scale_mm=0.006) == pytest.approx(6.0)
+    (tmp_path / "depth.json").write_text("{}")
+    with pytest.raises(InputError, match="scale_mm"):
+        files(tmp_path)
+
+
+def test_depth_is_found_among_the_files_of_its_frame(tmp_path: Path) -> None:
+    for number in (0, 2, 10):
+        write(tmp_path, f"{number}_color.png", np.zeros((50, 60, 3), np.uint8))
+        write(tmp_path, f"{number}_depth.tiff", np.full((50, 60), 600 + number, np.uint16))
+        write(tmp_path, f"{number}_mask.png", np.zeros((50, 60), np.uint8))
+    found = depth_files(tmp_path)
+    assert list(found) == [0, 2, 10]
+    assert all(file.name == f"{number}_depth.tiff" for number, file in found.items())
+    assert files(tmp_path).estimate(frame(10)).values[9, 9] == pytest.approx(610 * 100 / 65535)
+
+
+def test_files_follow_the_lens_of_the_frames_at_another_size(tmp_path: Path) -> None:
+    """Disparity drawn in half-size fisheye pixels arrives where the rectified ray says it belongs."""
+    fisheye = FisheyeCamera(PinholeCamera(60.0, 60.0, 59.5, 49.5, 120, 100), (-0.05, 0.002, 0.0, 0.0))
+    rectifier = Rectifier(fisheye, working_camera(fisheye, (60, 50)))
+    u, v = np.meshgrid(np.arange(60), np.arange(50))
+    write(tmp_path, "0.png", (2 * u + 2 * v).astype(np.uint8))
+    values = files(tmp_path, rectifier=rectifier).estimate(frame(0, rectifier.target)).values
+    for x, y in ((30, 25), (10, 12), (50, 40)):
+        source = fisheye.project(rectifier.target.unproject(np.array([x, y])))
+        expected = sum(2 * ((s + 0.5) / 2 - 0.5) for s in source) / 255
+        assert values[y, x] == pytest.approx(expected, abs=0.005)
+
+
+def test_a_runs_own_depth_is_not_rectified_twice(tmp_path: Path) -> None:
+    fisheye = FisheyeCamera(PinholeCamera(60.0, 60.0, 59.5, 49.5, 120, 100), (-0.05, 0.002, 0.0, 0.0))
+    rectifier = Rectifier(fisheye, working_camera(fisheye, (60, 50)))
+    array = ramp(np.uint16, 60000) + np.uint16(1)
+    write(tmp_path, "000000.png", array)
+    (tmp_path / "depth.json").write_text(json.dumps({"scale_mm": 0.001}))
+    values = files(tmp_path, rectifier=rectifier).estimate(frame(0, rectifier.target)).values
+    np.testing.assert_allclose(values, array * 0.001, rtol=1e-6)
+
+
+def test_a_frame_without_a_file_is_an_error_that_names_both(tmp_path: Path) -> None:
+    write(tmp_path, "4.png", ramp(np.uint8, 255))
+    with pytest.raises(InputError, match=f"frame 5 in {tmp_path}"):
+        files(tmp_path).estimate(frame(5))
+
+
+def test_another_aspect_is_an_error_that_names_both_sizes(tmp_path: Path) -> None:
+    write(tmp_path, "0.png", np.zeros((50, 50), np.uint8))
+    with pytest.raises(InputError, match=r"50x50 px.*60x50 px"):
+        files(tmp_path).estimate(frame())
+
+
+def test_mixed_8_and_16_bit_need_a_word_from_the_user(tmp_path: Path) -> None:
+    write(tmp_path, "0.png", np.full((50, 60), 60, np.uint8))
+    write(tmp_path, "1.png", np.full((50, 60), 300, np.uint16))
+    with pytest.raises(InputError, match=r"depth\.files_kind"):
+        files(tmp_path).estimate(frame(1))
+    assert files(tmp_path, files_kind="measured").estimate(frame(1)).values[3, 3] == 300.0
+
+
+def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no folder"):
+        files(tmp_path / "absent")
+    with pytest.raises(InputError, match="no png, tif, jpg or npy"):
+        files(tmp_path)
+    write(tmp_path, "0.png", np.dstack([ramp(np.uint8, 255), 0 * ramp(np.uint8, 1), ramp(np.uint8, 9)]))
+    with pytest.raises(InputError, match="coloured picture"):
+        files(tmp_path)
+    (tmp_path / "0.png").write_bytes(b"not a picture")
+    with pytest.raises(InputError, match="cannot read the depth file"):
+        files(tmp_path)
+    write(tmp_path, "00.png", ramp(np.uint8, 255))
+    with pytest.raises(InputError, match="two depth files for frame 0"):
+        files(tmp_path)
+
+
+def test_the_registry_knows_its_names(tmp_path: Path) -> None:
+    write(tmp_path, "0.png", ramp(np.uint8, 255))
+    assert create_depth(DepthSettings(), SAME, "cpu").name == "shading"
+    assert isinstance(create_depth(DepthSettings(backend=f"files:{tmp_path}"), SAME, "cpu"), FilesDepth)
+    assert isinstance(create_anchor(DepthSettings(), "cpu"), AnchoredDepth)
+    with pytest.raises(SettingsError, match="shading, depth-anything, depth-pro or files:FOLDER"):
+        create_depth(DepthSettings(backend="midas"), SAME, "cpu")
+
+
+@pytest.mark.real
+def test_real_disparity_files_of_a_fisheye_video(real_data: Path) -> None:
+    """Anchored by near and far, frame 0 comes within 10 % of the peers' reading of the same files everywhere."""
+    folder = real_data / "endoscopy" / "c3vd"
+    source = C3vdFolder(folder / "cecum_t1_a")
+    assert source.camera is not None
+    rectifier = Rectifier(source.camera, working_camera(source.camera, (337, 270)))
+    settings = DepthSettings(backend=f"files:{folder / 'cecum_t1_a_depth_anything'}", near_far_mm=(13.5, 100.0))
+    first = frame(0, rectifier.target)
+    estimate = create_depth(settings, rectifier, "cpu").estimate(first)
+    depth_mm = create_anchor(settings, "cpu").depth_mm(estimate, first)
+    convention_mm = 15.6 / (estimate.values + 0.156)
+    assert np.isfinite(depth_mm).mean() > 0.99
+    assert np.nanmax(np.abs(depth_mm / convention_mm - 1)) < 0.15
