@@ -1,0 +1,1 @@
+"""Numbers only: poses, depth and surfaces against the truth; knows no stage of the pipeline."""

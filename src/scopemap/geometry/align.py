@@ -1,0 +1,119 @@
+"""Alignment of trajectories: the similarity that takes the estimated world to the reference world.
+
+Source of the closed form: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+IEEE TPAMI 13(4), 1991, eq. 34-43.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scopemap.errors import AlignmentError, check_shape
+from scopemap.geometry.se3 import inverse
+
+AlignMode = Literal["none", "origin", "se3", "sim3"]
+
+# Singular values below this share of the largest are rounding, not motion.
+_RANK_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Takes points x to `scale * R x + t`.
+
+    Attributes
+    ----------
+    scale : > 0, unitless.
+    R : (3, 3) rotation.
+    t : (3,) translation, mm.
+    singular_values : (3,) of the covariance that was fitted, largest first; None where nothing was fitted.
+    """
+
+    scale: float
+    R: np.ndarray
+    t: np.ndarray
+    singular_values: np.ndarray | None = None
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        """Return the similarity that changes nothing."""
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    @property
+    def line_ratio(self) -> float:
+        """Second over first singular value; below 1e-3 the path is nearly a line and the turn about it is weak.
+
+        NaN where nothing was fitted.
+        """
+        if self.singular_values is None:
+            return float("nan")
+        return float(self.singular_values[1] / self.singular_values[0])
+
+    def transform_points(self, points: np.ndarray) -> np.ndarray:
+        """Return points of shape (..., 3), mm, moved to the reference world."""
+        return self.scale * points @ self.R.T + self.t
+
+    def transform_poses(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return poses of shape (N, 4, 4) moved to the reference world; the scale acts on positions only."""
+        moved = np.array(T_world_camera, dtype=np.float64)
+        moved[..., :3, :3] = self.R @ moved[..., :3, :3]
+        moved[..., :3, 3] = self.transform_points(moved[..., :3, 3])
+        return moved
+
+
+def umeyama(points_from: np.ndarray, points_to: np.ndarray, with_scale: bool) -> Similarity:
+    """Return the similarity that takes `points_from` to `points_to` with the least squared error.
+
+    Both are (N, 3) float64, mm, matched row by row. Without scale the best rigid motion is returned. A straight line or
+    a single place leaves the rotation free: `AlignmentError`, with the singular values. Umeyama 1991, eq. 34-43.
+    """
+    check_shape("points_from", points_from, (None, 3))
+    check_shape("points_to", points_to, (len(points_from), 3))
+    mean_from, mean_to = points_from.mean(axis=0), points_to.mean(axis=0)
+    centred_from, centred_to = points_from - mean_from, points_to - mean_to
+    covariance = centred_to.T @ centred_from / len(points_from)
+    U, D, Vt = np.linalg.svd(covariance)
+    _refuse_degenerate(D, float(np.linalg.norm(points_from) * np.linalg.norm(points_to)) / len(points_from))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = U * signs @ Vt
+    scale = float(D @ signs / np.mean(np.sum(centred_from**2, axis=1))) if with_scale else 1.0
+    return Similarity(scale, R, mean_to - scale * R @ mean_from, D)
+
+
+def _refuse_degenerate(singular_values: np.ndarray, magnitude: float) -> None:
+    largest = singular_values[0]
+    moving = largest > _RANK_TOLERANCE * magnitude
+    rank = int(np.sum(singular_values > _RANK_TOLERANCE * largest)) if moving else 0
+    if rank < 2:
+        values = ", ".join(f"{value:.3g}" for value in singular_values)
+        raise AlignmentError(
+            f"cannot fit a rotation: the positions lie {'on one line' if rank else 'in one place'} (singular values of "
+            f"their covariance: {values}); align by 'origin' or 'none' instead"
+        )
+
+
+def align_trajectories(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> tuple[np.ndarray, Similarity]:
+    """Return the estimated poses moved onto the reference, and the similarity that moved them.
+
+    Both are (N, 4, 4) float64 camera-to-world, mm, matched row by row. `none` moves nothing, `origin` puts the first
+    poses onto each other, `se3` and `sim3` fit the positions (`umeyama`). Raises `AlignmentError` where the fit is
+    degenerate or `mode` is unknown.
+    """
+    check_shape("estimated", estimated, (None, 4, 4))
+    check_shape("reference", reference, (len(estimated), 4, 4))
+    similarity = _fit(estimated, reference, mode)
+    return similarity.transform_poses(estimated), similarity
+
+
+def _fit(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> Similarity:
+    if mode == "none":
+        return Similarity.identity()
+    if mode == "origin":
+        T = reference[0] @ inverse(estimated[0])
+        return Similarity(1.0, T[:3, :3], T[:3, 3])
+    if mode in ("se3", "sim3"):
+        return umeyama(estimated[:, :3, 3], reference[:, :3, 3], with_scale=mode == "sim3")
+    raise AlignmentError(f"unknown alignment '{mode}': choose none, origin, se3 or sim3")

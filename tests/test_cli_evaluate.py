@@ -1,0 +1,130 @@
+"""`scopemap evaluate`: keys, alignment, mesh, formats, warnings, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import typer
+from sample_trajectories import as_trajectory, vector_a, write_c3vd, write_run
+from typer.testing import CliRunner
+
+from scopemap.cli.evaluate import evaluate
+from scopemap.errors import AlignmentError, InputError
+from scopemap.geometry.align import align_trajectories
+from scopemap.trajectory import path_length_mm, write_kitti, write_tum
+
+KEYS = [
+    *("frames", "tracked", "align", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
+    *("rotation_mean_deg", "rotation_max_deg", "rotation_unaligned_mean_deg", "rotation_unaligned_max_deg"),
+    *("rpe_1_mm", "rpe_1_deg", "rpe_10_mm", "rpe_10_deg", "tlr"),
+]
+
+
+def run(*arguments: object, code: int = 0) -> object:
+    app = typer.Typer()
+    app.command()(evaluate)
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, (result.output, result.exception)
+    return result
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    estimated, reference = vector_a()
+    return write_run(tmp_path / "run", as_trajectory(estimated)), write_c3vd(tmp_path / "truth", reference)
+
+
+@pytest.mark.parametrize(
+    ("align", "ate"), [("none", 10.058219), ("origin", 8.782756), ("se3", 5.585285), ("sim3", 0.308821)]
+)
+def test_json_has_the_keys_and_the_known_figures(folders: tuple[Path, Path], align: str, ate: float) -> None:
+    figures = json.loads(run(folders[0], "--truth", folders[1], "--align", align, "--json").stdout)
+    assert list(figures) == KEYS
+    assert figures["align"] == align
+    assert figures["ate_rmse_mm"] == pytest.approx(ate, abs=2e-6)
+    assert figures["frames"] == 60
+
+
+def test_sim3_is_the_default_and_the_table_says_so(folders: tuple[Path, Path]) -> None:
+    output = run(folders[0], "--truth", folders[1]).stdout
+    assert "60 of 60 frames tracked, align sim3, scale 2.4977" in output
+    assert "0.3088" in output
+    assert run(folders[0], "--truth", folders[1], "--quiet").stdout.count("\n") == 1
+
+
+def test_paper_units_are_radians(folders: tuple[Path, Path]) -> None:
+    figures = json.loads(run(folders[0], "--truth", folders[1], "--json", "--paper-units").stdout)
+    assert list(figures) == [*KEYS, "paper"]
+    assert np.degrees(figures["paper"]["r_avg_rad"]) == pytest.approx(figures["rotation_mean_deg"])
+    assert figures["paper"]["t_fin_mm"] == pytest.approx(0.225936, abs=2e-6)
+    assert "R_avg +- std (rad)" in run(folders[0], "--truth", folders[1], "--paper-units").stdout
+
+
+def test_lost_frames_warn_on_stderr_and_json_stays_json(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+    lossy = write_run(tmp_path / "lossy", as_trajectory(vector_a()[0][:9], lost=(4, 5)))
+    result = run(lossy, "--truth", folders[1], "--json")
+    figures = json.loads(result.stdout)
+    assert (figures["frames"], figures["tracked"]) == (9, 7)
+    assert figures["ate_hold_rmse_mm"] > figures["ate_rmse_mm"]
+    assert figures["rpe_10_mm"] is None
+    assert "2 of 9 frames are lost" in result.stderr
+    assert run(lossy, "--truth", folders[1], "--json", "--quiet").stderr == ""
+
+
+def test_nearly_straight_path_warns(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(50, 3)) * [20, 0.1, 0.1]
+    truth = write_c3vd(tmp_path / "truth", poses)
+    assert "nearly a straight line" in run(truth, "--truth", truth).stderr
+    assert run(truth, "--truth", truth, "--align", "origin").stderr == ""
+
+
+def test_foreign_files_in_metres_and_by_frame_number(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+    estimated = as_trajectory(vector_a()[0])
+    write_kitti(tmp_path / "kitti.txt", estimated, unit="m")
+    write_tum(tmp_path / "ours.tum", estimated)
+    rows = np.loadtxt(tmp_path / "ours.tum")
+    rows[:, 0] = np.arange(60)
+    rows[:, 1:4] /= 1000
+    np.savetxt(tmp_path / "numbered.tum", rows[5:50:3])
+    lengths = [path_length_mm(poses[5:50:3, :3, 3]) for poses in vector_a()]
+    expected = [("kitti.txt", 60, 0.436782), ("ours.tum", 60, 0.436782), ("numbered.tum", 15, lengths[0] / lengths[1])]
+    for name, frames, tlr in expected:
+        arguments = (tmp_path / name, "--truth", folders[1], "--unit", "m", "--align", "none", "--json")
+        figures = json.loads(run(*arguments).stdout)
+        assert figures["frames"] == frames
+        assert figures["tlr"] == pytest.approx(tlr, abs=1e-6)
+    wrong = json.loads(run(tmp_path / "kitti.txt", "--truth", folders[1], "--json").stdout)
+    assert wrong["tlr"] == pytest.approx(0.436782e-3, rel=1e-5)
+
+
+def test_mesh_is_moved_by_the_alignment_of_the_trajectory(tmp_path: Path) -> None:
+    estimated, reference = vector_a()
+    _, similarity = align_trajectories(estimated, reference, "sim3")
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=20.0)
+    run_folder = write_run(tmp_path / "run", as_trajectory(estimated))
+    truth_folder = write_c3vd(tmp_path / "truth", reference)
+    sphere.export(truth_folder / "mesh_truth.ply")
+    # The estimate's own world: the inverse of the alignment, on a sphere 1 mm larger.
+    larger = trimesh.creation.icosphere(subdivisions=4, radius=21.0)
+    larger.vertices = (larger.vertices - similarity.t) @ similarity.R / similarity.scale
+    larger.export(run_folder / "mesh.ply")
+    figures = json.loads(run(run_folder, "--truth", truth_folder, "--json").stdout)
+    assert list(figures) == [*KEYS, "mesh_accuracy_mm", "mesh_accuracy_p90_mm", "mesh_completeness_mm"]
+    assert figures["mesh_accuracy_mm"] == pytest.approx(1.0, abs=0.02)
+    assert figures["mesh_accuracy_p90_mm"] == pytest.approx(1.0, abs=0.05)
+    assert figures["mesh_completeness_mm"] == pytest.approx(1.0, abs=0.02)
+    (run_folder / "mesh.ply").write_text("not a mesh")
+    assert isinstance(run(run_folder, "--truth", truth_folder, code=1).exception, InputError)
+
+
+def test_refusals(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+    two = write_run(tmp_path / "two", as_trajectory(vector_a()[0][:2]))
+    assert isinstance(run(two, "--truth", folders[1], code=1).exception, AlignmentError)
+    assert isinstance(run(tmp_path / "none", "--truth", folders[1], code=1).exception, InputError)
+    assert "sim4" in run(folders[0], "--truth", folders[1], "--align", "sim4", code=2).output
+    run(folders[0], code=2)

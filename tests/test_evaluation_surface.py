@@ -1,0 +1,122 @@
+"""Surfaces: closed forms on planes and spheres, exactness against brute force, the stated bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.evaluation.surface import FScore, compare_surfaces, distance_to_mesh, surface_points
+
+
+def brute_force(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
+    distances = []
+    for point in points:
+        closest = trimesh.triangles.closest_point(mesh.triangles, np.tile(point, (len(mesh.faces), 1)))
+        distances.append(np.linalg.norm(closest - point, axis=1).min())
+    return np.array(distances)
+
+
+def wavy_sheet(side: int, step_mm: float) -> trimesh.Trimesh:
+    u, v = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    vertices = np.stack([u * step_mm, v * step_mm, 3 * np.sin(0.2 * u * step_mm) * np.cos(0.15 * v * step_mm)], -1)
+    a = (u * side + v)[:-1, :-1].ravel()
+    faces = np.concatenate([np.stack([a, a + side, a + 1], 1), np.stack([a + side, a + side + 1, a + 1], 1)])
+    return trimesh.Trimesh(vertices.reshape(-1, 3), faces, process=False)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), step_mm=st.sampled_from([0.7, 1.5, 6.0]))
+def test_near_the_surface_the_distance_is_exact(seed: int, step_mm: float) -> None:
+    mesh = wavy_sheet(20, step_mm)
+    rng = np.random.default_rng(seed)
+    points = mesh.vertices[rng.integers(len(mesh.vertices), size=60)] + rng.normal(scale=1.5, size=(60, 3))
+    np.testing.assert_allclose(distance_to_mesh(points, mesh), brute_force(points, mesh), atol=1e-9)
+
+
+def test_from_far_away_the_distance_is_exact_to_a_sheet() -> None:
+    mesh = wavy_sheet(80, 1.0)
+    points = np.random.default_rng(0).uniform([0, 0, -60], [80, 80, 60], size=(150, 3))
+    np.testing.assert_allclose(distance_to_mesh(points, mesh), brute_force(points, mesh), atol=1e-9)
+
+
+def test_a_crowd_of_nearer_centroids_costs_no_more_than_the_bound() -> None:
+    # 200 specks 10 mm from the origin, and the tip of one larger triangle at 9.5 mm whose centroid lies behind them.
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(200, 3))
+    centres = 10 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    specks = centres[:, None] + rng.normal(scale=1e-3, size=(200, 3, 3))
+    tip = np.array([[[9.5, 0, 0], [11.2, 0.5, 0], [11.2, -0.5, 0]]])
+    crowd = trimesh.Trimesh(np.concatenate([specks, tip]).reshape(-1, 3), np.arange(603).reshape(-1, 3), process=False)
+    origin = np.zeros((1, 3))
+    assert brute_force(origin, crowd)[0] == pytest.approx(9.5)
+    radius = np.linalg.norm(tip[0] - tip[0].mean(axis=0), axis=1).max()
+    assert 9.9 < distance_to_mesh(origin, crowd)[0] < 9.5 + radius
+
+
+def test_large_and_few_triangles() -> None:
+    single = trimesh.Trimesh([[0, 0, 0], [100, 0, 0], [0, 100, 0]], [[0, 1, 2]])
+    points = np.array([[20, 20, 7.0], [-3, -4, 0], [100, 100, 0], [50, 50, 0]])
+    expected = [7, 5, np.sqrt(2) * 50, 0]
+    np.testing.assert_allclose(distance_to_mesh(points, single), expected, atol=1e-9)
+    tiny = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    np.testing.assert_allclose(distance_to_mesh(points, tiny), brute_force(points, tiny), atol=1e-9)
+    assert distance_to_mesh(np.empty((0, 3)), tiny).shape == (0,)
+
+
+def test_parallel_planes_are_their_distance_apart() -> None:
+    lower = trimesh.creation.box(extents=(30, 30, 1e-6))
+    upper = lower.copy()
+    upper.apply_translation([0, 0, 1.5])
+    report = compare_surfaces(upper, lower)
+    for summary in (report.accuracy, report.completeness):
+        assert [summary.mean_mm, summary.median_mm, summary.rms_mm, summary.p90_mm] == pytest.approx(
+            [1.5] * 4, abs=1e-5
+        )
+    assert report.chamfer_mm == pytest.approx(1.5, abs=1e-5)
+    assert [score.f_score for score in report.scores] == [0.0, 1.0, 1.0]
+
+
+def test_half_of_a_surface_is_accurate_but_not_complete() -> None:
+    whole = wavy_sheet(41, 1.0)
+    half = whole.submesh([np.flatnonzero(whole.triangles_center[:, 0] < 20)], append=True)
+    report = compare_surfaces(half, whole)
+    assert report.accuracy.mean_mm == pytest.approx(0, abs=1e-9)
+    assert 3 < report.completeness.mean_mm < 10
+    one_mm = report.scores[0]
+    assert one_mm.precision == 1
+    # The half, and the strip of 1 mm beside it.
+    assert one_mm.recall == pytest.approx(0.5 + 1 / 40, abs=0.02)
+
+
+def test_concentric_spheres_and_points_against_a_mesh() -> None:
+    inner, outer = (trimesh.creation.icosphere(subdivisions=5, radius=radius) for radius in (20.0, 22.0))
+    assert compare_surfaces(inner, outer).chamfer_mm == pytest.approx(2.0, abs=0.02)
+    on_outer = surface_points(outer, seed=3)
+    assert compare_surfaces(on_outer, inner).accuracy.mean_mm == pytest.approx(2.0, abs=0.02)
+    # From point to point a spacing of half a millimetre shows up as error; to the mesh it does not.
+    assert 0.05 < compare_surfaces(on_outer, surface_points(outer, seed=4)).accuracy.mean_mm < 0.3
+    assert compare_surfaces(on_outer, outer).accuracy.mean_mm == pytest.approx(0, abs=1e-9)
+
+
+def test_sampling_is_dense_even_and_repeatable() -> None:
+    box = trimesh.creation.box(extents=(20, 20, 20))
+    points = surface_points(box)
+    assert len(points) >= box.area / 0.25
+    on_top = np.mean(points[:, 2] > 10 - 1e-6)
+    assert on_top == pytest.approx(1 / 6, abs=0.02)
+    np.testing.assert_array_equal(points, surface_points(box))
+
+
+def test_empty_surfaces_are_refused() -> None:
+    with pytest.raises(ValueError, match="no points"):
+        surface_points(np.empty((0, 3)))
+    with pytest.raises(ValueError, match="no area"):
+        surface_points(trimesh.Trimesh())
+
+
+def test_f_score() -> None:
+    assert FScore(1.0, 0.5, 1.0).f_score == pytest.approx(2 / 3)
+    assert FScore(1.0, 0.0, 0.0).f_score == 0

@@ -1,0 +1,175 @@
+"""Trajectory files: every form is read back as the poses that were written, bad input is named with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sample_trajectories import write_c3vd, write_run
+
+from scopemap.errors import InputError
+from scopemap.geometry.se3 import se3_exp
+from scopemap.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    rng = np.random.default_rng(0)
+    twists = np.hstack([rng.normal(size=(6, 3)), rng.normal(scale=80, size=(6, 3))])
+    status = np.array(["initial", "ok", "lost", "lost", "ok", "ok"])
+    poses = np.stack([se3_exp(twist) for twist in twists])
+    return Trajectory(np.array([0, 2, 4, 6, 8, 11]), np.array([0, 2, 4, 6, 8, 11]) / 25, poses, status)
+
+
+def test_properties(trajectory: Trajectory) -> None:
+    assert trajectory.tracked.tolist() == [True, True, False, False, True, True]
+    steps = np.diff(trajectory.T_world_camera[:, :3, 3], axis=0)
+    assert trajectory.path_length_mm == pytest.approx(sum(np.sqrt(step @ step) for step in steps))
+    assert trajectory.rows(trajectory.tracked).indices.tolist() == [0, 2, 8, 11]
+
+
+def test_run_folder_gives_back_indices_and_lost_frames(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_run(tmp_path, trajectory)
+    found = read_trajectory(tmp_path)
+    np.testing.assert_array_equal(found.indices, trajectory.indices)
+    np.testing.assert_array_equal(found.status, trajectory.status)
+    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-7)
+    assert found.has_indices
+
+
+def test_run_folder_whose_files_do_not_fit_is_refused(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_run(tmp_path, trajectory)
+    table = (tmp_path / "frames.csv").read_text()
+    for changed in (table.rsplit("\n", 2)[0], table.replace("0.080000", "0.120000"), table.replace("lost", "gone")):
+        (tmp_path / "frames.csv").write_text(changed)
+        with pytest.raises(InputError, match=r"same run|status"):
+            read_trajectory(tmp_path)
+    (tmp_path / "frames.csv").write_text(table.replace("time_s", "seconds"))
+    with pytest.raises(InputError, match="index, time_s and status"):
+        read_trajectory(tmp_path)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_tum_says_its_unit_and_its_times(tmp_path: Path, trajectory: Trajectory, unit: str) -> None:
+    write_tum(tmp_path / "a.tum", trajectory, unit=unit)
+    numbers = np.loadtxt(tmp_path / "a.tum")
+    assert numbers.shape == (6, 8)
+    assert np.all(numbers[:, 7] >= 0)
+    np.testing.assert_allclose(numbers[:, 1:4] * {"mm": 1, "m": 1000}[unit], trajectory.positions_mm, atol=1e-5)
+    # The header wins over what the caller assumes.
+    found = read_trajectory(tmp_path / "a.tum", unit="m" if unit == "mm" else "mm")
+    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-5)
+    np.testing.assert_allclose(found.times_s, trajectory.times_s, atol=1e-6)
+    assert not found.has_indices
+
+
+def test_our_tum_with_whole_seconds_is_not_taken_for_frame_numbers(tmp_path: Path, trajectory: Trajectory) -> None:
+    whole = Trajectory(trajectory.indices, np.arange(6.0), trajectory.T_world_camera, trajectory.status)
+    write_tum(tmp_path / "a.tum", whole)
+    assert not read_trajectory(tmp_path / "a.tum").has_indices
+    body = "\n".join((tmp_path / "a.tum").read_text().splitlines()[2:])
+    (tmp_path / "foreign.tum").write_text(body)
+    foreign = read_trajectory(tmp_path / "foreign.tum")
+    assert foreign.has_indices
+    assert foreign.indices.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_foreign_tum_is_sorted_and_scaled(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("# from elsewhere\n0.5 1 2 3 0 0 0 1\n\n0.25, 4, 5, 6, 0, 0, 0, -1 # late\n")
+    found = read_trajectory(tmp_path / "a.txt", unit="m")
+    np.testing.assert_allclose(found.times_s, [0.25, 0.5])
+    np.testing.assert_allclose(found.positions_mm, [[4000, 5000, 6000], [1000, 2000, 3000]])
+    np.testing.assert_allclose(found.T_world_camera[:, :3, :3], np.stack([np.eye(3)] * 2), atol=1e-15)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_kitti_round_trip(tmp_path: Path, trajectory: Trajectory, unit: str) -> None:
+    write_kitti(tmp_path / "a.txt", trajectory, unit=unit)
+    found = read_trajectory(tmp_path / "a.txt", unit=unit)
+    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-8)
+    assert found.indices.tolist() == list(range(6))
+    np.testing.assert_allclose(found.times_s, np.arange(6) / 30)
+
+
+def test_c3vd_in_both_forms_and_with_a_pose_at_the_origin(tmp_path: Path, trajectory: Trajectory) -> None:
+    poses = trajectory.T_world_camera.copy()
+    poses[0, :3, 3] = 0  # ambiguous alone: the form is decided over the whole file
+    stored, row_major = tmp_path / "pose.txt", tmp_path / "row_major.txt"
+    write_c3vd(tmp_path, poses, digits=6)
+    row_major.write_text("# row-major\n" + "".join(" ".join(f"{x:.6g}" for x in T.ravel()) + "\n" for T in poses))
+    for path in (stored, row_major, tmp_path):
+        found = read_trajectory(path)
+        np.testing.assert_allclose(found.T_world_camera, poses, atol=2e-3)
+        # Six digits in the file, exact rotations inside.
+        R = found.T_world_camera[:, :3, :3]
+        np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.stack([np.eye(3)] * 6), atol=1e-12)
+
+
+def test_seven_scenes_is_metres_and_numbered_by_file(tmp_path: Path, trajectory: Trajectory) -> None:
+    for number, T in zip((3, 10, 100), trajectory.T_world_camera, strict=False):
+        metres = T.copy()
+        metres[:3, 3] /= 1000
+        np.savetxt(tmp_path / f"frame-{number:06d}.pose.txt", metres)
+    found = read_trajectory(tmp_path)
+    assert found.indices.tolist() == [3, 10, 100]
+    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera[:3], atol=1e-9)
+
+
+GOOD = "0 0 0 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no pose"),
+        ("# only a comment\n", "no pose"),
+        (GOOD + "x 0 0 0 0 0 0 1\n", "line 2: expected numbers"),
+        (GOOD + "\n1 nan 0 0 0 0 0 1\n", "line 3: a pose holds NaN"),
+        (GOOD + "1 0 0 0 0 0 0\n", "line 2: found 7 numbers"),
+        (GOOD + "1 0 0 0 0 0 0 0\n", "line 2: the quaternion has length 0"),
+        (GOOD + "0 1 1 1 0 0 0 1\n", "line 2: the time stamp of an earlier line"),
+        ("1 2 3\n", "its lines hold 3 numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 2 0 0 0 0 2 0\n", r"line 2: not a rigid motion"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", r"line 1: not a rigid motion .*det R = -1"),
+        ("1 0 0 5 0 1 0 0 0 0 1 0 5 0 0 1\n", "neither the last row nor the last column"),
+        ("1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 2\n", "line 1: not a rigid motion"),
+    ],
+)
+def test_bad_files_are_named_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_trajectory(path)
+
+
+def test_missing_empty_and_binary_paths(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no file or folder"):
+        read_trajectory(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"looked for trajectory\.tum"):
+        read_trajectory(tmp_path)
+    (tmp_path / "movie.mp4").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="cannot read a trajectory"):
+        read_trajectory(tmp_path / "movie.mp4")
+
+
+def test_impossible_trajectories_are_refused(trajectory: Trajectory) -> None:
+    poses = trajectory.T_world_camera
+    with pytest.raises(ValueError, match="status"):
+        Trajectory(np.arange(6), np.arange(6.0), poses, np.array(["fine"] * 6))
+    with pytest.raises(ValueError, match="ascending"):
+        Trajectory(np.array([0, 1, 1, 2, 3, 4]), np.arange(6.0), poses, trajectory.status)
+    with pytest.raises(ValueError, match="times_s"):
+        Trajectory(np.arange(6), np.arange(5.0), poses, trajectory.status)
+
+
+@pytest.mark.real
+def test_real_c3vd_and_seven_scenes(real_data: Path) -> None:
+    clip = read_trajectory(real_data / "endoscopy" / "c3vd" / "cecum_t1_a")
+    assert len(clip) == 276
+    assert clip.path_length_mm == pytest.approx(54.7, abs=0.05)
+    again = read_trajectory(real_data / "endoscopy" / "c3vd_camera_paths" / "c1v1.txt")
+    np.testing.assert_allclose(again.T_world_camera, clip.T_world_camera[: len(again)], atol=1e-3)
+    kitchen = read_trajectory(real_data / "rgbd" / "7scenes_kitchen_100f")
+    assert len(kitchen) == 100
+    assert 100 < kitchen.path_length_mm < 10_000
