@@ -1,0 +1,82 @@
+"""Image pyramids for tracking: masked means, so that highlights and borders do not bleed into coarse levels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+
+from scopemap.config import OdometrySettings
+from scopemap.frame import Frame
+from scopemap.odometry.residuals import View
+
+CHANNELS = {"grey": ("grey",), "normalised": ("normalised",), "both": ("grey", "normalised")}
+_GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
+_NOISE_LEVEL = 2.0  # grey levels of local deviation below which an area counts as flat
+
+
+def build_pyramid(frame: Frame, settings: OdometrySettings) -> list[View]:
+    """Return the levels from `finest_level` (first) to the coarsest (last), each half the size of the one before.
+
+    Levels whose short side would fall below `min_side_px` are left out; the finest is always there. A frame without
+    depth gives views that can only be tracked, not tracked against.
+    """
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    weight = frame.valid.astype(np.float32)
+    depth = np.full(grey.shape, np.nan, np.float32) if frame.depth_mm is None else frame.depth_mm
+    camera, views = frame.camera, []
+    for level in range(settings.levels):
+        if level > 0:
+            width, height = camera.width // 2, camera.height // 2
+            if views and min(width, height) < settings.min_side_px:
+                break
+            grey, weight = _halve_image(grey, weight, (width, height))
+            depth, camera = _halve_depth(depth), camera.resized(width, height)
+        if level >= min(settings.finest_level, settings.levels - 1):
+            views.append(View(_channels(grey, weight, settings), weight, depth, np.array([camera.fx, camera.fy, camera.cx, camera.cy])))
+    return views
+
+
+def _channels(grey: np.ndarray, weight: np.ndarray, settings: OdometrySettings) -> np.ndarray:
+    images = [
+        grey / _GREY_UNIT if name == "grey" else _normalised(grey, weight, settings.normalise_sigma_px)
+        for name in CHANNELS[settings.channels]
+    ]
+    return np.stack(images).astype(np.float32)
+
+
+def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(grey * weight, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
+    return mean, (share > 0.5).astype(np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
+    """Mean of the known depths among four pixels that lie on the nearest of their surfaces (within 5 %)."""
+    h, w = depth_mm.shape[0] // 2, depth_mm.shape[1] // 2
+    out = np.full((h, w), np.nan, np.float32)
+    for row in range(h):
+        for column in range(w):
+            block = depth_mm[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+            nearest = np.inf
+            for d in block.flat:
+                if d < nearest:
+                    nearest = d
+            total, count = 0.0, 0
+            for d in block.flat:
+                if d <= 1.05 * nearest:
+                    total += d
+                    count += 1
+            if count > 0:
+                out[row, column] = total / count
+    return out
+
+
+def _normalised(grey: np.ndarray, weight: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Grey values minus their local mean, over their local deviation, both over usable pixels only."""
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), 1e-6)
+    mean = cv2.GaussianBlur(grey * weight, (0, 0), sigma_px) / share
+    high_pass = (grey - mean) * weight
+    variance = cv2.GaussianBlur(high_pass * high_pass, (0, 0), sigma_px) / share
+    return high_pass / np.sqrt(variance + _NOISE_LEVEL**2)

@@ -1,0 +1,109 @@
+"""RTDL: rotation first, then the whole motion, by dog-leg on photometric residuals from coarse to fine.
+
+METHOD section WEMA-RTDL. The reference is a keyframe with depth; its points are moved, not the tracked frame's (the
+paper's formula lifts with the tracked frame's depth, which is not known yet when tracking comes first).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.config import OdometrySettings
+from scopemap.geometry.se3 import orthonormalised, se3_exp
+from scopemap.odometry.dogleg import Options, Problem, Quadratic, minimise
+from scopemap.odometry.residuals import PARAMETERS, Loss, View, mean_cost, normal_equations, residual_images
+from scopemap.odometry.pyramid import CHANNELS
+
+_MAD_TO_SIGMA = 1.4826
+
+
+class Motion(NamedTuple):
+    """Motion (4, 4) that takes points of the reference to the current camera, and (gain, bias) of its brightness."""
+
+    T_current_reference: np.ndarray
+    affine: np.ndarray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where the alignment of two frames ended.
+
+    Attributes
+    ----------
+    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level.
+    inlier_share : share of pixels within 3 robust standard deviations of the level's start... of all used pixels.
+    overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
+    """
+
+    motion: Motion
+    residual: float
+    inlier_share: float
+    overlap: float
+    iterations: int
+
+
+def align(reference: list[View], current: list[View], start: np.ndarray, settings: OdometrySettings) -> Alignment:
+    """Align two pyramids (finest level first), starting from the motion `start` (4, 4)."""
+    motion, iterations = Motion(start, np.array([1.0, 0.0])), 0
+    depth = reference[-1].depth_mm
+    unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
+    for level in reversed(range(len(reference))):
+        rotation_only = settings.rotation_first and level == len(reference) - 1 and len(reference) > 1
+        motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
+        iterations += steps
+    # Inverting by transposing doubles a deviation from a rotation each time round: cut it off at every frame.
+    motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
+    residuals = _residuals(reference[0], current[0], motion, settings)
+    used = residuals[0][np.isfinite(residuals[0])]
+    usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
+    sigma = _robust_sigma(used)
+    inliers = float(np.mean(np.abs(used) < 1.0)) if used.size else 0.0
+    return Alignment(motion, sigma, inliers, used.size / max(usable, 1), iterations)
+
+
+def _loss(sigma: np.ndarray, settings: OdometrySettings) -> Loss:
+    lit = np.array([name == "grey" for name in CHANNELS[settings.channels]])
+    return Loss(sigma, settings.huber, lit, settings.lamp_falloff)
+
+
+def _residuals(reference: View, current: View, motion: Motion, settings: OdometrySettings) -> np.ndarray:
+    loss = _loss(np.ones(len(reference.channels)), settings)
+    return residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
+
+
+def _align_level(
+    reference: View, current: View, motion: Motion, settings: OdometrySettings, rotation_only: bool, unit_mm: float
+) -> tuple[Motion, int]:
+    start = _residuals(reference, current, motion, settings)
+    loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
+    least_weight = 0.5 * np.isfinite(start[0]).sum()
+    free = np.array([0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.lit.any() else []))
+
+    def linearise(state: Motion) -> Quadratic:
+        equations = normal_equations(reference, current, *state, loss, unit_mm)
+        return Quadratic(equations.cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
+
+    def cost(state: Motion) -> float:
+        mean, weight = mean_cost(reference, current, *state, loss)
+        # A mean over few pixels can be small: a step that walks out of the overlap is no improvement.
+        return mean if weight > least_weight else np.inf
+
+    def retract(state: Motion, step: np.ndarray) -> Motion:
+        full = np.zeros(PARAMETERS)
+        full[free] = step
+        full[3:6] *= unit_mm
+        return Motion(se3_exp(full[:6]) @ state.T_current_reference, state.affine + full[6:])
+
+    options = Options(settings.radius, settings.max_iterations, gauss_newton=settings.solver == "gauss-newton")
+    solution = minimise(Problem(linearise, cost, retract), motion, options)
+    return solution.state, solution.iterations
+
+
+def _robust_sigma(residuals: np.ndarray) -> float:
+    """Standard deviation from the median absolute value; a small floor keeps flat images from dividing by zero."""
+    if residuals.size == 0:
+        return 1e-3
+    return max(float(_MAD_TO_SIGMA * np.median(np.abs(residuals))), 1e-3)
