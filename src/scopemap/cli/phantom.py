@@ -1,0 +1,102 @@
+"""`scopemap phantom`: render synthetic endoscopy with exact truth."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.errors import SettingsError
+
+_PLAIN_LINES = 10
+
+
+def phantom(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="new or empty folder, or one of an earlier phantom")],
+    scene: Annotated[str, typer.Option(help="colon | laparoscopy | tube")] = "colon",
+    frames: Annotated[int | None, typer.Option(help="number of frames; default 200, or all of --path")] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="image size, px")] = "320x256",
+    seed: Annotated[int, typer.Option(help="of everything random")] = 0,
+    path: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="camera path to follow, 16 numbers per line")
+    ] = None,
+    deform: Annotated[bool, typer.Option("--deform", help="let the tissue breathe")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="end in exactly the first pose")] = False,
+    events: Annotated[str, typer.Option(help="bad stretches: black:A-B,blur:A-B,smoke:A-B (inclusive)")] = "",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, gloss, ...")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing but errors and JSON")] = False,
+) -> None:
+    """Render synthetic endoscopy with true poses, depth and mesh, in the C3VD layout."""
+    # Imported here, so that --help does not wait for the kernels.
+    from scopemap.phantom import PhantomSpec, parse_events, write_phantom
+
+    width, height = _parse_size(size)
+    spec = PhantomSpec(
+        scene=scene,  # type: ignore[arg-type]
+        frames=frames,
+        width=width,
+        height=height,
+        seed=seed,
+        path_file=path,
+        deform=deform,
+        loop=loop,
+        events=parse_events(events),
+    ).with_settings(_parse_settings(settings or []))
+    with _progress(quiet or as_json) as progress:
+        write_phantom(spec, folder, progress)
+    _report(folder, as_json, quiet)
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise SettingsError(f"cannot read the size '{text}': expected WIDTHxHEIGHT such as 320x256")
+    return int(match[1]), int(match[2])
+
+
+def _parse_settings(pairs: list[str]) -> dict[str, str]:
+    for pair in pairs:
+        if "=" not in pair:
+            raise SettingsError(f"cannot read the setting '{pair}': expected KEY=VALUE such as fov_deg=70")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+@contextmanager
+def _progress(silent: bool) -> Iterator[Callable[[int, int], None] | None]:
+    if silent:
+        yield None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("rendering", total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+    else:
+        yield _print_line
+
+
+def _print_line(done: int, total: int) -> None:
+    if done == total or done % max(total // _PLAIN_LINES, 1) == 0:
+        typer.echo(f"rendered {done} of {total} frames", err=True)
+
+
+def _report(folder: Path, as_json: bool, quiet: bool) -> None:
+    description = json.loads((folder / "phantom.json").read_text())
+    if as_json:
+        typer.echo(json.dumps({"folder": str(folder)} | description, indent=2))
+    elif not quiet:
+        spec = description["spec"]
+        typer.echo(
+            f"{description['frames']} frames of {spec['scene']} ({spec['width']}x{spec['height']}) in {folder}: "
+            "colour, depth, pose.txt, camera.yaml, mesh_truth.ply"
+        )

@@ -1,0 +1,129 @@
+"""Camera paths: read from a file, or made up as a hand would move.
+
+Poses are camera to world, mm, OpenCV axes. C3VD stores them transposed (translation in the last row); which form a
+file has is decided once for the whole file by where the translations lie.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.errors import InputError
+from scopemap.geometry.se3 import orthonormalised, se3, so3_exp
+
+_SPEED_MM = 0.45
+_SWAY_FRAMES = (90.0, 170.0)
+_ROTATION_TOLERANCE = 1e-3
+
+
+def read_path(file: Path) -> np.ndarray:
+    """Return the poses of a text file as (N, 4, 4) float64, camera to world, mm.
+
+    One pose per line: 16 numbers, row-major or in C3VD's transposed form, parted by spaces or commas; `#` starts a
+    comment. Raises `InputError` for a file that cannot be read, a bad line (named), or matrices that are no motions.
+    """
+    try:
+        lines = Path(file).read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the camera path {file}: {error}") from None
+    rows = [_parse_line(file, n, line) for n, line in enumerate(lines, 1) if line.split("#")[0].strip()]
+    if not rows:
+        raise InputError(f"the camera path {file} holds no pose: expected 16 numbers per line")
+    poses = np.array(rows).reshape(-1, 4, 4)
+    if np.allclose(poses[:, :3, 3], 0):
+        poses = poses.transpose(0, 2, 1)
+    for n, pose in enumerate(poses):
+        R, last = pose[:3, :3], pose[3]
+        if not (np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) and np.allclose(last, [0, 0, 0, 1])):
+            raise InputError(f"pose {n} of {file} is no rigid motion: expected a 4x4 camera-to-world matrix in mm")
+        if np.linalg.det(R) < 0:
+            raise InputError(f"pose {n} of {file} mirrors: expected a right-handed camera-to-world matrix")
+    return np.array([orthonormalised(pose) for pose in poses])
+
+
+def _parse_line(file: Path, number: int, line: str) -> list[float]:
+    fields = line.split("#")[0].replace(",", " ").split()
+    try:
+        values = [float(field) for field in fields]
+    except ValueError:
+        values = []
+    if len(values) != 16 or not np.isfinite(values).all():
+        raise InputError(f"line {number} of {file}: expected 16 finite numbers, found {len(fields)} fields")
+    return values
+
+
+def c3vd_line(T_world_camera: np.ndarray) -> str:
+    """Return one line of C3VD's `pose.txt`: 16 numbers, transposed, so that the translation is the last row."""
+    return ",".join(f"{value:.9g}" for value in T_world_camera.T.ravel())
+
+
+def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
+    """Return a hand-like path along a winding or straight tube, (frames, 4, 4): forward, or forward and back."""
+    rng = np.random.default_rng((seed, 1))
+    turn = _turn(frames, loop)
+    length = _SPEED_MM * max(frames - 1, 1) * (0.5 if loop else 1.0)
+    progress = 0.5 * (1 - np.cos(turn)) if loop else np.linspace(0, 1, frames)
+    stations = np.linspace(0, length, max(int(length * 2), 2))
+    yaw, pitch = (np.radians(0 if straight else 28) * _wander(stations, rng, (120.0, 220.0)) for _ in range(2))
+    heading = np.stack([np.sin(yaw), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], -1)
+    heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+    guide = np.cumsum(heading * (stations[1] - stations[0]), axis=0)
+    guide -= guide[0]
+    here = progress * length
+    positions = _interpolate(here, stations, guide) + _sway(frames, loop, rng, (2.0, 2.0, 1.2))
+    angles = np.stack([np.interp(here, stations, -pitch), np.interp(here, stations, yaw), 0 * here], -1)
+    return _poses(positions, 0.8 * angles + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
+
+
+def sweep_path(frames: int, loop: bool, seed: int) -> np.ndarray:
+    """Return a hand-like path that sweeps sideways over a scene ahead of it, (frames, 4, 4)."""
+    rng = np.random.default_rng((seed, 1))
+    reach_mm = min(18.0, _SPEED_MM * max(frames - 1, 1) / (2 * np.pi))
+    positions = _sway(frames, loop, rng, (reach_mm, reach_mm, 0.4 * reach_mm), frames_per_turn=(220.0, 320.0))
+    positions += _sway(frames, loop, rng, (1.0, 1.0, 1.0))
+    look = np.stack([positions[:, 1] / 90.0, -positions[:, 0] / 90.0, np.zeros(frames)], -1)
+    return _poses(positions, look + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
+
+
+def _turn(frames: int, loop: bool) -> np.ndarray:
+    """Angle 0 to 2 pi over a loop, whose last frame is its first; else the share of the way."""
+    return np.linspace(0, 2 * np.pi if loop else 1.0, frames)
+
+
+def _wander(x: np.ndarray, rng: np.random.Generator, periods: tuple[float, float]) -> np.ndarray:
+    """Sum of three waves of random period and phase, about -1..1, 0 at the start."""
+    period, phase = rng.uniform(*periods, 3) / [1.0, 1.6, 2.6], rng.uniform(0, 2 * np.pi, 3)
+    waves = np.sin(2 * np.pi * x[:, None] / period + phase) @ [0.55, 0.3, 0.15]
+    return waves - waves[0]
+
+
+def _sway(
+    frames: int,
+    loop: bool,
+    rng: np.random.Generator,
+    amplitudes: tuple[float, float, float],
+    frames_per_turn: tuple[float, float] = _SWAY_FRAMES,
+) -> np.ndarray:
+    """Low-frequency wandering (frames, 3); in a loop with whole numbers of turns, so that it ends where it starts."""
+    columns = []
+    for amplitude in amplitudes:
+        if loop:
+            amplitude *= min(1.0, frames / frames_per_turn[0])
+            turns = np.maximum(np.round(frames / rng.uniform(*frames_per_turn, 3) * [1.0, 1.6, 2.6]), 1)
+            phase = rng.uniform(0, 2 * np.pi, 3)
+            wave = np.sin(_turn(frames, loop)[:, None] * turns + phase) @ [0.55, 0.3, 0.15]
+            columns.append(amplitude * (wave - wave[0]))
+        else:
+            columns.append(amplitude * _wander(np.arange(frames), rng, frames_per_turn))
+    return np.stack(columns, -1)
+
+
+def _interpolate(x: np.ndarray, stations: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(x, stations, column) for column in values.T], -1)
+
+
+def _poses(positions: np.ndarray, rotation_vectors: np.ndarray, loop: bool) -> np.ndarray:
+    poses = np.array([se3(so3_exp(w), t) for w, t in zip(rotation_vectors, positions, strict=True)])
+    return np.concatenate([poses[:-1], poses[:1]]) if loop else poses

@@ -1,0 +1,137 @@
+"""PhantomSpec: everything that decides what a phantom looks like; equal specs give equal files."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Literal, get_args, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from scopemap.camera import PinholeCamera
+from scopemap.errors import SettingsError
+
+SceneName = Literal["colon", "laparoscopy", "tube"]
+EventName = Literal["black", "blur", "smoke"]
+
+DEFAULT_FRAMES = 200
+C3VD_DEPTH_SCALE_MM = 100.0 / 65535
+
+
+@dataclass(frozen=True)
+class Event:
+    """A stretch of frames, `first` to `last` inclusive, that shows little or nothing."""
+
+    kind: EventName
+    first: int
+    last: int
+
+    def covers(self, index: int) -> bool:
+        """Tell whether frame `index` belongs to the stretch."""
+        return self.first <= index <= self.last
+
+
+@dataclass(frozen=True)
+class PhantomSpec:
+    """What to render.
+
+    Attributes
+    ----------
+    scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
+    frames : number of frames; None: every pose of `path_file`, or 200.
+    width, height : image size, px.
+    fov_deg : horizontal field of view, degrees.
+    seed : of everything random.
+    path_file : camera path to follow (`read_path`), None: a hand-like path is made up.
+    deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
+    loop : whether the made-up path ends in exactly its first pose.
+    events : stretches of black, blurred or smoky frames.
+    noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
+    texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo.
+    gloss : strength of the wet highlights, 1 = as in the clinic, 0 = none.
+    auto_exposure : whether every frame is exposed for itself; False: all as the first.
+    depth_scale_mm : mm per unit of the depth files; the default is C3VD's, 100 mm at most.
+    fps : frames per second as written to `camera.yaml`.
+    """
+
+    scene: SceneName = "colon"
+    frames: int | None = None
+    width: int = 320
+    height: int = 256
+    fov_deg: float = 90.0
+    seed: int = 0
+    path_file: Path | None = None
+    deform: bool = False
+    loop: bool = False
+    events: tuple[Event, ...] = ()
+    breath_mm: float = 2.0
+    breath_frames: float = 120.0
+    noise: float = 0.004
+    texture: float = 1.0
+    gloss: float = 1.0
+    auto_exposure: bool = False
+    depth_scale_mm: float = C3VD_DEPTH_SCALE_MM
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        checks = {
+            f"scene must be one of {', '.join(get_args(SceneName))}": self.scene in get_args(SceneName),
+            "frames must be at least 1": self.frames is None or self.frames >= 1,
+            "width and height must be 16 to 4096 px": all(16 <= n <= 4096 for n in (self.width, self.height)),
+            "fov_deg must lie between 10 and 150": 10 <= self.fov_deg <= 150,
+            "seed must not be negative": self.seed >= 0,
+            "breath_mm must lie between 0 and 4": 0 <= self.breath_mm <= 4,
+            "breath_frames and fps must be positive": min(self.breath_frames, self.fps) > 0,
+            "noise, texture and gloss must not be negative": min(self.noise, self.texture, self.gloss) >= 0,
+            "depth_scale_mm must be positive": self.depth_scale_mm > 0,
+            "loop needs a made-up path of at least 3 frames, not a path file": not self.loop
+            or (self.path_file is None and (self.frames is None or self.frames >= 3)),
+        }
+        for message, fine in checks.items():
+            if not fine:
+                raise SettingsError(f"impossible phantom: {message} (got {self._named_in(message)})")
+
+    def _named_in(self, message: str) -> str:
+        return ", ".join(
+            f"{f.name}={getattr(self, f.name)}" for f in fields(self) if re.search(rf"\b{f.name}\b", message)
+        )
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The pinhole camera: square pixels, principal point at the centre of the image."""
+        focal = 0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2)
+        return PinholeCamera(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, self.width, self.height)
+
+    @property
+    def max_depth_mm(self) -> float:
+        """Depth from which the 16-bit depth files say "clipped"."""
+        return 65535 * self.depth_scale_mm
+
+    def with_settings(self, settings: dict[str, str]) -> PhantomSpec:
+        """Return a copy with settings given as text, such as {"fov_deg": "70"}; raises `SettingsError`."""
+        types = {name: kind for name, kind in get_type_hints(type(self)).items() if name != "events"}
+        values = {}
+        for name, text in settings.items():
+            if name not in types:
+                raise SettingsError(f"unknown phantom setting '{name}': choose one of {', '.join(types)}")
+            try:
+                values[name] = TypeAdapter(types[name]).validate_python(text)
+            except ValidationError:
+                raise SettingsError(f"phantom setting '{name}': cannot use '{text}' as {types[name]}") from None
+        return replace(self, **values)
+
+
+def parse_events(text: str) -> tuple[Event, ...]:
+    """Return the events of a text such as "black:40-49,blur:90-95"; raises `SettingsError`."""
+    events = []
+    for part in filter(None, (piece.strip() for piece in text.split(","))):
+        match = re.fullmatch(rf"({'|'.join(get_args(EventName))}):(\d+)-(\d+)", part)
+        if not match:
+            raise SettingsError(f"cannot read the event '{part}': expected black:A-B, blur:A-B or smoke:A-B")
+        kind, first, last = match[1], int(match[2]), int(match[3])
+        if last < first:
+            raise SettingsError(f"the event '{part}' ends before it begins: write {kind}:{last}-{first}")
+        events.append(Event(kind, first, last))  # type: ignore[arg-type]
+    return tuple(events)

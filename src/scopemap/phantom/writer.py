@@ -1,0 +1,118 @@
+"""Write a phantom as a C3VD folder, with a calibration file and the true surface beside the frames.
+
+0000_color.png  0000_depth.tiff  pose.txt  camera.yaml  mesh_truth.ply  [mesh_truth/0000.ply]  phantom.json
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.camera import PinholeCamera
+from scopemap.errors import InputError
+from scopemap.phantom.camera_path import c3vd_line
+from scopemap.phantom.render import Phantom, prepare, render_surface
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.truth_mesh import SeenVoxels, TriangleMesh
+
+CLIPPED = 65535
+_OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
+
+
+def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
+    """Render the phantom of `spec` into `folder`, calling `progress(frames done, frames in all)` after each frame.
+
+    A folder that holds an earlier phantom is written anew; one that holds anything else is refused. Raises
+    `InputError` for that, for a folder that cannot be written, and for a path file that cannot be used.
+    """
+    folder = Path(folder)
+    _check_free(folder)
+    phantom = prepare(spec)
+    try:
+        _clear(folder)
+        _write_description(phantom, folder / "phantom.json")
+        (folder / "pose.txt").write_text("".join(c3vd_line(T) + "\n" for T in phantom.poses))
+        _write_camera(spec, folder / "camera.yaml")
+        seen = SeenVoxels(phantom.scene.volume)
+        for index in range(len(phantom.poses)):
+            rgb, surface = render_surface(phantom, index)
+            seen.add(surface.rest_mm)
+            _write_image(folder / f"{index:04d}_color.png", rgb[..., ::-1])
+            _write_image(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
+            if progress is not None:
+                progress(index + 1, len(phantom.poses))
+        _write_meshes(phantom, seen, folder)
+    except OSError as error:
+        raise InputError(f"cannot write the phantom to {folder}: {error}") from None
+
+
+def encode_depth(depth_mm: np.ndarray, scale_mm: float) -> np.ndarray:
+    """Return depth (H, W) in mm, NaN = unknown, as uint16: 0 = unknown, 65535 = too far, else units of `scale_mm`."""
+    units = np.clip(np.rint(np.nan_to_num(depth_mm.astype(np.float64)) / scale_mm), 1, CLIPPED)
+    return np.where(np.isnan(depth_mm), 0, units).astype(np.uint16)
+
+
+def _check_free(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"cannot write a phantom to {folder}: it is a file; name a new folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "phantom.json").is_file():
+        raise InputError(f"will not write a phantom into {folder}: it holds other files; name a new or empty folder")
+
+
+def _clear(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for pattern in _OWN_FILES:
+        for file in folder.glob(pattern):
+            file.unlink()
+
+
+def _write_image(file: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(file), image):
+        raise OSError(f"{file.name} could not be encoded or stored")
+
+
+def _write_camera(spec: PhantomSpec, file: Path) -> None:
+    camera: PinholeCamera = spec.camera
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    if not storage.isOpened():
+        raise OSError(f"{file.name} could not be opened")
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.matrix)
+    storage.write("distortion_coefficients", np.zeros((1, 5)))
+    storage.write("depth_scale", spec.depth_scale_mm)
+    storage.write("fps", spec.fps)
+    storage.release()
+
+
+def _write_meshes(phantom: Phantom, seen: SeenVoxels, folder: Path) -> None:
+    mesh = seen.mesh()
+    _write_mesh(mesh, folder / "mesh_truth.ply")
+    if not phantom.spec.deform:
+        return
+    (folder / "mesh_truth").mkdir(exist_ok=True)
+    for index in range(len(phantom.poses)):
+        _write_mesh(mesh.moved(phantom.breath.at(index)), folder / "mesh_truth" / f"{index:04d}.ply")
+
+
+def _write_mesh(mesh: TriangleMesh, file: Path) -> None:
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
+
+
+def _write_description(phantom: Phantom, file: Path) -> None:
+    spec = asdict(phantom.spec) | {"path_file": phantom.spec.path_file and str(phantom.spec.path_file)}
+    description = {
+        "made_by": f"scopemap {version('scopemap')}",
+        "spec": spec,
+        "frames": len(phantom.poses),
+        "exposure": phantom.exposure,
+        "voxel_mm": phantom.scene.volume.voxel_mm,
+    }
+    file.write_text(json.dumps(description, indent=2) + "\n")

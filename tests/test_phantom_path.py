@@ -1,0 +1,109 @@
+"""Camera paths of the phantom: read in every form, made up smooth, closed when asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.errors import InputError, SettingsError
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.phantom import PhantomSpec, prepare, read_path
+from scopemap.phantom.camera_path import c3vd_line, lumen_path, sweep_path
+
+
+@pytest.fixture
+def poses() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return np.array([se3_exp(np.concatenate([rng.normal(size=3), 40 * rng.normal(size=3)])) for _ in range(5)])
+
+
+@pytest.mark.parametrize("separator", [" ", ",", ", "])
+@pytest.mark.parametrize("stored", [False, True])
+def test_reads_both_forms(tmp_path: Path, poses: np.ndarray, separator: str, stored: bool) -> None:
+    rows = [separator.join(f"{v:.9g}" for v in (T.T if stored else T).ravel()) for T in poses]
+    file = tmp_path / "path.txt"
+    file.write_text("# a comment\n" + "\n".join(rows) + "\n\n")
+    np.testing.assert_allclose(read_path(file), poses, atol=1e-6)
+
+
+def test_c3vd_line_has_the_translation_in_the_last_row(poses: np.ndarray) -> None:
+    stored = np.array(c3vd_line(poses[0]).split(","), dtype=float).reshape(4, 4)
+    np.testing.assert_allclose(stored[3, :3], poses[0][:3, 3], rtol=1e-8)
+    np.testing.assert_array_equal(stored[:, 3], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no pose"),
+        ("# nothing\n", "no pose"),
+        ("1 2 3\n", "line 1"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n1 0 0 x 0 1 0 0 0 0 1 0 0 0 0 1\n", "line 2"),
+        ("1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1\n", "line 1"),
+        ("2 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1\n", "no rigid motion"),
+        ("-1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1\n", "mirrors"),
+    ],
+)
+def test_bad_files_are_refused_with_the_place(tmp_path: Path, text: str, says: str) -> None:
+    file = tmp_path / "path.txt"
+    file.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_path(file)
+
+
+def test_missing_file_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot read the camera path"):
+        read_path(tmp_path / "none.txt")
+
+
+def test_the_first_poses_of_a_file_are_used(tmp_path: Path) -> None:
+    poses = lumen_path(12, False, 3)
+    file = tmp_path / "path.txt"
+    file.write_text("\n".join(c3vd_line(T) for T in poses))
+    phantom = prepare(PhantomSpec(path_file=file, frames=7, width=32, height=32))
+    np.testing.assert_allclose(phantom.poses, poses[:7], atol=1e-6)
+    with pytest.raises(InputError, match="holds 12 poses, 13 frames"):
+        prepare(PhantomSpec(path_file=file, frames=13, width=32, height=32))
+
+
+@given(seed=st.integers(0, 10_000), frames=st.integers(2, 700), loop=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_made_up_paths_move_like_a_hand(seed: int, frames: int, loop: bool) -> None:
+    frames = max(frames, 60 if loop else 2)
+    for poses in (lumen_path(frames, loop, seed), sweep_path(frames, loop, seed)):
+        steps = inverse(poses[:-1]) @ poses[1:]
+        assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 1.5
+        assert np.degrees(rotation_angle_rad(steps[:, :3, :3])).max() < 1.3
+        assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
+
+
+@pytest.mark.parametrize("make", [lumen_path, sweep_path])
+def test_loop_closes_exactly_and_goes_somewhere(make: object) -> None:
+    poses = make(300, True, 4)  # type: ignore[operator]
+    np.testing.assert_array_equal(poses[-1], poses[0])
+    distance = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    assert distance.max() > 10.0
+    # No jump at the seam: the last step is as small as any other.
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps[-1] < 2 * steps.mean()
+
+
+def test_paths_follow_the_seed() -> None:
+    np.testing.assert_array_equal(lumen_path(40, False, 1), lumen_path(40, False, 1))
+    assert not np.allclose(lumen_path(40, False, 1), lumen_path(40, False, 2))
+
+
+def test_a_loop_along_a_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="loop"):
+        PhantomSpec(loop=True, path_file=tmp_path / "path.txt")
+
+
+@pytest.mark.real
+def test_real_pose_files_agree_in_both_forms(real_data: Path) -> None:
+    plain = read_path(real_data / "endoscopy" / "c3vd_camera_paths" / "c1v1.txt")
+    stored = read_path(real_data / "endoscopy" / "c3vd" / "cecum_t1_a" / "pose.txt")
+    np.testing.assert_allclose(plain, stored, atol=1e-3)

@@ -1,0 +1,152 @@
+"""The phantom's pictures: the physics of its lamp, its noise, its bad stretches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scopemap.phantom import PhantomSpec, parse_events, prepare, render_frame
+from scopemap.phantom.deformation import REST
+from scopemap.phantom.march import march
+from scopemap.phantom.noise import noise_at
+from scopemap.phantom.render import light
+from scopemap.phantom.shading import Look, develop, shade
+from scopemap.phantom.volume import Volume
+
+SMALL = {"width": 96, "height": 80, "frames": 6}
+
+
+@pytest.fixture(scope="module")
+def wall() -> Volume:
+    """A plane facing the camera at z = 60."""
+    z = np.arange(80.0, dtype=np.float32)[None, None, :]
+    return Volume(np.broadcast_to(60.0 - z, (150, 150, 80)).copy(), np.array([-75.0, -75.0, 0.0]), 1.0)
+
+
+def at_depth(wall: Volume, z: float) -> tuple[np.ndarray, np.ndarray]:
+    camera = PhantomSpec(width=41, height=41, fov_deg=60).camera
+    T = np.eye(4)
+    T[2, 3] = 60.0 - z
+    surface = march(wall, camera, T, REST)
+    flat = Look(
+        np.full((41, 41, 3), 0.5, np.float32), np.zeros((41, 41, 3), np.float32), np.zeros((41, 41), np.float32)
+    )
+    return shade(surface, flat, camera)[..., 0], surface.depth_mm
+
+
+def test_brightness_falls_as_cosine_over_squared_distance(wall: Volume) -> None:
+    camera = PhantomSpec(width=41, height=41, fov_deg=60).camera
+    cosine = 1 / np.linalg.norm(camera.rays, axis=-1)
+    for z in (12.0, 24.0, 48.0):
+        radiance, depth = at_depth(wall, z)
+        np.testing.assert_allclose(depth, z, atol=1e-4)
+        np.testing.assert_allclose(radiance, 0.5 * cosine**3 / z**2, rtol=1e-4)
+
+
+def test_highlights_sit_where_the_surface_faces_the_lamp(wall: Volume) -> None:
+    camera = PhantomSpec(width=41, height=41, fov_deg=60).camera
+    T = np.eye(4)
+    T[2, 3] = 30.0
+    surface = march(wall, camera, T, REST)
+    zero = np.zeros((41, 41, 3), np.float32)
+    shiny = shade(surface, Look(zero, zero, np.ones((41, 41), np.float32)), camera)[..., 0]
+    assert np.unravel_index(shiny.argmax(), shiny.shape) == (20, 20)
+    assert shiny[20, 30] < 0.01 * shiny[20, 20]
+
+
+def test_first_frame_is_well_exposed() -> None:
+    for scene in ("colon", "laparoscopy", "tube"):
+        rgb, _ = render_frame(prepare(PhantomSpec(scene=scene, **SMALL)), 0)
+        brightest = rgb.max(-1)
+        assert 100 < np.percentile(brightest, 70) < 235
+        assert (brightest >= 254).mean() < 0.1
+
+
+def test_tube_is_featureless_and_colon_is_not() -> None:
+    def contrast(scene: str) -> float:
+        spec = PhantomSpec(scene=scene, noise=0.0, **SMALL)
+        phantom = prepare(spec)
+        linear, surface = light(phantom.scene, spec.camera, phantom.poses[0])
+        towards = -spec.camera.rays / np.linalg.norm(spec.camera.rays, axis=-1, keepdims=True)
+        lamp = (surface.normal * towards).sum(-1) / surface.distance_mm**2
+        red = linear[..., 0] / lamp / (1 - 0.35 * (spec.camera.rays[..., :2] ** 2).sum(-1) / 1.7)
+        middle = red[8:-8, 8:-8]
+        middle = middle[np.isfinite(middle)]
+        return float(np.std(np.diff(np.log(middle[middle > 0]))))
+
+    assert contrast("colon") > 5 * contrast("tube")
+
+
+def test_texture_sticks_to_moving_tissue() -> None:
+    spec = PhantomSpec(deform=True, breath_frames=8.0, **SMALL)
+    phantom = prepare(spec)
+    displacement = phantom.breath.at(4)
+    surface = march(phantom.scene.volume, spec.camera, phantom.poses[0], displacement)
+    footprint = np.full(surface.depth_mm.shape, 0.1, np.float32)
+    rest = surface.rest_mm.reshape(-1, 3).astype(float)
+    moved = displacement.move(rest)
+    assert np.linalg.norm(moved - rest, axis=1).max() > 0.5
+    again = (moved - displacement.at(moved)).reshape(surface.rest_mm.shape).astype(np.float32)
+    look = phantom.scene.appearance
+    np.testing.assert_allclose(look.albedo(surface.rest_mm, footprint), look.albedo(again, footprint), atol=1e-3)
+
+
+def test_same_seed_same_picture() -> None:
+    spec = PhantomSpec(seed=3, **SMALL)
+    first, again = (render_frame(prepare(spec), 2) for _ in range(2))
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first[1], again[1])
+    other, _ = render_frame(prepare(replace(spec, seed=4)), 2)
+    assert np.abs(other.astype(int) - first[0]).mean() > 3
+
+
+def test_noise_has_the_stated_strength() -> None:
+    rng = np.random.default_rng(0)
+    dark = np.full((200, 200, 3), 0.001, np.float32)
+    levels = develop(dark, 0.0, rng).astype(float)
+    assert levels.std() == 0
+    bright = develop(np.full((200, 200, 3), 0.3, np.float32), 0.01, rng)
+    slope = 255 * 1.055 / 2.4 * 0.3 ** (1 / 2.4 - 1)
+    expected = slope * 0.01 * np.sqrt(1 + 2.5**2 * 0.3)
+    assert bright.astype(float).std() == pytest.approx(expected, rel=0.05)
+
+
+def test_events_are_seen_where_they_were_ordered() -> None:
+    plain = prepare(PhantomSpec(noise=0.0, **SMALL))
+    bad = prepare(PhantomSpec(events=parse_events("black:1-1, blur:2-3,smoke:4-4"), noise=0.0, **SMALL))
+    pictures = {i: render_frame(bad, i)[0].astype(float) for i in range(6)}
+    clear = {i: render_frame(plain, i)[0].astype(float) for i in range(6)}
+
+    def sharpness(rgb: np.ndarray) -> float:
+        return float(np.abs(np.diff(rgb[..., 1], axis=1)).mean())
+
+    for index in (0, 5):
+        np.testing.assert_array_equal(pictures[index], clear[index])
+    assert pictures[1].mean() < 12
+    for index in (2, 3):
+        assert sharpness(pictures[index]) < 0.75 * sharpness(clear[index])
+    assert pictures[4].reshape(-1, 3).std(0).mean() < 0.6 * clear[4].reshape(-1, 3).std(0).mean()
+    assert np.abs(pictures[4].mean((0, 1)) - pictures[4].mean()).max() < 15
+    np.testing.assert_array_equal(render_frame(bad, 4)[1], render_frame(plain, 4)[1])
+
+
+def test_auto_exposure_evens_out_the_brightness() -> None:
+    spec = PhantomSpec(scene="colon", auto_exposure=True, **SMALL)
+    phantom = prepare(spec)
+    assert phantom.exposure is None
+    levels = [np.percentile(render_frame(phantom, i)[0].max(-1), 80) for i in range(6)]
+    assert np.ptp(levels) < 6
+
+
+def test_noise_field_is_smooth_seeded_and_centred() -> None:
+    points = np.random.default_rng(0).uniform(-500, 500, (20_000, 3))
+    values = noise_at(points, 7.0, 1)
+    assert abs(values.mean()) < 0.02
+    assert 0.2 < values.std() < 0.4
+    assert np.abs(values).max() <= 1.0
+    near = noise_at(points + np.array([1e-3, 0, 0]), 7.0, 1)
+    assert np.abs(near - values).max() < 1e-3
+    assert np.abs(np.corrcoef(values, noise_at(points, 7.0, 2))[0, 1]) < 0.05
+    assert noise_at(np.full((1, 3), np.nan), 7.0, 1)[0] == 0
