@@ -1,0 +1,6 @@
+"""Volumetric fusion: posed depth frames to one coloured triangle mesh."""
+
+from scopemap.fusion.mesh import save_mesh
+from scopemap.fusion.volume import TsdfVolume
+
+__all__ = ["TsdfVolume", "save_mesh"]

@@ -1,0 +1,234 @@
+"""Kernels of the truncated signed distance field (TSDF): what a frame measures, where, and into which voxels.
+
+The field holds the distance to the surface in mm: positive in free space (the camera's side), negative behind the
+surface, clipped to the truncation. Weighted running mean of Curless and Levoy, SIGGRAPH 1996, eq. 3-4; blocks of 8^3
+voxels as Niessner et al., SIGGRAPH Asia 2013. Inverse depth is used throughout because it is linear in the pixel on a
+plane: interpolated and differentiated, a slanted wall stays exact.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 8
+# 21 bits of a key for each block coordinate.
+KEY_OFFSET = 1 << 20
+_KEY_MASK = (1 << 21) - 1
+_RECENT = 1 << 15
+_NORMAL_REACH_PX = 3
+_COLOUR_BAND_VOXELS = 2.0
+# Share of the truncation behind the surface from which on a voxel counts less and less.
+_FULL_WEIGHT_SHARE = 0.2
+
+
+class Voxels(NamedTuple):
+    """N blocks: `tsdf` mm and `weight` (N, 8, 8, 8) float32; `colour` (N, 8, 8, 8, 4), weighted sums r g b 1."""
+
+    tsdf: np.ndarray
+    weight: np.ndarray
+    colour: np.ndarray
+
+
+class View(NamedTuple):
+    """A pinhole camera in the world: rotation (3, 3) and translation (3,) mm from world to camera, focal lengths px."""
+
+    R: np.ndarray
+    t: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class Surface(NamedTuple):
+    """What a frame measures, each (H, W) float32.
+
+    Inverse depth 1/mm, NaN where there is none; distance of the tangent plane from the camera, mm; weight, 0..1.
+    """
+
+    inverse_depth: np.ndarray
+    plane_mm: np.ndarray
+    weight: np.ndarray
+
+
+class Grid(NamedTuple):
+    """Voxel size and truncation in mm, and the largest relative change of depth per px that is one surface."""
+
+    voxel_mm: float
+    truncation_mm: float
+    largest_step: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slope(inverse_depth: np.ndarray, row: int, col: int, along_columns: bool, largest_step: float) -> float:
+    """Change of inverse depth per px, mean of the sides that belong to the same surface; NaN where neither does."""
+    here, total, sides = inverse_depth[row, col], 0.0, 0
+    size = inverse_depth.shape[1] if along_columns else inverse_depth.shape[0]
+    position = col if along_columns else row
+    for step in (-_NORMAL_REACH_PX, _NORMAL_REACH_PX):
+        if 0 <= position + step < size:
+            there = inverse_depth[row, col + step] if along_columns else inverse_depth[row + step, col]
+            if abs(there - here) <= largest_step * _NORMAL_REACH_PX * here:
+                total += (there - here) / step
+                sides += 1
+    return total / sides if sides else np.nan
+
+
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def measure_surface(
+    inverse_depth: np.ndarray, view: View, largest_step: float, min_incidence: float, reach_mm: float
+) -> Surface:
+    """Return tangent plane and weight of every pixel of `inverse_depth` (H, W) float32, 1/mm, NaN = unknown.
+
+    On the plane n.X = 1 the inverse depth is n.(x, y, 1), so its slopes give n, and 1/|n| is the plane's distance from
+    the camera. Weight = cos(incidence) / (1 + (2 distance / reach)^2): 1 for a wall met head-on at the lens, falling
+    with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
+    """
+    height, width = inverse_depth.shape
+    kept = np.full((height, width), np.nan, np.float32)
+    plane_mm = np.zeros((height, width), np.float32)
+    weight = np.zeros((height, width), np.float32)
+    for row in prange(height):
+        for col in range(width):
+            here = inverse_depth[row, col]
+            if not here > 0:
+                continue
+            x, y = (col - view.cx) / view.fx, (row - view.cy) / view.fy
+            nx = view.fx * _slope(inverse_depth, row, col, True, largest_step)
+            ny = view.fy * _slope(inverse_depth, row, col, False, largest_step)
+            nz = here - nx * x - ny * y
+            plane = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
+            distance = np.sqrt(x * x + y * y + 1.0) / here
+            if plane >= min_incidence * distance:
+                kept[row, col] = here
+                plane_mm[row, col] = plane
+                weight[row, col] = plane / distance / (1.0 + (2.0 * distance / reach_mm) ** 2)
+    return Surface(kept, plane_mm, weight)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pack(x: int, y: int, z: int) -> int:
+    """Return the int64 key of a block coordinate."""
+    return ((x + KEY_OFFSET) << 42) | ((y + KEY_OFFSET) << 21) | (z + KEY_OFFSET)
+
+
+def unpack(keys: np.ndarray) -> np.ndarray:
+    """Return the (N, 3) int64 block coordinates of (N,) keys."""
+    return np.stack([(keys >> 42) & _KEY_MASK, (keys >> 21) & _KEY_MASK, keys & _KEY_MASK], -1) - KEY_OFFSET
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndarray:
+    """Return keys, some of them repeated, of all blocks within the truncation of a measured pixel (H, W).
+
+    Each ray is cut into pieces of half a block; the box around a piece, widened by the pixel's footprint, names the
+    blocks. The boxes overlap from pixel to pixel, so no voxel that the frame can see near the surface is missed.
+    """
+    block_mm = BLOCK * grid.voxel_mm
+    pieces = int(np.ceil(4.0 * grid.truncation_mm / block_mm))
+    piece_mm = 2.0 * grid.truncation_mm / pieces
+    footprint = 1.5 / min(view.fx, view.fy)
+    origin = -view.R.T @ view.t
+    low, high, direction = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
+    recent = np.full(_RECENT, -1, np.int64)
+    keys, count = np.empty(4096, np.int64), 0
+    for row in range(inverse_depth.shape[0]):
+        for col in range(inverse_depth.shape[1]):
+            if not inverse_depth[row, col] > 0:
+                continue
+            depth = 1.0 / inverse_depth[row, col]
+            x, y = (col - view.cx) / view.fx, (row - view.cy) / view.fy
+            for axis in range(3):
+                direction[axis] = view.R[0, axis] * x + view.R[1, axis] * y + view.R[2, axis]
+            for piece in range(pieces):
+                near = max(depth - grid.truncation_mm + piece * piece_mm, 0.0)
+                far = max(near, depth - grid.truncation_mm + (piece + 1) * piece_mm)
+                for axis in range(3):
+                    a, b = origin[axis] + near * direction[axis], origin[axis] + far * direction[axis]
+                    low[axis] = np.int64(np.floor((min(a, b) - footprint * far) / grid.voxel_mm)) >> 3
+                    high[axis] = np.int64(np.ceil((max(a, b) + footprint * far) / grid.voxel_mm)) >> 3
+                for i in range(low[0], high[0] + 1):
+                    for j in range(low[1], high[1] + 1):
+                        for k in range(low[2], high[2] + 1):
+                            key = pack(i, j, k)
+                            place = (i * 73856093 ^ j * 19349663 ^ k * 83492791) & (_RECENT - 1)
+                            if recent[place] != key:
+                                recent[place] = key
+                                if count == keys.size:
+                                    keys = np.concatenate((keys, np.empty_like(keys)))
+                                keys[count] = key
+                                count += 1
+    return keys[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(inverse_depth: np.ndarray, u: float, v: float, largest_step: float) -> float:
+    """Bilinear inverse depth where the four neighbours are one surface, else the nearest pixel's (NaN: none)."""
+    # Clamped, so that the outer half of a border pixel continues the cell inside it.
+    col = min(max(int(np.floor(u)), 0), inverse_depth.shape[1] - 2)
+    row = min(max(int(np.floor(v)), 0), inverse_depth.shape[0] - 2)
+    a, b = inverse_depth[row, col], inverse_depth[row, col + 1]
+    c, d = inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    known = a > 0 and b > 0 and c > 0 and d > 0
+    # A cell's diagonal is sqrt(2) px long.
+    if known and high - low <= 1.5 * largest_step * low:
+        s, t = u - col, v - row
+        return (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
+    return inverse_depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _integrate_block(
+    voxels: Voxels, slot: int, corner: np.ndarray, surface: Surface, rgb: np.ndarray, view: View, grid: Grid
+) -> None:
+    height, width = surface.inverse_depth.shape
+    R, truncation = view.R, grid.truncation_mm
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            for k in range(BLOCK):
+                x, y = (corner[0] + i) * grid.voxel_mm, (corner[1] + j) * grid.voxel_mm
+                z = (corner[2] + k) * grid.voxel_mm
+                depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + view.t[2]
+                if depth <= 0:
+                    continue
+                u = view.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + view.t[0]) / depth + view.cx
+                v = view.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + view.t[1]) / depth + view.cy
+                if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                    continue
+                row, col = int(v + 0.5), int(u + 0.5)
+                weight = surface.weight[row, col]
+                if weight == 0:
+                    continue
+                inverse_depth = _sample(surface.inverse_depth, u, v, grid.largest_step)
+                gap = 1.0 - depth * inverse_depth
+                behind = -gap / (inverse_depth * truncation)
+                if behind >= 1.0:
+                    continue
+                weight *= min(1.0, (1.0 - behind) / (1.0 - _FULL_WEIGHT_SHARE))
+                distance = min(max(gap * surface.plane_mm[row, col], -truncation), truncation)
+                total = voxels.weight[slot, i, j, k] + weight
+                voxels.tsdf[slot, i, j, k] += (distance - voxels.tsdf[slot, i, j, k]) * weight / total
+                voxels.weight[slot, i, j, k] = total
+                if abs(distance) <= _COLOUR_BAND_VOXELS * grid.voxel_mm:
+                    for channel in range(3):
+                        voxels.colour[slot, i, j, k, channel] += weight * rgb[row, col, channel]
+                    voxels.colour[slot, i, j, k, 3] += weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def integrate_blocks(
+    voxels: Voxels, slots: np.ndarray, corners: np.ndarray, surface: Surface, rgb: np.ndarray, view: View, grid: Grid
+) -> None:
+    """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
+
+    The distance of a voxel is the one to the tangent plane of the surface that its pixel sees. Voxels farther behind
+    the surface than the truncation, measured along the optical axis, are not known and stay untouched; towards there
+    the weight falls to 0 (Oleynikova et al., IROS 2017, eq. 6), so that whoever sees past a thin fold overrules whoever
+    sees its front. Changes `voxels`.
+    """
+    for n in prange(len(slots)):
+        _integrate_block(voxels, slots[n], corners[n], surface, rgb, view, grid)
