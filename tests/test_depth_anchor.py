@@ -110,6 +110,17 @@ def test_measured_depth_is_never_touched() -> None:
     anchor = anchored(near_far_mm=(1.0, 2.0), anchor="near-far")
     np.testing.assert_array_equal(anchor.depth_mm(DepthEstimate(TRUTH_MM, "measured"), frame()), TRUTH_MM)
     assert anchor.description == "measured depth"
+    room_mm = 50 * TRUTH_MM
+    np.testing.assert_array_equal(anchor.depth_mm(DepthEstimate(room_mm, "measured"), frame()), room_mm)
+
+
+def test_a_few_pixels_do_not_fix_the_scale() -> None:
+    anchor = anchored(reference=Metric())
+    few = np.zeros((40, 60), bool)
+    few[20, 10:50] = True
+    assert np.isnan(anchor.depth_mm(disparity(), replace(frame(), valid=few))).all()
+    assert anchor.conversion is None
+    np.testing.assert_allclose(anchor.depth_mm(disparity(), frame(1)), TRUTH_MM, rtol=1e-3)
 
 
 def test_the_shading_back_end_is_its_own_anchor() -> None:

@@ -160,4 +160,4 @@ def test_error_on_real_frames(real_data: Path) -> None:
         assert scores["shading x ray z"].abs_rel < limit, scene
         assert scores["shading x ray z"].abs_rel < 0.75 * scores["constant depth"].abs_rel, scene
         if scene != "endonerf pulling":
-            assert scores["shading x ray z"].abs_rel < 0.8 * scores["shading as depth"].abs_rel, scene
+            assert scores["shading x ray z"].abs_rel < 0.85 * scores["shading as depth"].abs_rel, scene

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from torchvision.models.optical_flow import raft_large, raft_small
 
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.flow import DisFlow, NoFlow, RaftFlow, create_flow, pair_flow, pull
+from scopemap.flow import DisFlow, NoFlow, RaftFlow, create_flow, pair_flow
 from scopemap.flow.consistency import agree
 from scopemap.flow.raft import torchvision_names
+from scopemap.geometry.warp import pull
 
 SHAPE = (140, 171)
 

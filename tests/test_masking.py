@@ -127,6 +127,17 @@ def test_a_black_frame_has_no_tissue_and_does_not_fail() -> None:
     assert masker(frame(in_circle())).valid[disc(RADIUS - 6)].all()
 
 
+@pytest.mark.parametrize("sigma", [2.0, 6.0])
+def test_the_noise_of_a_black_image_is_not_tissue(sigma: float) -> None:
+    rng = np.random.default_rng(1)
+    dark = np.clip(rng.normal(2, sigma, tissue().shape), 0, 255).astype(np.uint8)
+    assert is_constant(dark)
+    assert Masker(MaskSettings())(frame(dark)).valid.mean() < 0.01
+    noisy = np.clip(tissue() + rng.normal(0, sigma, dark.shape), 0, 255).astype(np.uint8)
+    assert not is_constant(noisy)
+    assert Masker(MaskSettings(highlights=False))(frame(noisy)).valid.all()
+
+
 def test_constant_images_are_told_from_dark_ones() -> None:
     noise = np.random.default_rng(0).integers(0, 4, (240, 320, 3), dtype=np.uint8)
     assert is_constant(np.zeros((240, 320, 3), np.uint8))

@@ -7,11 +7,12 @@ import pytest
 from scipy import ndimage
 
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.phantom import PhantomSpec, SeenVoxels, build_scene, prepare, read_path, render_surface
+from scopemap.phantom import PhantomSpec, SeenVoxels, build_scene, prepare, render_surface
 from scopemap.phantom.deformation import REST, breathing
 from scopemap.phantom.march import march
 from scopemap.phantom.render import Phantom, camera_path
 from scopemap.phantom.volume import Volume
+from scopemap.trajectory import read_poses
 
 SMALL = {"width": 96, "height": 80, "frames": 12}
 
@@ -215,7 +216,7 @@ def test_real_paths_have_room_and_a_view(real_data: object) -> None:
     for scene in ("colon", "tube"):
         for file in files if scene == "colon" else files[::7]:
             spec = PhantomSpec(scene=scene, path_file=file, width=48, height=40)
-            poses = read_path(file)
+            poses = read_poses(file)
             volume = build_scene(spec, poses).volume
             assert volume.values_at(poses[:, :3, 3])[0].min() > 5.0, file
             for pose in poses[:: len(poses) // 3]:

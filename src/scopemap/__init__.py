@@ -1,1 +1,54 @@
-"""scopemap: from a monocular endoscope video to camera poses and a tissue surface."""
+"""scopemap: from a monocular endoscope video to camera poses and a tissue surface.
+
+>>> from scopemap import Config, open_sequence, reconstruct
+>>> result = reconstruct(open_sequence("video.mp4"), Config(), out="result")
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scopemap.config import Config
+    from scopemap.datasets import open_sequence
+    from scopemap.errors import ScopemapError
+    from scopemap.frame import Frame, Truth
+    from scopemap.reconstruction import Reconstruction
+    from scopemap.runner import reconstruct
+    from scopemap.trajectory import Trajectory, read_trajectory
+
+__version__ = version("scopemap")
+__all__ = [
+    "Config",
+    "Frame",
+    "Reconstruction",
+    "ScopemapError",
+    "Trajectory",
+    "Truth",
+    "__version__",
+    "open_sequence",
+    "read_trajectory",
+    "reconstruct",
+]
+
+_HOMES = {
+    "Config": "config",
+    "Frame": "frame",
+    "Reconstruction": "reconstruction",
+    "ScopemapError": "errors",
+    "Trajectory": "trajectory",
+    "Truth": "frame",
+    "open_sequence": "datasets",
+    "read_trajectory": "trajectory",
+    "reconstruct": "runner",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for: `scopemap --help` must not wait for compilers and networks."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'scopemap' has no attribute '{name}'")
+    from importlib import import_module
+
+    return getattr(import_module(f"scopemap.{_HOMES[name]}"), name)

@@ -51,7 +51,7 @@ def read_calibration(file: Path | str, image_size: tuple[int, int]) -> Calibrati
     """
     file = Path(file)
     try:
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
     numbers = _plain_numbers(text)

@@ -1,13 +1,14 @@
 """Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
 
-Order of precedence: defaults < preset < TOML file < single settings (`--set odometry.huber=2`). An unknown key is an
-error that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its constants (section "WEMA-RTDL"),
-so the values here were chosen by measurement (BENCHMARK.md).
+Order of precedence: defaults < preset < TOML file < single settings (`--set odometry.huber=2`); the preset itself may
+be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282; it
+publishes none of its constants (section "WEMA-RTDL"), so the values here were chosen by measurement (BENCHMARK.md).
 """
 
 from __future__ import annotations
 
 import difflib
+import json
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +23,7 @@ Preset = Literal["paper", "default", "realtime"]
 class Settings(BaseModel):
     """A group of settings: frozen, validated, no unknown key."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class MaskSettings(Settings):
@@ -30,9 +31,9 @@ class MaskSettings(Settings):
 
     field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
     dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
-    bright_level: int = Field(240, ge=0, le=255, description="level of the second-brightest channel that counts as saturated")
+    bright_level: int = Field(240, ge=0, le=255, description="level at which the second-brightest channel is saturated")
     highlights: bool = Field(True, description="find specular highlights and leave them out")
-    highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median that makes a highlight")
+    highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median in a highlight")
     highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
     border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
 
@@ -53,7 +54,7 @@ class DepthSettings(Settings):
     files_scale_mm: float | None = Field(None, gt=0, description="mm per unit of depth files; None: found or assumed")
     shading_median_mm: float = Field(35.0, gt=0, description="stated prior: median distance of tissue in frame 1, mm")
     shading_exponent: float = Field(0.6, gt=0, le=1, description="distance = k * brightness^-exponent")
-    max_depth_mm: float = Field(300.0, gt=0, description="depth beyond this is unknown")
+    max_depth_mm: float = Field(300.0, gt=0, description="depth beyond this is unknown, unless it is measured")
 
 
 class MapisSettings(Settings):
@@ -92,7 +93,9 @@ class NetworkSettings(Settings):
 class OdometrySettings(Settings):
     """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
 
-    keyframe_every: int = Field(5, ge=1, description="every n-th frame becomes a keyframe (the paper's first alpha: 2)")
+    keyframe_every: int = Field(
+        10, ge=1, description="every n-th frame becomes a keyframe (the paper's first alpha: 2)"
+    )
     levels: int = Field(5, ge=1, description="pyramid levels, factor 0.5")
     finest_level: int = Field(1, ge=0, description="0: full working size, 1: half")
     min_side_px: int = Field(16, ge=4, description="no level with a shorter side than this")
@@ -102,15 +105,19 @@ class OdometrySettings(Settings):
     radius: float = Field(0.1, gt=0, description="rho, first trust radius: rad, and translation over mean depth")
     huber: float = Field(1.0, gt=0, description="Huber threshold in robust standard deviations (MAD)")
     channels: Literal["grey", "normalised", "both"] = Field(
-        "both", description="what is compared: grey values, or grey values minus local mean over local deviation, or both"
+        "both",
+        description="what is compared: grey values, or grey values minus local mean over local deviation, or both",
     )
-    normalise_sigma_px: float = Field(4.0, gt=0, description="width of the local mean, px at each level")
-    lamp_falloff: float = Field(
-        0.9, ge=0, description="grey values fall as distance^-x from the lamp; inverse square through sRGB: 2/2.2; 0: off"
+    normalise_sigma_px: float = Field(2.0, gt=0, description="width of the local mean, px at each level")
+    grey_share: float = Field(0.3, gt=0, description="weight of the grey channel against the normalised one")
+    lamp_gamma: float = Field(
+        0.35,
+        ge=0,
+        description="grey = (cosine / distance^2)^gamma; sRGB alone: 0.45, endoscopes measure less; 0: off",
     )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
-    min_inlier_share: float = Field(0.3, ge=0, le=1, description="a frame below this is lost")
+    min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated images: 0.37")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
     max_step: float = Field(0.5, gt=0, description="largest jump between frames: rad, and mm over mean depth")
 
@@ -139,7 +146,7 @@ class FusionSettings(Settings):
     enabled: bool = True
     voxel_mm: float = Field(1.0, gt=0)
     truncation_mm: float = Field(5.0, gt=0)
-    max_depth_mm: float = Field(150.0, gt=0, description="depth beyond this is not fused")
+    max_depth_mm: float = Field(100.0, gt=0, description="depth beyond this is not fused")
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     min_weight: float = Field(1.5, ge=0, description="voxels with less weight give no surface")
     min_component_share: float = Field(0.02, ge=0, le=1, description="floaters below this share of the faces go")
@@ -160,33 +167,30 @@ class Config(Settings):
 
     @classmethod
     def load(
-        cls, preset: Preset = "default", file: Path | None = None, settings: dict[str, Any] | None = None
+        cls, preset: Preset | None = None, file: Path | None = None, settings: dict[str, Any] | None = None
     ) -> Config:
         """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
 
-        `settings` maps names such as "odometry.huber" to values or to their text. Raises `SettingsError`.
+        `settings` maps names such as "odometry.huber" to values or to their text. The preset is the one that they
+        name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
-        if preset not in PRESETS:
-            raise SettingsError(f"unknown preset '{preset}': choose one of {', '.join(PRESETS)}")
-        tree: dict[str, Any] = {"preset": preset}
-        for key, value in PRESETS[preset].items():
-            _insert(tree, key, value)
-        if file is not None:
-            for key, value in _flatten(_read_toml(file)).items():
-                _insert(tree, key, value)
-        for key, value in (settings or {}).items():
+        settings = settings or {}
+        in_file = {} if file is None else _flatten(_read_toml(file))
+        chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
+        if chosen not in PRESETS:
+            raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
+        tree: dict[str, Any] = {}
+        for key, value in (PRESETS[chosen] | in_file | settings | {"preset": chosen}).items():
             _insert(tree, key, value)
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
             raise SettingsError("; ".join(_explain(item) for item in error.errors())) from None
 
-    def replace(self, **settings: Any) -> Config:
-        """Return a copy with dotted settings changed; dots are written as double underscores: `odometry__huber=2`."""
-        tree = self.model_dump()
-        for key, value in settings.items():
-            _insert(tree, key.replace("__", "."), value)
-        return type(self).model_validate(tree)
+    def toml(self) -> str:
+        """Return all settings as TOML text that `load` reads back; what is None is left out."""
+        flat = _flatten(self.model_dump())
+        return "".join(f"{key} = {_toml_value(value)}\n" for key, value in flat.items() if value is not None)
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -205,7 +209,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.keyframe_every": 2,
         "odometry.finest_level": 0,
         "odometry.channels": "grey",
-        "odometry.lamp_falloff": 0.0,
+        "odometry.lamp_gamma": 0.0,
         "odometry.gain_bias": False,
         "odometry.start": "identity",
         "smoothing.method": "wema",
@@ -223,6 +227,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 def setting_names() -> list[str]:
     """Return the dotted names of all settings."""
     return list(_flatten(Config().model_dump()))
+
+
+def _toml_value(value: Any) -> str:
+    # JSON's numbers, booleans, arrays and strings are TOML's too, but for surrogate pairs and a raw DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -248,7 +257,7 @@ def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(Path(file).read_text())
+        return tomllib.loads(Path(file).read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"cannot read the settings in {file}: {error}") from None
 

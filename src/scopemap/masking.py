@@ -14,12 +14,16 @@ from scopemap.frame import Frame
 _NEIGHBOURHOOD_SHARE = 0.09
 _DARKEST_HIGHLIGHT = 70
 _CONSTANT_RANGE = 4
+# Widths of the means that leave little of a sensor's noise: for one image as a whole, and for one pixel.
+_NOISE_WIDTH_PX = 9
+_CALM_WIDTH_PX = 5
 _LEAST_FIELD_SHARE = 0.05
 
 
 def is_constant(rgb: np.ndarray) -> bool:
-    """Return whether an image (H, W, 3) uint8 shows nothing: black, or one even colour up to coding noise."""
-    low, high = np.percentile(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
+    """Return whether an image (H, W, 3) uint8 shows nothing: black, or one even colour up to noise."""
+    calm = cv2.blur(rgb, (_NOISE_WIDTH_PX, _NOISE_WIDTH_PX))
+    low, high = np.percentile(cv2.cvtColor(calm, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
     return bool(high - low <= _CONSTANT_RANGE)
 
 
@@ -34,15 +38,18 @@ class Masker:
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights and at bad exposure.
 
-        Under-exposed is a pixel whose brightest channel is at most `dark_level`; over-exposed, one whose second
-        brightest reaches `bright_level`: red alone clips on sound tissue, and leaves two channels to see by.
+        Under-exposed is a pixel whose brightest channel is at most `dark_level`, its own or the mean around it: noise
+        lifts single pixels of a black image. Over-exposed is one whose second brightest channel reaches
+        `bright_level`: red alone clips on sound tissue, and leaves two channels to see by.
         """
         darkest, middle, brightest = _sorted_channels(frame.rgb)
         clipped = middle >= self.settings.bright_level
-        valid = frame.valid & (brightest > self.settings.dark_level) & ~clipped
+        calm = cv2.blur(frame.rgb, (_CALM_WIDTH_PX, _CALM_WIDTH_PX)).max(-1)
+        lit = np.minimum(brightest, calm) > self.settings.dark_level
+        valid = frame.valid & lit & ~clipped
         field = frame.valid
         if self.settings.field_of_view:
-            field = self._field_of_view(brightest > self.settings.dark_level, frame.valid)
+            field = self._field_of_view(lit, frame.valid)
         if self.settings.highlights:
             valid &= ~_grown(clipped | self._highlights(darkest, field), self.settings.highlight_grow_px)
         return replace(frame, valid=valid & field)

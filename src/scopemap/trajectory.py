@@ -108,7 +108,7 @@ def write_tum(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> None:
     ]
     for time_s, numbers in zip(trajectory.times_s, np.hstack([positions, quaternions]), strict=True):
         lines.append(f"{time_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
-    Path(path).write_text("\n".join(lines) + "\n")
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_kitti(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> None:
@@ -116,7 +116,7 @@ def write_kitti(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> Non
     rows = trajectory.T_world_camera[:, :3].copy()
     rows[:, :, 3] /= _MM_PER_UNIT[unit]
     lines = [" ".join(f"{number:.12g}" for number in row.ravel()) for row in rows]
-    Path(path).write_text("\n".join(lines) + "\n")
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_trajectory(path: Path, *, unit: Unit = "mm") -> Trajectory:
@@ -141,6 +141,15 @@ def read_trajectory(path: Path, *, unit: Unit = "mm") -> Trajectory:
             "and 16 (C3VD pose.txt)"
         )
     return readers[columns](table, unit)
+
+
+def read_poses(path: Path) -> np.ndarray:
+    """Return the camera-to-world poses (N, 4, 4), mm, of a `pose.txt`: 16 numbers a line, by commas or spaces.
+
+    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
+    over all its lines (with no translation at all they look alike: taken as stored). Raises `InputError`.
+    """
+    return _from_matrices(_read_numbers(Path(path)), "mm").T_world_camera
 
 
 @dataclass(frozen=True)
@@ -178,7 +187,7 @@ def _trajectory(T: np.ndarray, indices: np.ndarray | None, times_s: np.ndarray |
 
 def _read_numbers(path: Path) -> _Table:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read a trajectory from {path}: {error}") from None
     rows: list[list[float]] = []
@@ -253,7 +262,9 @@ def _from_kitti(table: _Table, unit: Unit) -> Trajectory:
 
 
 def _from_matrices(table: _Table, unit: Unit) -> Trajectory:
-    # Decided over all lines: one pose without translation could be either form. C3VD's own form is the transposed.
+    columns = table.values.shape[1]
+    if columns != 16:
+        raise InputError(f"{table.path}, line {table.line_numbers[0]}: expected 16 numbers, a matrix, found {columns}")
     T = table.values.reshape(-1, 4, 4)
     if np.allclose(T[:, :3, 3], 0):
         T = np.swapaxes(T, 1, 2)
@@ -292,7 +303,7 @@ def _read_run(folder: Path) -> Trajectory:
 
 def _read_frames(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     try:
-        rows = list(csv.DictReader(path.read_text().splitlines()))
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
         indices = np.array([int(row["index"]) for row in rows], dtype=np.int64)
         times_s = np.array([float(row["time_s"]) for row in rows])
         status = np.array([row["status"] for row in rows])

@@ -211,7 +211,7 @@ def _record(checkpoint: Checkpoint, revision: str) -> None:
     files = {path.relative_to(folder).as_posix(): _stamp(path, sha256_of(path)) for path in sorted(found)}
     lock = _read_lock() | {checkpoint.name: {"revision": revision, "files": files}}
     draft = folder / f"{LOCK_NAME}.part"
-    draft.write_text(json.dumps(lock, indent=2) + "\n")
+    draft.write_text(json.dumps(lock, indent=2) + "\n", encoding="utf-8")
     draft.replace(folder / LOCK_NAME)
 
 
@@ -225,7 +225,7 @@ def _read_lock() -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise WeightsError(
             f"cannot read the record of pulled weights {path}: {error}. Delete it and pull again"

@@ -46,8 +46,9 @@ def verify(
     names = [name] if name else there
     faults = {each: fault for each in names if (fault := _fault(each))}
     verdict = {each: faults.get(each, "ok") for each in names}
-    text = "\n".join(f"{each}: {state}" for each, state in verdict.items() if state == "ok")
-    _say(verdict, text or "no weights are there", as_json, quiet)
+    sound = [f"{each}: ok" for each in names if each not in faults]
+    if as_json or sound or not faults:
+        _say(verdict, "\n".join(sound) or "no weights are there", as_json, quiet)
     if faults:
         raise WeightsError("; ".join(faults.values()))
 

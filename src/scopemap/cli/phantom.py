@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scopemap.errors import SettingsError
-
-_PLAIN_LINES = 10
+from scopemap.cli.options import parse_settings, parse_size
+from scopemap.cli.progress import render_progress
 
 
 def phantom(
@@ -39,7 +34,7 @@ def phantom(
     # Imported here, so that --help does not wait for the kernels.
     from scopemap.phantom import PhantomSpec, parse_events, write_phantom
 
-    width, height = _parse_size(size)
+    width, height = parse_size(size)
     spec = PhantomSpec(
         scene=scene,  # type: ignore[arg-type]
         frames=frames,
@@ -50,48 +45,14 @@ def phantom(
         deform=deform,
         loop=loop,
         events=parse_events(events),
-    ).with_settings(_parse_settings(settings or []))
-    with _progress(quiet or as_json) as progress:
+    ).with_settings(parse_settings(settings or []))
+    with render_progress(quiet or as_json) as progress:
         write_phantom(spec, folder, progress)
     _report(folder, as_json, quiet)
 
 
-def _parse_size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match:
-        raise SettingsError(f"cannot read the size '{text}': expected WIDTHxHEIGHT such as 320x256")
-    return int(match[1]), int(match[2])
-
-
-def _parse_settings(pairs: list[str]) -> dict[str, str]:
-    for pair in pairs:
-        if "=" not in pair:
-            raise SettingsError(f"cannot read the setting '{pair}': expected KEY=VALUE such as fov_deg=70")
-    return dict(pair.split("=", 1) for pair in pairs)
-
-
-@contextmanager
-def _progress(silent: bool) -> Iterator[Callable[[int, int], None] | None]:
-    if silent:
-        yield None
-    elif sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import Progress
-
-        with Progress(console=Console(stderr=True)) as bar:
-            task = bar.add_task("rendering", total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-    else:
-        yield _print_line
-
-
-def _print_line(done: int, total: int) -> None:
-    if done == total or done % max(total // _PLAIN_LINES, 1) == 0:
-        typer.echo(f"rendered {done} of {total} frames", err=True)
-
-
 def _report(folder: Path, as_json: bool, quiet: bool) -> None:
-    description = json.loads((folder / "phantom.json").read_text())
+    description = json.loads((folder / "phantom.json").read_text(encoding="utf-8"))
     if as_json:
         typer.echo(json.dumps({"folder": str(folder)} | description, indent=2))
     elif not quiet:

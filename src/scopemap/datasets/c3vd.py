@@ -17,6 +17,7 @@ from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
 from scopemap.lenses import OmnidirectionalCamera
+from scopemap.trajectory import read_poses
 
 CAMERA = OmnidirectionalCamera(
     polynomial=(769.243600037458, 0.0, -0.000812770624150226, 6.25674244578925e-07, -1.19662182144280e-09),
@@ -76,26 +77,3 @@ class C3vdFolder(ImageFolder):
         # 0 lies outside the lens circle, the largest value was clipped.
         known = (values > 0) & (values < largest)
         return np.where(known, values * np.float32(scale_mm), np.nan).astype(np.float32)
-
-
-def read_poses(file: Path) -> np.ndarray:
-    """Return the camera-to-world poses (N, 4, 4), mm, of a `pose.txt`: 16 numbers a line, by commas or spaces.
-
-    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
-    over all its lines (with no translation at all they look alike: taken as stored). Raises `InputError`.
-    """
-    try:
-        lines = [line.replace(",", " ").split() for line in file.read_text().splitlines()]
-        rows = [[float(word) for word in line] for line in lines if line and not line[0].startswith("#")]
-    except (OSError, ValueError) as error:
-        raise InputError(f"reading the poses in {file}: {error}") from None
-    if not rows or any(len(row) != 16 for row in rows):
-        wrong = next((i for i, row in enumerate(rows) if len(row) != 16), 0)
-        raise InputError(f"reading the poses in {file}: line {wrong} (from 0) does not hold 16 numbers")
-    poses = np.array(rows).reshape(-1, 4, 4)
-    if np.allclose(poses[:, :3, 3], 0):
-        poses = poses.transpose(0, 2, 1)
-    proper = np.allclose(poses[:, 3], [0, 0, 0, 1], atol=1e-4)
-    if not proper or not np.allclose(np.linalg.det(poses[:, :3, :3]), 1, atol=1e-2):
-        raise InputError(f"reading the poses in {file}: they are not rigid motions, neither as stored nor transposed")
-    return poses

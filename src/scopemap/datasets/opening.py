@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import read_calibration
-from scopemap.camera import CameraModel
+from scopemap.calibration import Calibration, read_calibration
 from scopemap.datasets.c3vd import C3vdFolder
 from scopemap.datasets.images import ImageFolder
 from scopemap.datasets.sequence import Sequence, Source, assumed_camera
@@ -45,7 +44,7 @@ def open_sequence(
     if selection.step is not None and selection.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
     source = _open_source(Path(path), dataset)
-    model, camera_source, calibrated = _camera_of(source, camera, fov_deg)
+    calibration, calibrated = _calibration_of(source, camera, fov_deg)
     if size is None:
         size, size_source = working_size(source.width, source.height), "chosen"
     else:
@@ -55,8 +54,17 @@ def open_sequence(
             f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
         )
     size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
-    rectifier = Rectifier(model, working_camera(model, size))
-    sequence = Sequence(source, source.path, rectifier, camera_source, size_source, calibrated, selection)
+    rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
+    sequence = Sequence(
+        source,
+        source.path,
+        rectifier,
+        camera_source=calibration.source,
+        size_source=size_source,
+        calibrated=calibrated,
+        selection=selection,
+        depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
+    )
     if sequence.count is not None and sequence.count < 2 and not isinstance(source, VideoFile):
         raise InputError(f"reading {source.path}: {sequence.count} frame(s) selected, two are needed")
     return sequence
@@ -87,13 +95,14 @@ def _innermost(path: Path) -> Path:
     return path
 
 
-def _camera_of(source: Source, file: Path | str | None, fov_deg: float) -> tuple[CameraModel, str, bool]:
+def _calibration_of(source: Source, file: Path | str | None, fov_deg: float) -> tuple[Calibration, bool]:
+    """Return the calibration, and whether the camera is known by it or only assumed."""
     if file is not None:
-        calibration = read_calibration(file, (source.width, source.height))
-        return calibration.camera, calibration.source, True
+        return read_calibration(file, (source.width, source.height)), True
     if source.camera is not None:
-        return source.camera, source.camera_source, True
+        return Calibration(source.camera, source.depth_scale_mm, source.camera_source), True
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
     focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
-    return assumed_camera(source, float(focal_px)), f"assumed: horizontal field of view {fov_deg:g} deg (--fov)", False
+    assumed = f"assumed: horizontal field of view {fov_deg:g} deg (--fov)"
+    return Calibration(assumed_camera(source, float(focal_px)), None, assumed), False

@@ -60,6 +60,7 @@ class Source(Protocol):
     camera : the camera of the images, or None where it is unknown.
     camera_source : how the camera is known, one phrase, or "".
     pixel_aspect : width of a pixel over its height.
+    depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
     """
@@ -71,6 +72,7 @@ class Source(Protocol):
     camera: CameraModel | None
     camera_source: str
     pixel_aspect: float
+    depth_scale_mm: float | None
     notes: list[str]
     warnings: list[str]
 
@@ -103,6 +105,7 @@ class Sequence:
     size_source : where the working size comes from, one phrase.
     calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
     selection : slice over the input's frames.
+    depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
     """
 
     source: Source
@@ -112,6 +115,7 @@ class Sequence:
     size_source: str
     calibrated: bool
     selection: slice = field(default_factory=lambda: slice(None))
+    depth_scale_mm: float | None = None
 
     @property
     def name(self) -> str:

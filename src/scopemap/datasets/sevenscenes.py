@@ -84,6 +84,6 @@ def _read_pose(file: Path) -> np.ndarray | None:
 
 def _read_matrix(file: Path, shape: tuple[int, int]) -> np.ndarray:
     try:
-        return np.array(file.read_text().split(), dtype=np.float64).reshape(shape)
+        return np.array(file.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(shape)
     except ValueError as error:
         raise InputError(f"reading {file}: expected {shape[0]}x{shape[1]} numbers ({error})") from None

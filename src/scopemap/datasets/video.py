@@ -17,6 +17,8 @@ from scopemap.errors import InputError
 DEFAULT_RATE_HZ = 30.0
 # Headers round durations and count pictures that are never shown: less than this is not a video that breaks off.
 _MISSING_SHARE, _MISSING_FRAMES = 0.02, 2
+# FFmpeg draws text files as a terminal would show them.
+_TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 
 
 class VideoFile:
@@ -32,6 +34,7 @@ class VideoFile:
         self.path = path
         self.camera: CameraModel | None = None
         self.camera_source = ""
+        self.depth_scale_mm: float | None = None
         self.notes: list[str] = []
         self.warnings: list[str] = []
         first = [frame for _, frame in islice(self._decoded(), 2)]
@@ -76,6 +79,8 @@ class VideoFile:
                 if not container.streams.video:
                     raise InputError(f"reading the video {self.path}: it has no picture")
                 stream = container.streams.video[0]
+                if stream.codec_context.name in _TEXT_CODECS:
+                    raise InputError(f"reading the video {self.path}: it is a text file, not a video")
                 stream.thread_type = "AUTO"
                 for packet in container.demux(stream):
                     try:

@@ -17,8 +17,8 @@ from scopemap.depth.estimate import DepthEstimate, DepthEstimator
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 
-# A frame with fewer pixels that have both an estimate and an anchor cannot fix a scale: the next one is tried.
-_MIN_PIXELS = 16
+# A frame with less that has both an estimate and an anchor cannot fix a scale: the next one is tried.
+_LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,19 @@ class AnchoredDepth:
         return self._description
 
     @property
+    def reference(self) -> DepthEstimator:
+        """The estimator that is asked where the anchor is neither the range nor the estimate itself."""
+        return self._reference
+
+    @property
     def conversion(self) -> AffineDisparity | DepthScale | None:
         """The conversion that holds for the sequence; None until a frame fixed it."""
         return self._conversion
 
     def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
-        """Return metric depth (H, W) float32 in mm, NaN = unknown, not positive or beyond `settings.max_depth_mm`.
+        """Return metric depth (H, W) float32 in mm, NaN = unknown or not positive.
 
+        Depth that is not measured is NaN too beyond `settings.max_depth_mm`, where an estimate says nothing any more.
         All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
         anchor.
         """
@@ -81,12 +87,14 @@ class AnchoredDepth:
         if self._conversion is None:
             return np.full(estimate.values.shape, np.nan, dtype=np.float32)
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
+        if estimate.kind == "measured":
+            return depth_mm
         return np.where(depth_mm <= self._settings.max_depth_mm, depth_mm, np.float32(np.nan))
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
         """Fix the conversion; return this frame's depth (H, W) where it is the anchor's and not the conversion's."""
         usable = frame.valid & np.isfinite(estimate.values)
-        if usable.sum() < _MIN_PIXELS:
+        if usable.mean() < _LEAST_SHARE:
             return None
         first_mm = None
         source = self._source(estimate)
@@ -97,7 +105,7 @@ class AnchoredDepth:
         else:
             reference = self._reference.estimate(frame)
             known = usable & (reference.values > 0) & (reference.values <= self._settings.max_depth_mm)
-            if known.sum() < _MIN_PIXELS:
+            if known.mean() < _LEAST_SHARE:
                 return None
             focal_px = reference.focal_px or frame.camera.fx
             target = _Target(estimate.values[known], reference.values[known], focal_px)

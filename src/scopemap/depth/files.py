@@ -44,6 +44,7 @@ class FilesDepth:
     folder : holds one file per frame; `*_depth.*` and `*.depth.*` are preferred where other images lie there too.
     rectifier : from the source camera to the working camera.
     depth_scale_mm : mm per unit by the input's own calibration, or None.
+    measured_reach_mm : farthest depth that measured files can hold, of floats twice the first file's; None: predicted.
 
     Raises `InputError` where the folder does not exist, holds no usable file, or two files for one number.
     """
@@ -60,6 +61,7 @@ class FilesDepth:
         self._only_type = first.dtype if settings.files_kind == "auto" else None
         self._is_rectified = (self._folder / "depth.json").exists()
         self._scale = self._found_scale(first, settings, depth_scale_mm)
+        self.measured_reach_mm = _reach(first) * self._scale.mm if self._kind == "measured" else None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the depth or disparity of `frame` (found by `frame.index`), rectified, NaN = unknown.
@@ -189,12 +191,18 @@ def _depth(array: np.ndarray, scale_mm: float) -> np.ndarray:
     return np.where(known, array * np.float32(scale_mm), np.nan).astype(np.float32)
 
 
+def _reach(array: np.ndarray) -> float:
+    if np.issubdtype(array.dtype, np.integer):
+        return float(np.iinfo(array.dtype).max - (array.dtype == np.uint16))  # 65535 is unknown
+    return 2.0 * float(np.max(array, initial=0.0, where=np.isfinite(array)))
+
+
 def _scale_beside(folder: Path) -> _Scale | None:
     """Return the scale that a `depth.json` or `camera.yaml` in the folder states."""
     written, calibration = folder / "depth.json", folder / "camera.yaml"
     if written.exists():
         try:
-            return _Scale(float(json.loads(written.read_text())["scale_mm"]), written.name)
+            return _Scale(float(json.loads(written.read_text(encoding="utf-8"))["scale_mm"]), written.name)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"cannot read scale_mm in {written}: {error!r}") from None
     if calibration.exists():

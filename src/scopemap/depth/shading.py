@@ -30,7 +30,8 @@ _WINDOW_SHARE = 0.04
 _REACH_SHARE = 0.1
 # Deviation of log brightness in a window above which it is taken for shape, not for texture.
 _EDGE_LOG = 0.8
-_MIN_PIXELS = 16
+# A frame with less usable tissue cannot fix the scale: the next one is tried.
+_LEAST_SHARE = 0.02
 
 
 class ShadingDepth:
@@ -56,7 +57,7 @@ class ShadingDepth:
         distance = relative_distance(frame, unit_z, self._settings.shading_exponent)
         if self._scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
-            if seen.size >= _MIN_PIXELS:
+            if seen.size >= _LEAST_SHARE * distance.size:
                 self._scale_mm = self._settings.shading_median_mm / float(np.median(seen))
         scale_mm = np.nan if self._scale_mm is None else self._scale_mm
         return DepthEstimate((scale_mm * distance * unit_z).astype(np.float32), "depth")

@@ -1,13 +1,13 @@
 """Image pair to optical flow: a contract, estimators behind it, and what both directions together tell."""
 
 from scopemap.errors import SettingsError
-from scopemap.flow.consistency import Flow, agree, pair_flow, pull
+from scopemap.flow.consistency import Flow, agree, pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.flow.none import NoFlow
 from scopemap.flow.raft import RaftFlow
 
-__all__ = ["DisFlow", "Flow", "FlowEstimator", "NoFlow", "RaftFlow", "agree", "create_flow", "pair_flow", "pull"]
+__all__ = ["DisFlow", "Flow", "FlowEstimator", "NoFlow", "RaftFlow", "agree", "create_flow", "pair_flow"]
 
 FLOWS = ("raft-small", "raft-large", "dis", "none")
 

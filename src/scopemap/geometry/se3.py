@@ -38,8 +38,8 @@ def so3_log(R: np.ndarray) -> np.ndarray:
         return axis_sine * (angle / sine)
     if cosine > 0:
         return axis_sine
-    # Near pi the antisymmetric part vanishes: the axis is the largest column of R + 1.
-    columns = R + np.eye(3)
+    # Near pi the antisymmetric part vanishes; (R + R^T) / 2 = cos 1 + (1 - cos) a a^T holds the axis a up to its sign.
+    columns = 0.5 * (R + R.T) - cosine * np.eye(3)
     axis = columns[:, int(np.argmax(np.diag(columns)))]
     axis = axis / np.linalg.norm(axis)
     return axis * angle * (1.0 if axis @ axis_sine >= 0 else -1.0)

@@ -29,11 +29,11 @@ class Quadratic(NamedTuple):
 class Problem(Generic[State]):
     """What is minimised, on whatever group its states live.
 
-    `linearise` gives the quadratic model around a state, `cost` only its value, `retract` moves a state by a step (n,).
+    `linearise` gives the quadratic model around a state, of infinite cost where the state is impossible; `retract`
+    moves a state by a step (n,).
     """
 
     linearise: Callable[[State], Quadratic]
-    cost: Callable[[State], float]
     retract: Callable[[State, np.ndarray], State]
 
 
@@ -44,7 +44,7 @@ class Options:
     radius: float = 0.1
     max_iterations: int = 30
     min_step: float = 1e-5
-    min_decrease: float = 1e-5
+    min_decrease: float = 1e-4
     gauss_newton: bool = False
 
 
@@ -60,7 +60,8 @@ class Solution(Generic[State]):
 
 def gauss_newton_step(model: Quadratic) -> np.ndarray:
     """Return the step (n,) to the minimum of the model; directions that it does not see stay at zero."""
-    scale = np.sqrt(np.maximum(np.diag(model.hessian), 1e-30))
+    curvature = np.diag(model.hessian)
+    scale = np.sqrt(np.where(curvature > 0, curvature, 1.0))
     scaled = model.hessian / np.outer(scale, scale)
     return -np.linalg.lstsq(scaled, model.gradient / scale, rcond=1e-10)[0] / scale
 
@@ -93,19 +94,20 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
         if length < options.min_step or not np.isfinite(length):
             return Solution(state, model.cost, iteration, bool(np.isfinite(length)))
         candidate = problem.retract(state, step)
+        # Most steps are taken: linearising at once is cheaper than asking for the cost first.
+        ahead = problem.linearise(candidate)
         if options.gauss_newton:
-            state, model = candidate, problem.linearise(candidate)
+            state, model = candidate, ahead
             continue
-        cost = problem.cost(candidate)
         predicted = -float(model.gradient @ step + 0.5 * step @ model.hessian @ step)
-        ratio = (model.cost - cost) / max(predicted, 1e-300)
+        ratio = (model.cost - ahead.cost) / max(predicted, 1e-300)
         if ratio < 0.25:
             radius = 0.25 * length
         elif ratio > 0.75 and length > 0.99 * radius:
             radius = 2.0 * radius
-        if cost < model.cost:
-            small = model.cost - cost < options.min_decrease * model.cost
-            state, model = candidate, problem.linearise(candidate)
+        if ahead.cost < model.cost:
+            small = model.cost - ahead.cost < options.min_decrease * model.cost
+            state, model = candidate, ahead
             if small:
                 return Solution(state, model.cost, iteration, True)
     return Solution(state, model.cost, options.max_iterations, False)

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numba import njit
 
+from scopemap.camera import PinholeCamera
 from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
 from scopemap.odometry.residuals import View
 
 CHANNELS = {"grey": ("grey",), "normalised": ("normalised",), "both": ("grey", "normalised")}
 _GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
+_SLOPE_SIGMA_PX = 1.5
 _NOISE_LEVEL = 2.0  # grey levels of local deviation below which an area counts as flat
 
 
-def build_pyramid(frame: Frame, settings: OdometrySettings) -> list[View]:
+def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool = False) -> list[View]:
     """Return the levels from `finest_level` (first) to the coarsest (last), each half the size of the one before.
+
+    `trust_slope` says that the depth is good enough for tangent planes; predicted depth is not (its slopes follow the
+    paint of the tissue), and every point then counts as facing the camera.
 
     Levels whose short side would fall below `min_side_px` are left out; the finest is always there. A frame without
     depth gives views that can only be tracked, not tracked against.
@@ -24,17 +31,42 @@ def build_pyramid(frame: Frame, settings: OdometrySettings) -> list[View]:
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = frame.valid.astype(np.float32)
     depth = np.full(grey.shape, np.nan, np.float32) if frame.depth_mm is None else frame.depth_mm
-    camera, views = frame.camera, []
+    camera = frame.camera
+    views: list[View] = []
     for level in range(settings.levels):
         if level > 0:
             width, height = camera.width // 2, camera.height // 2
             if views and min(width, height) < settings.min_side_px:
                 break
+            # An odd last row or column has no partner: without it, pixels, depth and camera halve alike.
+            camera = replace(camera, width=2 * width, height=2 * height)
+            grey, weight, depth = (plane[: 2 * height, : 2 * width] for plane in (grey, weight, depth))
             grey, weight = _halve_image(grey, weight, (width, height))
             depth, camera = _halve_depth(depth), camera.resized(width, height)
         if level >= min(settings.finest_level, settings.levels - 1):
-            views.append(View(_channels(grey, weight, settings), weight, depth, np.array([camera.fx, camera.fy, camera.cx, camera.cy])))
+            slope = _slope(depth, camera) if trust_slope else np.zeros((*depth.shape, 2), np.float32)
+            views.append(
+                View(
+                    _channels(grey, weight, settings),
+                    weight,
+                    depth,
+                    slope,
+                    np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+                )
+            )
     return views
+
+
+def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """Derivative of smoothed inverse depth along the ray's x and y, (H, W, 2) 1/mm; 0 where depth is unknown."""
+    known = np.isfinite(depth_mm).astype(np.float32)
+    if not known.any():
+        return np.zeros((*depth_mm.shape, 2), np.float32)
+    nearness = np.divide(1.0, depth_mm, out=np.zeros_like(depth_mm), where=known > 0)
+    share = np.maximum(cv2.GaussianBlur(known, (0, 0), _SLOPE_SIGMA_PX), 1e-6)
+    smooth = np.where(share > 0.5, cv2.GaussianBlur(nearness, (0, 0), _SLOPE_SIGMA_PX) / share, np.nan)
+    along_y, along_x = np.gradient(smooth)
+    return np.nan_to_num(np.stack([camera.fx * along_x, camera.fy * along_y], -1)).astype(np.float32)
 
 
 def _channels(grey: np.ndarray, weight: np.ndarray, settings: OdometrySettings) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 For a reference pixel p with depth, X = depth * ray(p) and X' = T_current_reference X, each channel c of the images has
 
-    r_c(p) = C_c(project(X')) - (gain * L(p) * R_c(p) + bias),      L(p) = (|X| / |X'|)^falloff_c
+    r_c(p) = C_c(project(X')) - (gain * L(p) * R_c(p) + bias),      L(p) = ((cos' / cos) (|X| / |X'|)^2)^gamma
 
 R, C are the reference and the current image; C is sampled bilinearly, and its gradient is the exact derivative of that
-interpolation, so that Jacobians agree with finite differences. L predicts how the lamp, which moves with the camera,
-dims a point. A locally normalised channel is blind to light: it has neither gain nor bias nor fall-off. Parameters of
-the normal equations, in this order: rotation (3, rad) and translation (3, in units of `translation_unit_mm`) of a
-perturbation exp(xi) T_current_reference, gain, bias.
+interpolation, so that Jacobians agree with finite differences. L predicts how a point dims as the lamp, which moves
+with the camera, moves away and aside (cos: of incidence; gamma: of the image's tone curve). With the tangent plane
+m . X = 1 it is cos' / cos = (1 + m . R^T t) |X| / |X'|, and m is read off the gradient of inverse depth. A locally
+normalised channel is blind to light: it has neither gain nor bias nor fall-off. Parameters of the normal equations, in
+this order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference,
+gain, bias.
 
 One thread on purpose: a level is a few milliseconds of work, the other core has the networks and the fusion to do, and
 on a busy machine waking threads some fifty times a frame costs more than it saves (BENCHMARK.md).
@@ -33,6 +35,7 @@ class View(NamedTuple):
     ----------
     channels : (C, H, W) float32, raw grey values or locally normalised ones.
     weight : (H, W) float32, 0 where a pixel must not be used.
+    slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = facing or unknown.
     depth_mm : (H, W) float32, NaN = unknown (only the reference's is read).
     intrinsics : (4,) float64 fx, fy, cx, cy in px of this level.
     """
@@ -40,6 +43,7 @@ class View(NamedTuple):
     channels: np.ndarray
     weight: np.ndarray
     depth_mm: np.ndarray
+    slope: np.ndarray
     intrinsics: np.ndarray
 
 
@@ -49,13 +53,15 @@ class Loss(NamedTuple):
     Attributes
     ----------
     sigma : (C,) float64, robust standard deviation s of each channel's residuals. threshold : in units of s.
-    lit : (C,) bool, whether gain, bias and the lamp apply to the channel. falloff : exponent of the lamp, 0 = none.
+    share : (C,) float64, how much each channel counts.
+    lit : (C,) bool, whether gain, bias and the lamp apply to the channel. gamma : exponent of the lamp, 0 = no lamp.
     """
 
     sigma: np.ndarray
     threshold: float
+    share: np.ndarray
     lit: np.ndarray
-    falloff: float
+    gamma: float
 
 
 class NormalEquations(NamedTuple):
@@ -75,7 +81,7 @@ class NormalEquations(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def _land(reference, current, T, row, column):  # type: ignore[no-untyped-def]
-    """Where a reference pixel lands: X', pixel, cell (column, row), |X|^2; the last entry is its weight, 0 = unusable."""
+    """Where a reference pixel lands: X', place in its cell, cell (column, row), |X|^2, weight (0 = unusable)."""
     nothing = (0.0, 0.0, 1.0, 0.0, 0.0, 0, 0, 1.0, 0.0)
     depth, weight = float(reference.depth_mm[row, column]), float(reference.weight[row, column])
     if weight <= 0.0 or not depth > 0.0:
@@ -106,6 +112,21 @@ def _bilinear(image, a, b, i, j):  # type: ignore[no-untyped-def]
     return top + b * (bottom - top), (1 - b) * (i10 - i00) + b * (i11 - i01), bottom - top
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _tilt(reference, T, row, column):  # type: ignore[no-untyped-def]
+    """Plane m of a reference pixel, turned to the current camera, and 1 + m . R^T t: the lamp's lift off the plane."""
+    K = reference.intrinsics
+    a, b = float(reference.slope[row, column, 0]), float(reference.slope[row, column, 1])
+    c = 1.0 / float(reference.depth_mm[row, column]) - a * (column - K[2]) / K[0] - b * (row - K[3]) / K[1]
+    mx = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
+    my = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
+    mz = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+    lift = 1.0 + mx * T[0, 3] + my * T[1, 3] + mz * T[2, 3]
+    if 0.3 < lift < 3.0:
+        return mx, my, mz, lift
+    return 0.0, 0.0, 0.0, 1.0  # a plane seen from its edge or from behind: its tilt says nothing
+
+
 @njit(cache=True, nogil=True)
 def residual_images(reference, current, T_current_reference, affine, loss):  # type: ignore[no-untyped-def]
     """Return residuals (C, H, W) float32 on the reference's grid, NaN where a pixel is not used."""
@@ -116,7 +137,8 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
             x, y, z, a, b, i, j, square, weight = _land(reference, current, T_current_reference, row, column)
             if weight <= 0.0:
                 continue
-            lamp = (square / (x * x + y * y + z * z)) ** (0.5 * loss.falloff)
+            _, _, _, lift = _tilt(reference, T_current_reference, row, column)
+            lamp = ((square / (x * x + y * y + z * z)) ** 1.5 * lift) ** loss.gamma
             for c in range(channels):
                 value, _, _ = _bilinear(current.channels[c], a, b, i, j)
                 expected = float(reference.channels[c, row, column])
@@ -127,19 +149,19 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add(sums, J, r, weight):  # type: ignore[no-untyped-def]
-    """Add one residual's share to the upper triangle and the gradient."""
-    n = 0
-    for k in range(PARAMETERS):
+def _add(sums, J, r, weight, free):  # type: ignore[no-untyped-def]
+    """Add one residual's share to the upper triangle and the gradient; derivatives from `free` on are zero."""
+    for k in range(free):
         wj = weight * J[k]
         sums[_PAIRS + k] += wj * r
-        for m in range(k, PARAMETERS):
-            sums[n] += wj * J[m]
-            n += 1
+        first = k * PARAMETERS - k * (k - 1) // 2 - k
+        for m in range(k, free):
+            sums[first + m] += wj * J[m]
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(reference, current, T, affine, loss, unit_mm, linear):  # type: ignore[no-untyped-def]
+def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[no-untyped-def]
+    """Sums over all pixels, `_SUMS` long."""
     channels, h, w = reference.channels.shape
     sums, J = np.zeros(_SUMS), np.zeros(PARAMETERS)
     for row in range(h):
@@ -150,40 +172,43 @@ def _accumulate(reference, current, T, affine, loss, unit_mm, linear):  # type: 
             sums[_SUMS - 1] += weight
             fx, fy = current.intrinsics[0] / z, current.intrinsics[1] / z
             distance = x * x + y * y + z * z
-            lamp = (square / distance) ** (0.5 * loss.falloff)
+            mx, my, mz, lift = _tilt(reference, T, row, column)
+            lamp = ((square / distance) ** 1.5 * lift) ** loss.gamma
+            # -d ln(lamp) / dX', for translations; the lamp sits in the camera's centre: turning changes nothing.
+            kx = loss.gamma * (3.0 * x / distance - mx / lift)
+            ky = loss.gamma * (3.0 * y / distance - my / lift)
+            kz = loss.gamma * (3.0 * z / distance - mz / lift)
             for c in range(channels):
                 value, du, dv = _bilinear(current.channels[c], a, b, i, j)
                 shown = float(reference.channels[c, row, column])
-                k = 0.0
+                k, free = 0.0, PARAMETERS - 2
                 if loss.lit[c]:
                     shown *= lamp
                     r = value - affine[0] * shown - affine[1]
-                    k = affine[0] * shown * loss.falloff / distance  # -dL/dX' is along X': it turns nothing
+                    k, free = affine[0] * shown, PARAMETERS
                     J[6], J[7] = -shown, -1.0
                 else:
                     r = value - shown
-                    J[6], J[7] = 0.0, 0.0
                 size, s = abs(r), loss.sigma[c]
-                information = weight / (s * s)
+                information = loss.share[c] * weight / (s * s)
                 if size <= loss.threshold * s:
                     sums[_SUMS - 2] += 0.5 * information * r * r
                 else:
                     sums[_SUMS - 2] += information * loss.threshold * s * (size - 0.5 * loss.threshold * s)
                     information *= loss.threshold * s / size
-                if linear:
-                    gx, gy = du * fx, dv * fy
-                    gz = -(gx * x + gy * y) / z
-                    J[0], J[1], J[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
-                    J[3], J[4], J[5] = unit_mm * (gx + k * x), unit_mm * (gy + k * y), unit_mm * (gz + k * z)
-                    _add(sums, J, r, information)
+                gx, gy = du * fx, dv * fy
+                gz = -(gx * x + gy * y) / z
+                J[0], J[1], J[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+                J[3], J[4], J[5] = unit_mm * (gx + k * kx), unit_mm * (gy + k * ky), unit_mm * (gz + k * kz)
+                _add(sums, J, r, information, free)
     return sums
 
 
 def normal_equations(
     reference: View, current: View, T_current_reference: np.ndarray, affine: np.ndarray, loss: Loss, unit_mm: float
 ) -> NormalEquations:
-    """Linearise the loss around a motion (4, 4) and an affine brightness change (gain, bias); translation in `unit_mm`."""
-    sums = _accumulate(reference, current, T_current_reference, affine, loss, unit_mm, True)
+    """Linearise the loss around a motion (4, 4) and a brightness change (gain, bias); translation in `unit_mm`."""
+    sums = _accumulate(reference, current, T_current_reference, affine, loss, unit_mm)
     weight = float(sums[-1])
     sums /= max(weight, 1e-9)
     hessian = np.zeros((PARAMETERS, PARAMETERS))
@@ -191,11 +216,3 @@ def normal_equations(
     hessian[upper] = sums[:_PAIRS]
     hessian[upper[::-1]] = sums[:_PAIRS]
     return NormalEquations(hessian, sums[_PAIRS : _PAIRS + PARAMETERS], float(sums[-2]), weight)
-
-
-def mean_cost(
-    reference: View, current: View, T_current_reference: np.ndarray, affine: np.ndarray, loss: Loss
-) -> tuple[float, float]:
-    """Return the mean loss and the weight of the pixels used, without derivatives."""
-    cost, weight = _accumulate(reference, current, T_current_reference, affine, loss, 1.0, False)[-2:]
-    return float(cost / max(weight, 1e-9)), float(weight)

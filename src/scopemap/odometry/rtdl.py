@@ -14,10 +14,11 @@ import numpy as np
 from scopemap.config import OdometrySettings
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 from scopemap.odometry.dogleg import Options, Problem, Quadratic, minimise
-from scopemap.odometry.residuals import PARAMETERS, Loss, View, mean_cost, normal_equations, residual_images
 from scopemap.odometry.pyramid import CHANNELS
+from scopemap.odometry.residuals import PARAMETERS, Loss, View, normal_equations, residual_images
 
 _MAD_TO_SIGMA = 1.4826
+_INLIER = 0.5
 
 
 class Motion(NamedTuple):
@@ -33,8 +34,9 @@ class Alignment:
 
     Attributes
     ----------
-    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level.
-    inlier_share : share of pixels within 3 robust standard deviations of the level's start... of all used pixels.
+    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level, in
+    local deviations where the normalised channel is compared, else in units of 32 grey levels.
+    inlier_share : share of the used pixels whose residual is below half such a unit.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
     """
 
@@ -57,16 +59,17 @@ def align(reference: list[View], current: list[View], start: np.ndarray, setting
     # Inverting by transposing doubles a deviation from a rotation each time round: cut it off at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
     residuals = _residuals(reference[0], current[0], motion, settings)
-    used = residuals[0][np.isfinite(residuals[0])]
+    used = residuals[-1][np.isfinite(residuals[-1])]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
     sigma = _robust_sigma(used)
-    inliers = float(np.mean(np.abs(used) < 1.0)) if used.size else 0.0
+    inliers = float(np.mean(np.abs(used) < _INLIER)) if used.size else 0.0
     return Alignment(motion, sigma, inliers, used.size / max(usable, 1), iterations)
 
 
 def _loss(sigma: np.ndarray, settings: OdometrySettings) -> Loss:
     lit = np.array([name == "grey" for name in CHANNELS[settings.channels]])
-    return Loss(sigma, settings.huber, lit, settings.lamp_falloff)
+    share = np.where(lit, settings.grey_share, 1.0)
+    return Loss(sigma, settings.huber, share, lit, settings.lamp_gamma)
 
 
 def _residuals(reference: View, current: View, motion: Motion, settings: OdometrySettings) -> np.ndarray:
@@ -80,16 +83,15 @@ def _align_level(
     start = _residuals(reference, current, motion, settings)
     loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
     least_weight = 0.5 * np.isfinite(start[0]).sum()
-    free = np.array([0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.lit.any() else []))
+    free = np.array(
+        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.lit.any() else [])
+    )
 
     def linearise(state: Motion) -> Quadratic:
         equations = normal_equations(reference, current, *state, loss, unit_mm)
-        return Quadratic(equations.cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
-
-    def cost(state: Motion) -> float:
-        mean, weight = mean_cost(reference, current, *state, loss)
         # A mean over few pixels can be small: a step that walks out of the overlap is no improvement.
-        return mean if weight > least_weight else np.inf
+        cost = equations.cost if equations.weight > least_weight else np.inf
+        return Quadratic(cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
 
     def retract(state: Motion, step: np.ndarray) -> Motion:
         full = np.zeros(PARAMETERS)
@@ -98,7 +100,7 @@ def _align_level(
         return Motion(se3_exp(full[:6]) @ state.T_current_reference, state.affine + full[6:])
 
     options = Options(settings.radius, settings.max_iterations, gauss_newton=settings.solver == "gauss-newton")
-    solution = minimise(Problem(linearise, cost, retract), motion, options)
+    solution = minimise(Problem(linearise, retract), motion, options)
     return solution.state, solution.iterations
 
 

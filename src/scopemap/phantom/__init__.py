@@ -1,6 +1,5 @@
 """Synthetic endoscopy with exact truth: scenes, camera paths, rendering, and folders in the C3VD layout."""
 
-from scopemap.phantom.camera_path import read_path
 from scopemap.phantom.render import Phantom, build_scene, light, prepare, render_frame, render_surface
 from scopemap.phantom.spec import Event, PhantomSpec, parse_events
 from scopemap.phantom.truth_mesh import SeenVoxels, TriangleMesh, surface_mesh
@@ -17,7 +16,6 @@ __all__ = [
     "light",
     "parse_events",
     "prepare",
-    "read_path",
     "render_frame",
     "render_surface",
     "surface_mesh",

@@ -1,57 +1,13 @@
-"""Camera paths: read from a file, or made up as a hand would move.
-
-Poses are camera to world, mm, OpenCV axes. C3VD stores them transposed (translation in the last row); which form a
-file has is decided once for the whole file by where the translations lie.
-"""
+"""Camera paths, made up as a hand would move. Poses are camera to world, mm, OpenCV axes."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import orthonormalised, se3, so3_exp
+from scopemap.geometry.se3 import se3, so3_exp
 
 _SPEED_MM = 0.45
 _SWAY_FRAMES = (90.0, 170.0)
-_ROTATION_TOLERANCE = 1e-3
-
-
-def read_path(file: Path) -> np.ndarray:
-    """Return the poses of a text file as (N, 4, 4) float64, camera to world, mm.
-
-    One pose per line: 16 numbers, row-major or in C3VD's transposed form, parted by spaces or commas; `#` starts a
-    comment. Raises `InputError` for a file that cannot be read, a bad line (named), or matrices that are no motions.
-    """
-    try:
-        lines = Path(file).read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the camera path {file}: {error}") from None
-    rows = [_parse_line(file, n, line) for n, line in enumerate(lines, 1) if line.split("#")[0].strip()]
-    if not rows:
-        raise InputError(f"the camera path {file} holds no pose: expected 16 numbers per line")
-    poses = np.array(rows).reshape(-1, 4, 4)
-    if np.allclose(poses[:, :3, 3], 0):
-        poses = poses.transpose(0, 2, 1)
-    for n, pose in enumerate(poses):
-        R, last = pose[:3, :3], pose[3]
-        if not (np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) and np.allclose(last, [0, 0, 0, 1])):
-            raise InputError(f"pose {n} of {file} is no rigid motion: expected a 4x4 camera-to-world matrix in mm")
-        if np.linalg.det(R) < 0:
-            raise InputError(f"pose {n} of {file} mirrors: expected a right-handed camera-to-world matrix")
-    return np.array([orthonormalised(pose) for pose in poses])
-
-
-def _parse_line(file: Path, number: int, line: str) -> list[float]:
-    fields = line.split("#")[0].replace(",", " ").split()
-    try:
-        values = [float(field) for field in fields]
-    except ValueError:
-        values = []
-    if len(values) != 16 or not np.isfinite(values).all():
-        raise InputError(f"line {number} of {file}: expected 16 finite numbers, found {len(fields)} fields")
-    return values
 
 
 def c3vd_line(T_world_camera: np.ndarray) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from scopemap.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.phantom.camera_path import lumen_path, read_path, sweep_path
+from scopemap.phantom.camera_path import lumen_path, sweep_path
 from scopemap.phantom.cavity import laparoscopy_volume
 from scopemap.phantom.deformation import REST, Breathing, Displacement, breathing
 from scopemap.phantom.lumen import colon_volume, tube_volume
@@ -17,6 +17,7 @@ from scopemap.phantom.shading import Look, develop, disturb, exposure_for, shade
 from scopemap.phantom.spec import DEFAULT_FRAMES, PhantomSpec
 from scopemap.phantom.texture import Appearance
 from scopemap.phantom.volume import Volume
+from scopemap.trajectory import read_poses
 
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
@@ -69,7 +70,7 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
         if spec.scene == "laparoscopy":
             return sweep_path(frames, spec.loop, spec.seed)
         return lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
-    poses = read_path(spec.path_file)
+    poses = read_poses(spec.path_file)
     if spec.frames is not None and spec.frames > len(poses):
         raise InputError(
             f"{spec.path_file} holds {len(poses)} poses, {spec.frames} frames were asked for: ask for fewer"

@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -44,7 +44,7 @@ class PhantomSpec:
     width, height : image size, px.
     fov_deg : horizontal field of view, degrees.
     seed : of everything random.
-    path_file : camera path to follow (`read_path`), None: a hand-like path is made up.
+    path_file : camera path to follow (`read_poses`), None: a hand-like path is made up.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
     loop : whether the made-up path ends in exactly its first pose.
     events : stretches of black, blurred or smoky frames.
@@ -109,17 +109,17 @@ class PhantomSpec:
         """Depth from which the 16-bit depth files say "clipped"."""
         return 65535 * self.depth_scale_mm
 
-    def with_settings(self, settings: dict[str, str]) -> PhantomSpec:
-        """Return a copy with settings given as text, such as {"fov_deg": "70"}; raises `SettingsError`."""
+    def with_settings(self, settings: dict[str, Any]) -> PhantomSpec:
+        """Return a copy with settings given as values or text, such as {"fov_deg": "70"}; raises `SettingsError`."""
         types = {name: kind for name, kind in get_type_hints(type(self)).items() if name != "events"}
         values = {}
-        for name, text in settings.items():
+        for name, value in settings.items():
             if name not in types:
                 raise SettingsError(f"unknown phantom setting '{name}': choose one of {', '.join(types)}")
             try:
-                values[name] = TypeAdapter(types[name]).validate_python(text)
+                values[name] = TypeAdapter(types[name]).validate_python(value)
             except ValidationError:
-                raise SettingsError(f"phantom setting '{name}': cannot use '{text}' as {types[name]}") from None
+                raise SettingsError(f"phantom setting '{name}': cannot use '{value}' as {types[name]}") from None
         return replace(self, **values)
 
 

@@ -38,7 +38,7 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
     try:
         _clear(folder)
         _write_description(phantom, folder / "phantom.json")
-        (folder / "pose.txt").write_text("".join(c3vd_line(T) + "\n" for T in phantom.poses))
+        (folder / "pose.txt").write_text("".join(c3vd_line(T) + "\n" for T in phantom.poses), encoding="utf-8")
         _write_camera(spec, folder / "camera.yaml")
         seen = SeenVoxels(phantom.scene.volume)
         for index in range(len(phantom.poses)):
@@ -115,4 +115,4 @@ def _write_description(phantom: Phantom, file: Path) -> None:
         "exposure": phantom.exposure,
         "voxel_mm": phantom.scene.volume.voxel_mm,
     }
-    file.write_text(json.dumps(description, indent=2) + "\n")
+    file.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")

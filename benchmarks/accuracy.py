@@ -1,0 +1,162 @@
+"""Errors against the truth, one row per run, as Markdown: real frames, phantoms, ablations.
+
+    python benchmarks/accuracy.py --data FOLDER [--only real|phantom|ablation] [--keep FOLDER]
+
+FOLDER is the real data's (README, "Real data"); its `weights` are used for RAFT and LPIPS. Phantoms are rendered first.
+ATE in mm after the stated alignment; rotation in degrees since the first frame, unaligned; "10" is the RPE over 10
+frames; TLR before any alignment. ms is wall time per frame, reading and looking ahead in a second thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from scopemap import Config, open_sequence, read_trajectory, reconstruct
+from scopemap.evaluation.poses import match, pose_report
+from scopemap.evaluation.surface import compare_surfaces
+from scopemap.phantom import PhantomSpec, write_phantom
+
+HEADER = (
+    "| run | frames tracked | alignment | ATE | rotation mean / max | 10: mm / deg | TLR | mesh to truth | ms |\n"
+    "|---|---|---|---|---|---|---|---|---|"
+)
+LIGHT = {"networks.perceptual": "structure"}
+NO_SURFACE = {"fusion.enabled": False}
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "keyframe every 2": {"odometry.keyframe_every": 2},
+    "keyframe every 5": {"odometry.keyframe_every": 5},
+    "keyframe every 20": {"odometry.keyframe_every": 20},
+    "grey values only": {"odometry.channels": "grey"},
+    "normalised values only": {"odometry.channels": "normalised"},
+    "no lamp": {"odometry.lamp_gamma": 0.0},
+    "no gain and bias": {"odometry.gain_bias": False},
+    "neither lamp nor gain and bias": {"odometry.lamp_gamma": 0.0, "odometry.gain_bias": False},
+    "no SO(3) stage": {"odometry.rotation_first": False},
+    "Gauss-Newton": {"odometry.solver": "gauss-newton"},
+    "full resolution": {"odometry.finest_level": 0},
+    "no frame scale": {"mapis.frame_scale": "none"},
+    "no blending": {"mapis.blend": "none"},
+    "constant blend": {"mapis.blend": "constant"},
+    "paper's equation for the blend": {"mapis.blend": "paper-equation"},
+    "depth values copied, not moved": {"mapis.order": "refine-first"},
+    "WEMA": {"smoothing.method": "wema"},
+    "WEMA, s = 1": {"smoothing.method": "wema", "smoothing.dynamic": False},
+    "no flow": {"networks.flow": "none"},
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One row: an input, how it is aligned for the measurement, and the settings that differ from the default."""
+
+    name: str
+    source: Path
+    align: str
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def real_runs(data: Path) -> Iterator[Run]:
+    """Yield the runs on real frames."""
+    cecum, trans = data / "endoscopy/c3vd/cecum_t1_a", data / "endoscopy/c3vd/trans_t1_a"
+    kitchen = data / "rgbd/7scenes_kitchen_100f"
+    files = {"depth.backend": f"files:{cecum}_depth_anything"}
+    near_far = {"depth.near_far_mm": (13.5, 100.0)}
+    raft = {"networks.flow": "raft-small", "networks.perceptual": "lpips"}
+    yield Run("cecum_t1_a, Depth Anything files, near-far, RAFT small, LPIPS", cecum, "sim3", files | near_far | raft)
+    yield Run("the same, DIS, structural similarity", cecum, "sim3", files | near_far | LIGHT)
+    yield Run("the same, anchored by shading", cecum, "sim3", files | {"depth.anchor": "shading"} | LIGHT)
+    yield Run("cecum_t1_a, embedded shading, RAFT small, LPIPS", cecum, "sim3", raft)
+    yield Run("cecum_t1_a, embedded shading, DIS, structural similarity", cecum, "sim3", LIGHT)
+    yield Run(
+        "trans_t1_a, true depth", trans, "se3", {"depth.backend": f"files:{trans}", "fusion.min_weight": 0.5} | LIGHT
+    )
+    room = {"fusion.voxel_mm": 10, "fusion.truncation_mm": 40, "fusion.max_depth_mm": 4000}
+    yield Run(
+        "7scenes_kitchen_100f, measured depth", kitchen, "sim3", {"depth.backend": f"files:{kitchen}"} | room | LIGHT
+    )
+
+
+def phantom_runs(folder: Path, data: Path) -> Iterator[Run]:
+    """Render the phantoms and yield the runs on them."""
+    path = data / "endoscopy/c3vd_camera_paths/t3v2.txt"
+    specs = {
+        "colon, 200 frames": PhantomSpec(scene="colon", frames=200, seed=0),
+        "colon, another seed": PhantomSpec(scene="colon", frames=120, seed=5),
+        "colon, real camera path t3v2": PhantomSpec(scene="colon", frames=120, seed=1, path_file=path),
+        "laparoscopy": PhantomSpec(scene="laparoscopy", frames=120, seed=2),
+    }
+    for number, (name, spec) in enumerate(specs.items()):
+        source = folder / f"phantom{number}"
+        write_phantom(spec, source)
+        yield Run(f"{name}, true depth", source, "origin", {"depth.backend": f"files:{source}"} | LIGHT)
+        yield Run(f"{name}, embedded shading", source, "sim3", LIGHT)
+
+
+def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
+    """Yield every ablation on the real clip (Depth Anything files) and on a phantom (true depth)."""
+    cecum, source = data / "endoscopy/c3vd/cecum_t1_a", folder / "ablated"
+    write_phantom(PhantomSpec(scene="colon", frames=120, seed=5), source)
+    files = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
+    for name, changes in ABLATIONS.items():
+        yield Run(f"{name}: cecum_t1_a", cecum, "sim3", files | NO_SURFACE | LIGHT | changes)
+    for name, changes in ABLATIONS.items():
+        if not any(key.startswith(("mapis", "networks")) for key in changes):  # true depth is left as it is
+            truth = {"depth.backend": f"files:{source}"}
+            yield Run(f"{name}: colon phantom, true depth", source, "origin", truth | NO_SURFACE | LIGHT | changes)
+
+
+def row(run: Run, out: Path | None) -> str:
+    """Reconstruct, measure, and return the table row."""
+    started = time.perf_counter()
+    result = reconstruct(open_sequence(run.source), Config.load(settings=run.settings), out=out)
+    ms = 1e3 * (time.perf_counter() - started) / len(result.records)
+    matched = match(result.trajectory, read_trajectory(run.source), run.align)
+    report, mesh_file = pose_report(matched), run.source / "mesh_truth.ply"
+    surface = ""
+    if mesh_file.is_file() and len(result.mesh.faces):
+        import trimesh
+
+        moved = result.mesh.copy()
+        moved.vertices = matched.similarity.transform_points(moved.vertices)
+        surface = f"{compare_surfaces(moved, trimesh.load_mesh(mesh_file)).accuracy.mean_mm:.2f}"
+    rotation = f"{report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f}"
+    ten = "" if report.rpe_10_mm != report.rpe_10_mm else f"{report.rpe_10_mm:.3f} / {report.rpe_10_deg:.3f}"
+    tracked = f"{report.tracked} of {report.frames}"
+    return (
+        f"| {run.name} | {tracked} | {run.align} | {report.ate_rmse_mm:.3f} | {rotation} | {ten} "
+        f"| {report.tlr:.3f} | {surface} | {ms:.0f} |"
+    )
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", choices=("real", "phantom", "ablation"))
+    parser.add_argument("--keep", type=Path, help="keep the runs' folders here")
+    options = parser.parse_args()
+    os.environ.setdefault("SCOPEMAP_WEIGHTS_DIR", str(options.data / "weights"))
+    with tempfile.TemporaryDirectory() as scratch:
+        groups = {
+            "real": lambda: real_runs(options.data),
+            "phantom": lambda: phantom_runs(Path(scratch), options.data),
+            "ablation": lambda: ablation_runs(Path(scratch), options.data),
+        }
+        number = 0
+        for group in [options.only] if options.only else groups:
+            print(f"\n### {group}\n\n{HEADER}", flush=True)
+            for run in groups[group]():
+                print(row(run, options.keep / f"{number:02d}" if options.keep else None), flush=True)
+                number += 1
+
+
+if __name__ == "__main__":
+    main()

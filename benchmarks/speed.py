@@ -1,0 +1,95 @@
+"""What each part costs per frame, one part after the other, nothing in parallel.
+
+    python benchmarks/speed.py [--input PATH] [--frames N] [--set KEY=VALUE ...]
+
+Without an input a colon phantom of 337x270 px is rendered first. Prints median milliseconds per frame and the ratio to
+one DIS flow pair in the same run: machines differ and are shared, ratios travel better.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scopemap.cli.options import parse_settings
+from scopemap.config import Config
+from scopemap.datasets import open_sequence
+from scopemap.flow import DisFlow, pair_flow
+from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.pipeline import Estimators, Pipeline
+
+PHANTOM = PhantomSpec(scene="colon", frames=60, width=337, height=270, seed=0)
+WARM_UP = 5  # frames that compile, load and fill caches
+
+
+def timed(method: Callable[..., Any], part: str, seconds: dict[str, list[float]]) -> Callable[..., Any]:
+    """Return the method with its running time noted under `part`."""
+
+    def run(*arguments: Any, **options: Any) -> Any:
+        started = time.perf_counter()
+        try:
+            return method(*arguments, **options)
+        finally:
+            seconds[part].append(time.perf_counter() - started)
+
+    return run
+
+
+def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], tuple[int, int]]:
+    """Return milliseconds per frame of each part, and the working size."""
+    sequence = open_sequence(path, frames=slice(0, frames))
+    pipeline, seconds = Pipeline(config, Estimators.create(config, sequence)), defaultdict(list)
+    parts = {
+        "mask": (pipeline, "_masker"),
+        "depth estimate": (pipeline.estimators.depth, "estimate"),
+        "flow, perceptual distance": (pipeline, "_link"),
+        "track": (pipeline._tracker, "track"),
+        "keyframe": (pipeline._tracker, "adopt"),
+        "MAPIS": (pipeline._mapis, "refine"),
+        "fuse": (pipeline._volume, "integrate"),
+    }
+    for part, (owner, name) in parts.items():
+        setattr(owner, name, timed(getattr(owner, name), part, seconds))
+    previous = None
+    for frame, _ in sequence:
+        pipeline.step(pipeline.perceive(frame))
+        if previous is not None:
+            timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
+        previous = frame.rgb
+    per_frame = {
+        part: 1e3 * float(np.median(values[WARM_UP:])) for part, values in seconds.items() if part != "keyframe"
+    }
+    # Only every n-th frame is a keyframe: its cost is spread over all.
+    per_frame["keyframe"] = 1e3 * float(np.median(seconds["keyframe"][1:])) / config.odometry.keyframe_every
+    return per_frame, (sequence.camera.width, sequence.camera.height)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--input", type=Path)
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--set", dest="settings", action="append", default=[])
+    options = parser.parse_args()
+    config = Config.load(settings=parse_settings(options.settings))
+    with tempfile.TemporaryDirectory() as folder:
+        if options.input is None:
+            write_phantom(PHANTOM, Path(folder))
+        per_frame, (width, height) = measure(options.input or Path(folder), options.frames, config)
+    unit = per_frame.pop("DIS")
+    both = sum(per_frame[part] for part in ("track", "keyframe", "MAPIS", "fuse"))
+    print(f"{width}x{height} px, median per frame; one DIS flow pair with its check: {unit:.1f} ms\n")
+    print("| part | ms | in DIS pairs |\n|---|---|---|")
+    for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + fuse**", both)]:
+        print(f"| {part} | {ms:.1f} | {ms / unit:.2f} |")
+
+
+if __name__ == "__main__":
+    main()

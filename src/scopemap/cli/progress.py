@@ -1,0 +1,103 @@
+"""Progress of runs and renderings: a bar with rate, time left and state; plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from scopemap.pipeline import Step
+
+_SECONDS_BETWEEN_LINES = 10.0
+_RENDERED_LINES = 10
+
+
+@contextmanager
+def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[[Step], None], ...]]:
+    """Yield the observers (one, or none if `silent`) that show how a run of `total` frames goes, on stderr."""
+    if silent:
+        yield ()
+    elif not sys.stderr.isatty():
+        yield (_Lines(total),)
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (
+            TextColumn("tracking"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[state]}"),
+        )
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task, state = bar.add_task("", total=total, rate="", state=""), _State()
+
+            def show(step: Step) -> None:
+                state.add(step)
+                bar.update(task, advance=1, rate=f"{state.rate:.1f} frames/s", state=state.text)
+
+            yield (show,)
+
+
+class _State:
+    """Counts frames as they pass."""
+
+    def __init__(self) -> None:
+        self.started, self.done, self.lost, self.text = time.perf_counter(), 0, 0, ""
+
+    @property
+    def rate(self) -> float:
+        return self.done / max(time.perf_counter() - self.started, 1e-9)
+
+    def add(self, step: Step) -> None:
+        self.done += 1
+        if step.track.status == "lost":
+            self.lost += 1
+            self.text = f"lost: {step.track.reason}"
+        else:
+            self.text = "ok" + (f", {self.lost} lost so far" if self.lost else "")
+
+
+class _Lines:
+    """One line now and then."""
+
+    def __init__(self, total: int | None) -> None:
+        self._total, self._state, self._last = total, _State(), time.perf_counter()
+
+    def __call__(self, step: Step) -> None:
+        self._state.add(step)
+        state, now = self._state, time.perf_counter()
+        if now - self._last < _SECONDS_BETWEEN_LINES and state.done != self._total:
+            return
+        self._last = now
+        left = "" if not self._total else f", {max(self._total - state.done, 0) / state.rate:.0f} s left"
+        total = f" of {self._total}" if self._total else ""
+        typer.echo(f"frame {state.done}{total}: {state.rate:.1f} frames/s{left}, {state.text}", err=True)
+
+
+@contextmanager
+def render_progress(silent: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Yield what shows (done, total) frames of a phantom being rendered, on stderr; None if `silent`."""
+    if silent:
+        yield None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("rendering", total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+    else:
+        yield _print_rendered
+
+
+def _print_rendered(done: int, total: int) -> None:
+    if done == total or done % max(total // _RENDERED_LINES, 1) == 0:
+        typer.echo(f"rendered {done} of {total} frames", err=True)

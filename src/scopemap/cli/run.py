@@ -1,0 +1,135 @@
+"""`scopemap run`: from a video to poses, depth and a surface."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scopemap.cli.options import parse_near_far, parse_settings, parse_size, parse_slice
+from scopemap.cli.progress import run_progress
+
+if TYPE_CHECKING:
+    from scopemap.config import Config
+    from scopemap.reconstruction import Reconstruction
+
+
+class PresetChoice(StrEnum):
+    """Presets of settings."""
+
+    PAPER = "paper"
+    DEFAULT = "default"
+    REALTIME = "realtime"
+
+
+class DeviceChoice(StrEnum):
+    """Where networks run."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+def run(
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, a C3VD or 7-Scenes folder.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the result.")],
+    preset: Annotated[
+        PresetChoice | None,
+        typer.Option(help="paper: the method as published; default: what measures best; realtime: fast."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
+    ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="c3vd, 7-scenes, video or images; told from what lies there if left out.")
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Calibration: OpenCV YAML, or text 'fx fy cx cy [k1 k2 p1 p2 k3]'."),
+    ] = None,
+    fov: Annotated[
+        float, typer.Option(min=5.0, max=170.0, help="Horizontal field of view, degrees, where the camera is unknown.")
+    ] = 70.0,
+    near_far: Annotated[
+        str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files).")
+    ] = None,
+    flow: Annotated[str | None, typer.Option(help="dis, raft-small, raft-large or none.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Working size, px; else the input's over a whole number, at most 400 px."),
+    ] = None,
+    device: Annotated[DeviceChoice | None, typer.Option(help="Where networks run.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as odometry.huber=2.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")] = False,
+) -> None:
+    """Reconstruct camera poses, depth and a tissue surface from a video."""
+    from scopemap.config import Config
+
+    given: dict[str, Any] = {
+        "depth.backend": depth,
+        "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
+        "networks.flow": flow,
+        "networks.device": device.value if device else None,
+    }
+    chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
+    resolved = Config.load(preset.value if preset else None, config, chosen)
+
+    from scopemap.datasets import open_sequence
+    from scopemap.runner import reconstruct
+
+    sequence = open_sequence(
+        source,
+        dataset=dataset,
+        camera=camera,
+        fov_deg=fov,
+        size=parse_size(size) if size else None,
+        frames=parse_slice(frames) if frames else None,
+    )
+    with run_progress(sequence.count, silent=quiet or as_json) as observers:
+        result = reconstruct(sequence, resolved, out=out, overwrite=overwrite, observers=observers)
+    _report(result, resolved, out, as_json=as_json, quiet=quiet)
+
+
+def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
+    provenance = result.provenance
+    for warning in [] if quiet else provenance["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    if as_json:
+        summary = provenance | {"out": str(out), "preset": config.preset, "mesh_faces": len(result.mesh.faces)}
+        typer.echo(json.dumps(summary, indent=2))
+    elif not quiet:
+        for line in summary_lines(result):
+            typer.echo(line)
+        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv")
+
+
+def summary_lines(result: Reconstruction) -> list[str]:
+    """Return what a person wants to know of a run, one fact per line."""
+    facts = result.provenance
+    lines = [
+        f"{facts['tracked']} of {facts['frames']} frames tracked, path {result.trajectory.path_length_mm:.1f} mm",
+        f"camera: {facts['camera']['source']}",
+        f"size: {facts['camera']['size']}",
+        f"depth: {facts['estimators']['depth']}; scale: {facts['estimators']['anchor']}",
+        f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces",
+        f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s",
+    ]
+    lines += [f"lost: frame {record.index}, {record.track.reason}" for record in result.lost[:5]]
+    if len(result.lost) > 5:
+        lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")
+    return lines + [f"note: {note}" for note in facts["notes"]]

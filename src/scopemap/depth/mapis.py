@@ -1,0 +1,127 @@
+"""MAPIS: depth that keeps its scale from frame to frame.
+
+METHOD section MAPIS-Depth, steps 5-8. The previous depth is warped into the current frame along the flow, filtered, and
+blended with the current estimate by a weight from their perceptual distance. The paper's text trusts the warped depth
+where the images are alike, its equation does the reverse; `blend = "paper-equation"` is the latter, taken literally.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import MapisSettings
+from scopemap.depth.estimate import DepthKind
+from scopemap.errors import check_shape
+from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
+
+_LEAST_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """What links a frame to the one before it.
+
+    Attributes
+    ----------
+    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, where it can be trusted.
+    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant where one score was asked for.
+    """
+
+    to_previous: np.ndarray
+    consistent: np.ndarray
+    distance: np.ndarray
+
+
+@dataclass(frozen=True)
+class RefinedDepth:
+    """Depth of one frame after the consistency stage.
+
+    Attributes
+    ----------
+    depth_mm : (H, W) float32, NaN = unknown. scale : factor that was put on the raw depth.
+    warped_share : share of the image that had a warped previous depth.
+    """
+
+    depth_mm: np.ndarray
+    scale: float
+    warped_share: float
+
+
+class Mapis:
+    """Refines the raw depth of one frame after the other; `forget` cuts the chain after a lost frame."""
+
+    def __init__(self, settings: MapisSettings) -> None:
+        self.settings = settings
+        self._carried_mm: np.ndarray | None = None
+        self._scale = 1.0
+
+    def refine(
+        self,
+        raw_mm: np.ndarray,
+        kind: DepthKind,
+        camera: PinholeCamera,
+        link: Correspondence | None,
+        T_current_previous: np.ndarray | None,
+    ) -> RefinedDepth:
+        """Return the depth of a frame.
+
+        `raw_mm` is (H, W) float32; `link` is None for the first frame. With a motion the previous depth is moved by
+        it; with None its values are carried unchanged, as in the paper.
+        """
+        check_shape("raw_mm", raw_mm, (camera.height, camera.width))
+        warped_mm = self._warped(camera, link, T_current_previous)
+        frame_scale = self.settings.frame_scale
+        if frame_scale == "robust" or (frame_scale == "auto" and kind != "measured"):
+            self._scale = robust_scale(raw_mm, warped_mm, self._scale)
+        scaled_mm = raw_mm * np.float32(self._scale)
+        depth_mm = scaled_mm
+        blend = self.settings.blend if self.settings.blend != "auto" else _natural_blend(kind)
+        if link is not None and blend != "none":
+            weight = np.where(np.isfinite(warped_mm), self._weight(blend, link.distance), np.float32(0.0))
+            depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
+        self._carried_mm = depth_mm if self.settings.recursive else scaled_mm
+        return RefinedDepth(depth_mm, self._scale, float(np.isfinite(warped_mm).mean()))
+
+    def forget(self) -> None:
+        """Let the next frame start without a previous depth; the scale found last is held."""
+        self._carried_mm = None
+
+    def _warped(
+        self, camera: PinholeCamera, link: Correspondence | None, T_current_previous: np.ndarray | None
+    ) -> np.ndarray:
+        if link is None or self._carried_mm is None:
+            return np.full((camera.height, camera.width), np.nan, np.float32)
+        warped_mm = pull(self._carried_mm, link.to_previous)
+        warped_mm = np.where(link.consistent, warped_mm, np.float32(np.nan))
+        if T_current_previous is not None:
+            warped_mm = moved_depth(warped_mm, link.to_previous, camera, T_current_previous)
+        return bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
+
+    def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
+        """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
+        match blend:
+            case "exponential":
+                return np.exp(-distance / np.float32(self.settings.tau))
+            case "linear":
+                return 1 - np.clip(distance, 0, 1)
+            case "paper-equation":
+                return np.clip(distance, 0, 1)
+        return np.full_like(distance, self.settings.constant_weight)
+
+
+def _natural_blend(kind: DepthKind) -> str:
+    return "none" if kind == "measured" else "exponential"
+
+
+def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:
+    """Return the median ratio of the warped to the raw depth, or `otherwise` where too little of both is known.
+
+    Only a scale: chaining a shift from frame to frame diverges.
+    """
+    both = np.isfinite(raw_mm) & np.isfinite(warped_mm) & (raw_mm > 0)
+    if both.mean() < _LEAST_OVERLAP:
+        return otherwise
+    return float(np.exp(np.median(np.log(warped_mm[both] / raw_mm[both]))))

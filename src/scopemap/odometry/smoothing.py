@@ -1,0 +1,69 @@
+"""WEMA: the weighted mean of the last poses, on the group.
+
+METHOD section WEMA: x_reg = s (alpha x_i + beta x_{i-1} + gamma x_{i-2}) + (1 - s) x_i, s = 1 - exp(-i omega). Poses
+do not add: the mean is taken in the tangent space at the newest pose. The earlier poses are the estimated ones, and
+nothing is fed back to the tracker. A mean over the past lags behind a moving camera (BENCHMARK.md measures it).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from scopemap.config import SmoothingSettings
+from scopemap.geometry.se3 import mean_near
+
+
+class Smoother(Protocol):
+    """Poses in, smoothed poses out, one at a time."""
+
+    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the smoothed pose (4, 4) of the newest frame, given its estimate (4, 4)."""
+        ...
+
+    def forget(self) -> None:
+        """Let the next pose start without a past: between it and the last one frames were lost."""
+        ...
+
+
+class NoSmoothing:
+    """Leaves poses as they are."""
+
+    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the pose unchanged."""
+        return T_world_camera
+
+    def forget(self) -> None:
+        """Do nothing: there is no past."""
+
+
+class Wema:
+    """Weighted exponential moving average of the last three poses."""
+
+    def __init__(self, settings: SmoothingSettings) -> None:
+        self.settings = settings
+        self._past: list[np.ndarray] = []
+        self._count = 0
+
+    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the smoothed pose; the first two, also after `forget`, have too short a past and stay as they are."""
+        settings, past = self.settings, self._past
+        smoothed = T_world_camera
+        if len(past) == 2:
+            s = 1.0 - np.exp(-self._count * settings.omega) if settings.dynamic else 1.0
+            weights = [s * settings.alpha, s * settings.beta, s * settings.gamma]
+            # What is left, 1 - s, is the newest pose's too: it is the base of the tangent space.
+            smoothed = mean_near(T_world_camera, [T_world_camera, past[1], past[0]], weights)
+        self._past = [*past, T_world_camera][-2:]
+        self._count += 1
+        return smoothed
+
+    def forget(self) -> None:
+        """Let the next pose start without a past; s goes on growing."""
+        self._past = []
+
+
+def create_smoother(settings: SmoothingSettings) -> Smoother:
+    """Return the smoother that `settings.method` names."""
+    return Wema(settings) if settings.method == "wema" else NoSmoothing()

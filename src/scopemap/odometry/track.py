@@ -1,0 +1,37 @@
+"""Track: what tracking says about one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Status = Literal["initial", "ok", "lost"]
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where the camera was, how that is known, or why it is not.
+
+    Attributes
+    ----------
+    index : number of the frame.
+    status : "initial" for the frame that fixes the world, "ok", or "lost".
+    reason : one phrase; for a lost frame, what was wrong.
+    T_world_camera : (4, 4) float64; a lost frame repeats the last pose that is known.
+    keyframe : number of the frame it was aligned to.
+    residual : robust standard deviation of the photometric residual, NaN if there was none.
+    inlier_share, overlap : 0..1, see `rtdl.Alignment`; NaN if there was no alignment.
+    iterations : dog-leg steps over all levels.
+    """
+
+    index: int
+    status: Status
+    reason: str
+    T_world_camera: np.ndarray
+    keyframe: int
+    residual: float = float("nan")
+    inlier_share: float = float("nan")
+    overlap: float = float("nan")
+    iterations: int = 0

@@ -1,0 +1,139 @@
+"""The tracker: aligns every frame to the keyframe, and says when it could not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scopemap.config import OdometrySettings
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.odometry.pyramid import build_pyramid
+from scopemap.odometry.residuals import View
+from scopemap.odometry.rtdl import Alignment, align
+from scopemap.odometry.track import Track
+
+_LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go on
+
+
+@dataclass(frozen=True)
+class _Keyframe:
+    index: int
+    T_world_camera: np.ndarray
+    pyramid: list[View]
+    depth_mm: float  # mean
+
+
+class Tracker:
+    """Tracks frames against keyframes (METHOD section WEMA-RTDL).
+
+    The first usable frame fixes the world. Where a frame is lost, the record says so and why, and the next one starts
+    from the last pose that is known, or from where the last motion would have led: whichever fits better.
+    """
+
+    def __init__(self, settings: OdometrySettings) -> None:
+        self.settings = settings
+        self._keyframe: _Keyframe | None = None
+        self._T_world_last = np.eye(4)
+        self._T_step = np.eye(4)
+        self._frames_lost = 0
+        self._frames_since_keyframe = 0
+
+    def track(self, frame: Frame) -> Track:
+        """Return the frame's pose relative to the first usable frame, or say why there is none."""
+        self._frames_since_keyframe += 1
+        if frame.valid.mean() < self.settings.min_valid_share:
+            return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
+        if self._keyframe is None:
+            return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
+        pyramid = build_pyramid(frame, self.settings)
+        alignment = self._best(pyramid)
+        T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
+        trouble = self._trouble(alignment, T_world_camera)
+        if trouble:
+            return self._lost(frame, trouble, alignment)
+        self._remember(T_world_camera)
+        return _tracked(frame.index, "ok", "", T_world_camera, self._keyframe.index, alignment)
+
+    def wants_keyframe(self) -> bool:
+        """Return whether the frame that was tracked last should become a keyframe."""
+        return self._keyframe is None or self._frames_since_keyframe >= self.settings.keyframe_every
+
+    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+        """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
+
+        `measured` says that the depth, and so its slope, can be trusted.
+        """
+        if frame.depth_mm is None or frame.T_world_camera is None:
+            raise ValueError("a keyframe needs a depth and a pose")
+        known = frame.valid & np.isfinite(frame.depth_mm)
+        if known.mean() < self.settings.min_valid_share:
+            return False
+        pyramid = build_pyramid(frame, self.settings, trust_slope=measured)
+        self._keyframe = _Keyframe(frame.index, frame.T_world_camera, pyramid, float(frame.depth_mm[known].mean()))
+        self._frames_since_keyframe = 0
+        return True
+
+    def _best(self, pyramid: list[View]) -> Alignment:
+        keyframe = self._keyframe
+        assert keyframe is not None
+        starts = [inverse(T) @ keyframe.T_world_camera for T in self._guesses()]
+        found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
+        return max(found, key=lambda alignment: alignment.inlier_share * alignment.overlap)
+
+    def _guesses(self) -> list[np.ndarray]:
+        """Poses to start from: one while all is well, both the last and the extrapolated one after a loss."""
+        steps = min(1 + self._frames_lost, _LONGEST_EXTRAPOLATION)
+        onward = self._T_world_last @ np.linalg.matrix_power(self._T_step, steps)
+        if self._frames_lost:
+            return [self._T_world_last, onward]
+        if self.settings.start == "identity":
+            assert self._keyframe is not None
+            return [self._keyframe.T_world_camera]
+        return [onward if self.settings.start == "velocity" else self._T_world_last]
+
+    def _trouble(self, alignment: Alignment, T_world_camera: np.ndarray) -> str:
+        assert self._keyframe is not None
+        settings = self.settings
+        if not np.isfinite(T_world_camera).all():
+            return "the alignment diverged"
+        if alignment.overlap < settings.min_valid_share:
+            return f"only {alignment.overlap:.0%} of the keyframe is in view"
+        if alignment.inlier_share < settings.min_inlier_share:
+            return f"only {alignment.inlier_share:.0%} of the pixels agree with the keyframe"
+        T_step = inverse(self._T_world_last) @ T_world_camera
+        turn = float(rotation_angle_rad(T_step[:3, :3]))
+        way = float(np.linalg.norm(T_step[:3, 3])) / self._keyframe.depth_mm
+        if max(turn, way) > settings.max_step * (1 + self._frames_lost):
+            return f"a jump of {np.degrees(turn):.0f} deg and {way:.2f} mean depths"
+        return ""
+
+    def _remember(self, T_world_camera: np.ndarray) -> None:
+        T_step = inverse(self._T_world_last) @ T_world_camera
+        # After a gap the step is that of several frames: its share of one.
+        self._T_step = mean_near(np.eye(4), [T_step], [1 / (1 + self._frames_lost)])
+        self._T_world_last, self._frames_lost = T_world_camera, 0
+
+    def _lost(self, frame: Frame, reason: str, alignment: Alignment | None = None) -> Track:
+        self._frames_lost += 1
+        keyframe = self._keyframe.index if self._keyframe else frame.index
+        return _tracked(frame.index, "lost", reason, self._T_world_last, keyframe, alignment)
+
+
+def _tracked(
+    index: int, status: str, reason: str, T_world_camera: np.ndarray, keyframe: int, alignment: Alignment | None
+) -> Track:
+    if alignment is None:
+        return Track(index, status, reason, T_world_camera, keyframe)  # type: ignore[arg-type]
+    return Track(
+        index,
+        status,  # type: ignore[arg-type]
+        reason,
+        T_world_camera,
+        keyframe,
+        alignment.residual,
+        alignment.inlier_share,
+        alignment.overlap,
+        alignment.iterations,
+    )

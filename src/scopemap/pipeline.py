@@ -1,0 +1,167 @@
+"""The story: how one frame after the other becomes poses, depth and a surface.
+
+    frame -> mask -> raw depth -> track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS)
+          -> smooth (WEMA) -> fuse (TSDF)
+
+The `paper` preset refines before it tracks. Nothing here reads or writes files, looks at the clock, draws or prints:
+that is the runner's work. `perceive` is what needs no motion, so it may run a frame ahead of `step`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config, DepthSettings
+from scopemap.datasets import Sequence
+from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth
+from scopemap.depth.files import FilesDepth
+from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
+from scopemap.flow import FlowEstimator, create_flow, pair_flow
+from scopemap.frame import Frame
+from scopemap.fusion import TsdfVolume
+from scopemap.geometry.se3 import inverse
+from scopemap.geometry.warp import pull
+from scopemap.masking import Masker, is_constant
+from scopemap.odometry import Track, Tracker, create_smoother
+from scopemap.perceptual import PerceptualDistance, create_perceptual
+
+
+@dataclass(frozen=True)
+class Percept:
+    """What can be said of a frame before its motion is known.
+
+    Attributes
+    ----------
+    frame : masked. raw_mm : (H, W) float32, anchored but not yet consistent, NaN = unknown. kind : of the estimate.
+    link : correspondence with the frame before it, None for the first.
+    """
+
+    frame: Frame
+    raw_mm: np.ndarray
+    kind: DepthKind
+    link: Correspondence | None
+
+
+@dataclass(frozen=True)
+class Step:
+    """What became of a frame: with its refined depth and, unless it is lost, its pose."""
+
+    frame: Frame
+    track: Track
+    raw_mm: np.ndarray
+    refined: RefinedDepth
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """The interchangeable parts that look at images."""
+
+    depth: DepthEstimator
+    anchor: AnchoredDepth
+    flow: FlowEstimator
+    perceptual: PerceptualDistance
+
+    @classmethod
+    def create(cls, config: Config, sequence: Sequence) -> Estimators:
+        """Build what the settings name; raises what the parts raise where weights or files are missing."""
+        networks = config.networks
+        return cls(
+            create_depth(config.depth, sequence.rectifier, networks.device, sequence.depth_scale_mm),
+            create_anchor(config.depth, networks.device),
+            create_flow(networks.flow, networks.flow_iterations, networks.device),
+            create_perceptual(networks.perceptual, networks.device),
+        )
+
+    def reach_mm(self, settings: DepthSettings) -> float:
+        """Return how far depth may reach, mm: `max_depth_mm`, or what the files can hold where it is measured."""
+        measured_mm = self.depth.measured_reach_mm if isinstance(self.depth, FilesDepth) else None
+        return measured_mm or settings.max_depth_mm
+
+    def provenance(self) -> dict[str, str]:
+        """Return names, versions and hashes of the parts, and what fixed the scale."""
+        parts = self.depth.provenance() | self.flow.provenance() | self.perceptual.provenance()
+        return parts | {"anchor": self.anchor.description}
+
+
+class Pipeline:
+    """One run over one sequence; frames go through `perceive` and `step` in order, each once."""
+
+    def __init__(self, config: Config, estimators: Estimators) -> None:
+        self.config = config
+        self.estimators = estimators
+        self._masker = Masker(config.mask)
+        self._tracker = Tracker(config.odometry)
+        self._mapis = Mapis(config.mapis)
+        self._smooth = create_smoother(config.smoothing)
+        self._volume = TsdfVolume(config.fusion)
+        self._rgb_previous: np.ndarray | None = None
+        self._last: Track | None = None
+        self._fusable = 0
+
+    def perceive(self, frame: Frame) -> Percept:
+        """Mask a frame, estimate its raw depth and its correspondence with the frame before it."""
+        frame = self._masker(frame)
+        if is_constant(frame.rgb):
+            frame = replace(frame, valid=np.zeros_like(frame.valid))
+        # A frame that the tracker is going to refuse must not fix the scale of the depth.
+        usable = frame.valid.mean() >= self.config.odometry.min_valid_share
+        shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
+        estimate = self.estimators.depth.estimate(shown)
+        raw_mm = self.estimators.anchor.depth_mm(estimate, shown)
+        link = self._link(frame.rgb)
+        self._rgb_previous = frame.rgb
+        return Percept(frame, raw_mm, estimate.kind, link)
+
+    def step(self, percept: Percept) -> Step:
+        """Track a frame, make its depth consistent, fuse it."""
+        refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
+        track = self._tracker.track(percept.frame)
+        if refined is None:
+            # What links a lost frame to its past cannot be trusted either.
+            known = percept if track.status != "lost" else replace(percept, link=None)
+            refined = self._refine(known, self._motion(track))
+        frame = replace(percept.frame, depth_mm=refined.depth_mm)
+        if track.status == "lost":
+            self._mapis.forget()
+            self._smooth.forget()
+        else:
+            frame = replace(frame, T_world_camera=track.T_world_camera)
+            if self._tracker.wants_keyframe():
+                self._tracker.adopt(frame, measured=percept.kind == "measured")
+            frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
+            self._fuse(frame)
+        self._last = track
+        return Step(frame, track, percept.raw_mm, refined)
+
+    def surface(self) -> trimesh.Trimesh:
+        """Return the surface of all frames so far, world mm; may be empty."""
+        return self._volume.extract_mesh()
+
+    def _link(self, rgb: np.ndarray) -> Correspondence | None:
+        if self._rgb_previous is None:
+            return None
+        settings = self.config.mapis
+        flow = pair_flow(self.estimators.flow, self._rgb_previous, rgb, settings.consistency_px)
+        past = pull(self._rgb_previous, flow.to_previous) if settings.compare_warped else self._rgb_previous
+        distance = self.estimators.perceptual.compare(past, rgb)
+        values = np.full_like(distance.map, distance.score) if settings.perceptual_score else distance.map
+        return Correspondence(flow.to_previous, flow.consistent, values)
+
+    def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
+        camera: PinholeCamera = percept.frame.camera
+        return self._mapis.refine(percept.raw_mm, percept.kind, camera, percept.link, T_current_previous)
+
+    def _motion(self, track: Track) -> np.ndarray | None:
+        """Motion from the previous frame to this one, None unless both poses are known."""
+        if self._last is None or "lost" in (track.status, self._last.status):
+            return None
+        return inverse(track.T_world_camera) @ self._last.T_world_camera
+
+    def _fuse(self, frame: Frame) -> None:
+        if self.config.fusion.enabled and self._fusable % self.config.fusion.every == 0:
+            self._volume.integrate(frame)
+        self._fusable += 1

@@ -1,0 +1,184 @@
+"""What a run gives back, and the folder it is kept in.
+
+out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  depth/000000.png (16 bit, depth/depth.json has the scale)
+      frames.csv  config.toml  provenance.json
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.calibration import write_calibration
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config
+from scopemap.errors import InputError
+from scopemap.fusion.mesh import save_mesh
+from scopemap.odometry import Track
+from scopemap.pipeline import Step
+from scopemap.trajectory import Trajectory, write_tum
+
+DEPTH_SCALE_MM = 0.01
+"""The finest step of depth/*.png, which reaches 655 mm."""
+
+_LARGEST_UNIT = 65534
+_COLUMNS = [
+    *("index", "time_s", "name", "status", "reason", "keyframe", "residual", "inlier_share", "overlap", "iterations"),
+    *("depth_scale", "warped_share"),
+]
+_OWN_FILES = (
+    *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "frames.csv", "config.toml", "provenance.json"),
+)
+_OWN_FOLDERS = ("depth", "pictures")
+# What tells a run's folder from any other: the first is written last, the second first.
+_MARKS = ("provenance.json", "depth/depth.json")
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One line of frames.csv: what is known of a frame besides its pixels; `depth_scale` is MAPIS' factor."""
+
+    index: int
+    time_s: float
+    name: str
+    track: Track
+    T_world_camera: np.ndarray
+    depth_scale: float
+    warped_share: float
+
+    @classmethod
+    def of(cls, step: Step) -> FrameRecord:
+        """Return the record of a step; a lost frame's pose is the last one known."""
+        frame, track = step.frame, step.track
+        T_world_camera = track.T_world_camera if frame.T_world_camera is None else frame.T_world_camera
+        scale, share = step.refined.scale, step.refined.warped_share
+        return cls(frame.index, frame.time_s, frame.name, track, T_world_camera, scale, share)
+
+    def row(self) -> list[str]:
+        """Return the columns of frames.csv as text."""
+        track = self.track
+        numbers = (track.residual, track.inlier_share, track.overlap)
+        return [
+            *(str(self.index), f"{self.time_s:.6f}", self.name, track.status, track.reason, str(track.keyframe)),
+            *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
+            *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
+        ]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The result of a run.
+
+    Attributes
+    ----------
+    camera : working camera of all frames. records : one per frame, lost frames included.
+    mesh : world mm, vertex colours; may be empty. config : the resolved settings.
+    provenance : what the result depends on and what was assumed: input, camera, scale, weights, versions, machine,
+        time.
+    """
+
+    camera: PinholeCamera
+    records: list[FrameRecord]
+    mesh: trimesh.Trimesh
+    config: Config
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses with their status; a lost frame repeats the last pose that is known."""
+        records = self.records
+        return Trajectory(
+            np.array([record.index for record in records], dtype=np.int64),
+            np.array([record.time_s for record in records]),
+            np.stack([record.T_world_camera for record in records]),
+            np.array([record.track.status for record in records]),
+        )
+
+    @property
+    def lost(self) -> list[FrameRecord]:
+        """The records of the frames that could not be tracked."""
+        return [record for record in self.records if record.track.status == "lost"]
+
+    def save(self, folder: Path) -> None:
+        """Write everything but the depth maps, which a `DepthWriter` writes while they pass by.
+
+        Raises `InputError` where the folder cannot be written.
+        """
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_tum(folder / "trajectory.tum", self.trajectory)
+            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb")
+            write_calibration(self.camera, folder / "camera.yaml")
+            with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows([_COLUMNS, *(record.row() for record in self.records)])
+            (folder / "config.toml").write_text(self.config.toml(), encoding="utf-8")
+            provenance = json.dumps(self.provenance, indent=2) + "\n"
+            (folder / "provenance.json").write_text(provenance, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write the result to {folder}: {error.strerror or error}") from None
+
+
+class DepthWriter:
+    """Writes the refined depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
+
+    reach_mm : depth that must fit in; it makes the step coarser than `DEPTH_SCALE_MM` where it has to.
+    Raises `InputError` where nothing can be written.
+    """
+
+    def __init__(self, folder: Path, reach_mm: float = 0.0) -> None:
+        self._folder = Path(folder) / "depth"
+        self._scale_mm = _step_for(reach_mm)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            description = json.dumps({"scale_mm": self._scale_mm, "unknown": 0}) + "\n"
+            (self._folder / "depth.json").write_text(description, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
+
+    def __call__(self, step: Step) -> None:
+        """Write one frame's depth."""
+        units = np.nan_to_num(step.refined.depth_mm / self._scale_mm, nan=0.0)
+        image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
+        file = self._folder / f"{step.frame.index:06d}.png"
+        if not cv2.imwrite(str(file), image):
+            raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
+
+
+def _step_for(reach_mm: float) -> float:
+    """Return the smallest of ..., 0.01, 0.02, 0.05, 0.1, ... mm, `DEPTH_SCALE_MM` at least, that reaches so far."""
+    least = max(reach_mm / _LARGEST_UNIT, DEPTH_SCALE_MM) * (1 - 1e-6)
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(round(digit * power, 12) for digit in (1, 2, 5, 10) if digit * power >= least)
+
+
+def prepare_folder(folder: Path, *, overwrite: bool) -> None:
+    """Make an empty folder for a run; with `overwrite` an earlier run's files in it are removed, nothing else.
+
+    Raises `InputError` if something is in the way, or if the folder to overwrite holds no run.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"cannot write a run to {folder}: a file of that name is in the way")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not overwrite:
+            raise InputError(f"cannot write a run to {folder}: it is not empty; name another folder or use --overwrite")
+        if not any((folder / mark).is_file() for mark in _MARKS):
+            raise InputError(f"will not overwrite {folder}: what it holds is no run; name another folder")
+        for name in _OWN_FILES:
+            (folder / name).unlink(missing_ok=True)
+        for name in _OWN_FOLDERS:
+            shutil.rmtree(folder / name, ignore_errors=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write a run to {folder}: {error.strerror or error}") from None

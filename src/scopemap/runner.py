@@ -1,0 +1,170 @@
+"""Runs the story over a sequence: looks ahead, keeps the clock, tells observers, collects what is needed to trust it.
+
+While frame i is tracked and fused in this thread, frame i+1 is read and goes through the networks in another.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scopemap.config import Config, FusionSettings
+from scopemap.datasets import Sequence
+from scopemap.errors import InputError
+from scopemap.pipeline import Estimators, Percept, Pipeline, Step
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder
+
+Observer = Callable[[Step], None]
+_VERSIONS = (
+    *("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "torch", "torchvision", "transformers", "lpips"),
+)
+
+
+def reconstruct(
+    sequence: Sequence,
+    config: Config | None = None,
+    *,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    observers: tuple[Observer, ...] = (),
+) -> Reconstruction:
+    """Turn a sequence into poses, depth and a surface.
+
+    Parameters
+    ----------
+    sequence : what `open_sequence` gave.
+    config : settings, by default the preset `default`.
+    out : folder for the result; None keeps it in memory, without depth maps.
+    overwrite : replace an earlier run there.
+    observers : called with each `Step` as it is done.
+
+    Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
+    """
+    config = config or Config()
+    started = time.perf_counter()
+    estimators = Estimators.create(config, sequence)
+    if out is not None:
+        prepare_folder(Path(out), overwrite=overwrite)
+        observers = (DepthWriter(Path(out), estimators.reach_mm(config.depth)), *observers)
+    sequence, estimators = _with_best_camera(sequence, estimators)
+    distances = _Distances()
+    observers = (distances, *observers)
+    pipeline, clock = Pipeline(config, estimators), _Clock()
+    records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
+    if all(record.track.status == "lost" for record in records):
+        raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
+    mesh = clock.timed("mesh", pipeline.surface)
+    clock.seconds["total"] = time.perf_counter() - started
+    provenance = _provenance(sequence, estimators, clock, records)
+    provenance["warnings"] += distances.warnings(config.fusion)
+    result = Reconstruction(sequence.camera, records, mesh, config, provenance)
+    if out is not None:
+        result.save(Path(out))
+    return result
+
+
+class _Clock:
+    """Seconds spent per part; parts in different threads overlap."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    def timed(self, part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        started = time.perf_counter()
+        try:
+            return call(*arguments)
+        finally:
+            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - started
+
+
+class _Distances:
+    """Observer that keeps how far the scene lies: what is too far to be fused must not go missing unsaid."""
+
+    def __init__(self) -> None:
+        self._medians_mm: list[float] = []
+
+    def __call__(self, step: Step) -> None:
+        """Note the median depth of a frame."""
+        some_mm = step.refined.depth_mm[::4, ::4]
+        if np.isfinite(some_mm).any():
+            self._medians_mm.append(float(np.nanmedian(some_mm)))
+
+    def warnings(self, settings: FusionSettings) -> list[str]:
+        """Return what there is to say of all frames so far."""
+        if not settings.enabled or not self._medians_mm:
+            return []
+        median_mm = float(np.median(self._medians_mm))
+        if median_mm <= settings.max_depth_mm:
+            return []
+        return [
+            f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
+            f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
+        ]
+
+
+def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[Step]:
+    frames = iter(sequence)
+
+    def perceive_next() -> Percept | None:
+        item = clock.timed("read", next, frames, None)
+        return None if item is None else clock.timed("perceive", pipeline.perceive, item[0])
+
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="perceive") as ahead:
+        coming: Future[Percept | None] = ahead.submit(perceive_next)
+        while (percept := coming.result()) is not None:
+            coming = ahead.submit(perceive_next)
+            yield clock.timed("track and fuse", pipeline.step, percept)
+
+
+def _observed(step: Step, observers: tuple[Observer, ...]) -> FrameRecord:
+    for observer in observers:
+        observer(step)
+    return FrameRecord.of(step)
+
+
+def _with_best_camera(sequence: Sequence, estimators: Estimators) -> tuple[Sequence, Estimators]:
+    """Take an unknown camera's focal length from Depth Pro, where it is in use anyway."""
+    network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
+    if sequence.calibrated or network is None:
+        return sequence, estimators
+    first, _ = next(iter(sequence))
+    focal_px = network.estimate(first).focal_px
+    if focal_px is None:
+        return sequence, estimators
+    return sequence.with_focal(focal_px, f"estimated: Depth Pro on frame {first.index}"), estimators
+
+
+def _provenance(
+    sequence: Sequence, estimators: Estimators, clock: _Clock, records: list[FrameRecord]
+) -> dict[str, Any]:
+    camera = sequence.camera
+    lost = [record for record in records if record.track.status == "lost"]
+    return {
+        "input": str(sequence.path),
+        "dataset": sequence.source.name,
+        "frames": len(records),
+        "tracked": len(records) - len(lost),
+        "camera": {
+            "source": sequence.camera_source,
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "size": sequence.size_source,
+        },
+        "estimators": estimators.provenance(),
+        "notes": sequence.notes,
+        "warnings": sequence.warnings,
+        "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
+        "versions": {name: version(name) for name in _VERSIONS} | {"python": platform.python_version()},
+        "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",
+    }

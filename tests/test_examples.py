@@ -1,0 +1,51 @@
+"""The examples run, as a reader would run them, and say what they promise."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_phantom import write_tiny
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+PROMISED = {
+    "01_reconstruct.py": r"8 of 8 frames tracked, \d+\.\d mm\nsurface: [1-9]\d* vertices, .*\nscale: .*shading",
+    "02_evaluate.py": r"origin: ATE (0|1)\.\d+ mm.*\nse3 .*\nsim3  : ATE 0\.\d+ mm.*8 of 8 frames tracked",
+    "03_depth_from_files.py": r"depth: 8 files in .* \(measured\)\n8 of 8 frames tracked\nsurface: [1-9]\d* faces",
+}
+
+
+def _run(name: str, *arguments: object, weights: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / name), *map(str, arguments)],
+        env=os.environ | {"SCOPEMAP_WEIGHTS_DIR": str(weights), "HF_HUB_OFFLINE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_example_is_tested() -> None:
+    assert {file.name for file in EXAMPLES.glob("*.py")} == set(PROMISED)
+
+
+@pytest.mark.parametrize("name", sorted(PROMISED))
+def test_example_without_arguments(name: str, tmp_path: Path) -> None:
+    assert re.search(PROMISED[name], _run(name, weights=tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_examples_with_arguments(tmp_path: Path) -> None:
+    phantom, run = write_tiny(tmp_path / "phantom"), tmp_path / "run"
+    assert "9 of 9 frames tracked" in _run("01_reconstruct.py", phantom, run, weights=tmp_path / "none")
+    assert (run / "mesh.ply").is_file()
+    assert "9 of 9 frames tracked" in _run("02_evaluate.py", run, phantom, weights=tmp_path / "none")
+    # A run's own depth folder is depth from files, too.
+    assert "9 files" in _run("03_depth_from_files.py", phantom, run / "depth", weights=tmp_path / "none")

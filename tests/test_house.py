@@ -1,0 +1,308 @@
+"""The rules of the house, read off the tree: sizes, imports, names, words, what is documented and typed."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median, quantiles
+
+import pytest
+
+import scopemap
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "scopemap"
+BOTTOM = {"errors", "camera", "frame", "geometry", "config", "lenses", "calibration", "rectification"} | {
+    *("weights", "checkpoints", "device", "trajectory"),
+}
+STAGES = {"masking", "depth", "flow", "perceptual", "odometry", "fusion"}
+# What a room may import besides itself; rooms that are not named may import all but the command line.
+MAY_IMPORT = (
+    dict.fromkeys(BOTTOM, BOTTOM)
+    | dict.fromkeys(STAGES, BOTTOM)
+    | dict.fromkeys(("datasets", "phantom", "report"), BOTTOM)
+)
+MAY_NOT_IMPORT = {"evaluation": STAGES | {"pipeline", "runner", "reconstruction", "cli"}}
+NETWORKS = {"torch", "torchvision", "transformers", "lpips"}
+ADAPTERS = ("depth/", "flow/raft.py", "perceptual/", "weights.py", "device.py")
+FORBIDDEN_NAMES = {"utils", "util", "common", "core", "helpers", "base", "misc"}
+ENDINGS = ("print", "exit", "quit", "sys.exit", "os._exit")
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclass(frozen=True)
+class _Module:
+    path: Path
+    tree: ast.Module
+    lines: int
+
+    @property
+    def name(self) -> str:
+        return self.path.relative_to(SOURCE).as_posix() if self.path.is_relative_to(SOURCE) else self.path.name
+
+    @property
+    def room(self) -> str:
+        return self.name.split("/")[0].removesuffix(".py")
+
+    def functions(self) -> Iterator[Function]:
+        return (node for node in ast.walk(self.tree) if isinstance(node, Function))
+
+    def at(self, node: ast.AST) -> str:
+        return f"{self.name}:{node.lineno} {getattr(node, 'name', '')}".strip()  # type: ignore[attr-defined]
+
+
+def _read(path: Path) -> _Module:
+    text = path.read_text()
+    return _Module(path, ast.parse(text), len(text.splitlines()))
+
+
+MODULES = [_read(path) for path in sorted(SOURCE.rglob("*.py"))]
+TESTS = [_read(path) for path in sorted((ROOT / "tests").rglob("*.py"))]
+OTHERS = [_read(path) for name in ("benchmarks", "examples") for path in sorted((ROOT / name).rglob("*.py"))]
+
+
+def _is_command(function: Function) -> bool:
+    return "typer." in ast.unparse(function.args)
+
+
+def _is_typed_by_use(function: Function) -> bool:
+    """Whether numba compiles it for the types that it meets, and a docstring says what these are."""
+    compiled = any(ast.unparse(decorator).startswith("njit") for decorator in function.decorator_list)
+    return compiled and ast.get_docstring(function) is not None
+
+
+def _lines(function: Function) -> int:
+    """Lines of code: without the docstring, and for a command without its table of options."""
+    body = function.body
+    first = body[0].lineno if _is_command(function) else function.lineno
+    documented = ast.get_docstring(function, clean=False) is not None
+    docstring = body[0].end_lineno - body[0].lineno + 1 if documented else 0  # type: ignore[operator]
+    return function.end_lineno - first + 1 - docstring  # type: ignore[operator]
+
+
+def _parameters(function: Function) -> list[ast.arg]:
+    arguments = function.args
+    return [a for a in arguments.posonlyargs + arguments.args + arguments.kwonlyargs if a.arg not in ("self", "cls")]
+
+
+def _imported(module: _Module) -> Iterator[tuple[str, ast.AST]]:
+    """Every module that is imported, wherever in the file; `from scopemap import x` counts as scopemap.x."""
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module == "scopemap":
+            yield from ((f"scopemap.{alias.name}", node) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module.at(node)}: imports are absolute here"
+            yield str(node.module), node
+
+
+def _rooms_imported(module: _Module) -> Iterator[tuple[str, ast.AST]]:
+    for name, node in _imported(module):
+        if name.startswith("scopemap.") and not name.startswith("scopemap.__"):
+            yield name.split(".")[1], node
+
+
+def _none(faults: list[str]) -> None:
+    assert not faults, "\n" + "\n".join(faults)
+
+
+# ---- sizes
+
+
+def test_files_are_short() -> None:
+    _none([f"{m.path.name}: {m.lines} lines" for m in [*MODULES, *TESTS, *OTHERS] if m.lines > 400])
+
+
+def test_the_median_file_is_short(record_property: pytest.FixtureRequest) -> None:
+    middle = median(module.lines for module in MODULES if module.path.name != "__init__.py")
+    record_property("median lines of a file", middle)  # type: ignore[operator]
+    assert middle <= 180
+
+
+def test_functions_are_short() -> None:
+    sizes = [(_lines(function), module.at(function)) for module in MODULES for function in module.functions()]
+    _none([f"{where}: {size} lines" for size, where in sizes if size > 60])
+    assert quantiles([size for size, _ in sizes], n=10)[-1] <= 30
+    assert median(size for size, _ in sizes) <= 12
+
+
+def test_functions_take_few_parameters() -> None:
+    functions = [(module, function) for module in MODULES for function in module.functions()]
+    many = [(m, f) for m, f in functions if len(_parameters(f)) > 7 and not (m.room == "cli" and _is_command(f))]
+    _none([f"{module.at(function)}: {len(_parameters(function))} parameters" for module, function in many])
+
+
+def test_no_function_takes_keywords_it_does_not_name() -> None:
+    _none([module.at(f) for module in MODULES for f in module.functions() if f.args.kwarg is not None])
+
+
+def test_there_is_half_as_much_test_as_source() -> None:
+    assert sum(test.lines for test in TESTS) >= 0.5 * sum(module.lines for module in MODULES)
+
+
+# ---- imports
+
+
+def test_imports_go_downwards() -> None:
+    faults = []
+    for module in MODULES:
+        for room, node in _rooms_imported(module):
+            allowed = MAY_IMPORT.get(module.room)
+            outside = allowed is not None and room not in allowed
+            if room != module.room and (outside or room in MAY_NOT_IMPORT.get(module.room, set())):
+                faults.append(f"{module.at(node)}: {module.room} imports {room}")
+    _none(faults)
+
+
+def test_nobody_imports_the_command_line() -> None:
+    importing = [(m, node) for m in MODULES for room, node in _rooms_imported(m) if room == "cli" and m.room != "cli"]
+    _none([module.at(node) for module, node in importing])
+
+
+def test_every_room_that_the_rule_names_exists() -> None:
+    rooms = {module.room for module in MODULES}
+    assert set(MAY_IMPORT) | set(MAY_NOT_IMPORT) <= rooms
+
+
+def test_networks_are_imported_by_their_adapters_alone() -> None:
+    faults = []
+    for module in MODULES:
+        for name, node in _imported(module):
+            if name.split(".")[0] in NETWORKS and not module.name.startswith(ADAPTERS):
+                faults.append(f"{module.at(node)}: imports {name}")
+    _none(faults)
+
+
+@pytest.mark.parametrize("name", ["scopemap", "scopemap.cli"])
+def test_importing_does_not_wait_for_networks(name: str) -> None:
+    heavy = NETWORKS | {"numba", "matplotlib"}
+    code = f"import sys, {name}; print(*sorted({heavy!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
+def test_copyleft_tools_are_not_imported() -> None:
+    names = [(m, node) for m in MODULES for name, node in _imported(m) if name.split(".")[0] == "evo"]
+    _none([module.at(node) for module, node in names])
+
+
+# ---- names and words
+
+
+def test_no_module_has_a_name_that_says_nothing() -> None:
+    parts = {part.removesuffix(".py") for module in MODULES for part in module.name.split("/")}
+    assert not parts & FORBIDDEN_NAMES
+
+
+def test_the_library_neither_prints_nor_exits() -> None:
+    faults = []
+    for module in MODULES:
+        if module.room == "cli":
+            continue
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "print",
+                "exit",
+                "quit",
+                "sys.exit",
+                "os._exit",
+            ):
+                faults.append(module.at(node))
+    _none(faults)
+
+
+def test_nothing_is_left_for_later() -> None:
+    later = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b")
+    found = [(module, later.search(module.path.read_text())) for module in MODULES + OTHERS]
+    _none([f"{module.name}: {match[0]}" for module, match in found if match])
+
+
+def test_no_except_catches_everything_silently() -> None:
+    handlers = [(m, n) for m in MODULES for n in ast.walk(m.tree) if isinstance(n, ast.ExceptHandler)]
+    _none([module.at(node) for module, node in handlers if node.type is None])
+
+
+# ---- documentation and types
+
+
+def _public(module: _Module) -> Iterator[Function | ast.ClassDef]:
+    """Public functions and classes of a module, and the public methods of these classes."""
+    for node in module.tree.body:
+        if isinstance(node, Function | ast.ClassDef) and not node.name.startswith("_"):
+            yield node
+            if isinstance(node, ast.ClassDef):
+                methods = (item for item in node.body if isinstance(item, Function))
+                yield from (item for item in methods if not item.name.startswith("_"))
+
+
+def test_what_is_public_is_documented() -> None:
+    faults = [f"{module.name}: no docstring" for module in MODULES if not ast.get_docstring(module.tree)]
+    faults += [module.at(node) for module in MODULES for node in _public(module) if not ast.get_docstring(node)]
+    _none(faults)
+
+
+def test_what_is_public_is_typed() -> None:
+    faults = []
+    for module in MODULES:
+        for function in (f for f in _public(module) if isinstance(f, Function) and not _is_typed_by_use(f)):
+            untyped = [a.arg for a in _parameters(function) if a.annotation is None]
+            if untyped or function.returns is None:
+                faults.append(f"{module.at(function)}: {', '.join(untyped) or 'return'}")
+    _none(faults)
+
+
+def test_every_function_says_what_it_returns() -> None:
+    functions = [(module, f) for module in MODULES for f in module.functions() if not _is_typed_by_use(f)]
+    _none([module.at(function) for module, function in functions if function.returns is None])
+
+
+def test_public_names() -> None:
+    assert 0 < len(scopemap.__all__) <= 12
+    assert len(set(scopemap.__all__)) == len(scopemap.__all__)
+    for name in scopemap.__all__:
+        assert getattr(scopemap, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'reconstruckt'"):
+        _ = scopemap.reconstruckt
+
+
+# ---- the repository
+
+
+def _project_files() -> list[Path]:
+    """What git tracks, and what it would track."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    return [path for name in listed.splitlines() if (path := ROOT / name).is_file()]
+
+
+def test_no_file_is_large() -> None:
+    _none([f"{path}: {path.stat().st_size} bytes" for path in _project_files() if path.stat().st_size > 1_000_000])
+
+
+@pytest.mark.parametrize(
+    ("what", "pattern"),
+    [
+        ("a package registry's address", r"https?://[^\s/\"')]*(pypi|pythonhosted|npmjs|crates\.io|conda|artifactory)"),
+        ("a host by its number", r"https?://\d+\.\d+\.\d+\.\d+"),
+        ("a path of one machine", r"(?<![\w.}])/(work|root|home)/\w"),
+    ],
+)
+def test_no_file_names(what: str, pattern: str) -> None:
+    found = []
+    for path in _project_files():
+        text = path.read_bytes().decode("utf-8", errors="ignore")
+        for number, line in enumerate(text.splitlines(), start=1):
+            if b"\0" not in path.read_bytes()[:1000] and re.search(pattern, line):
+                found.append(f"{path.relative_to(ROOT)}:{number} holds {what}: {line.strip()[:100]}")
+    _none(found)

@@ -1,0 +1,354 @@
+"""The story from end to end on a tiny phantom: poses, truth kept out, losses, order, the camera, the look-ahead."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
+
+from scopemap import Config, open_sequence, reconstruct
+from scopemap.config import DepthSettings
+from scopemap.depth import AnchoredDepth, DepthEstimate
+from scopemap.depth.mapis import Mapis
+from scopemap.errors import InputError
+from scopemap.frame import Frame
+from scopemap.fusion import TsdfVolume
+from scopemap.odometry import Tracker
+from scopemap.pipeline import Estimators, Step
+from scopemap.trajectory import read_trajectory
+
+WITHOUT_NETWORKS = {"networks__flow": "dis", "networks__perceptual": "structure"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("phantom") / "sound")
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("phantom") / "interrupted", "black:4-4")
+
+
+class _SpyDepth:
+    """Asks another estimator, and keeps what it was asked."""
+
+    def __init__(self, inner: Any, name: str = "spy", focal_px: float | None = None) -> None:
+        self.inner, self.name, self.focal_px = inner, name, focal_px
+        self.seen: list[Frame] = []
+        self.threads: set[str] = set()
+        self.fails_at: int | None = None
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        self.seen.append(frame)
+        self.threads.add(threading.current_thread().name)
+        if len(self.seen) == self.fails_at:
+            raise RuntimeError("the network broke")
+        return replace(self.inner.estimate(frame), focal_px=self.focal_px)
+
+    def provenance(self) -> dict[str, str]:
+        return {"depth": self.name}
+
+
+def _spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any) -> list[_SpyDepth]:
+    """Put a spy into every run from here on, as its depth or as its anchor's reference; they appear in the list."""
+    create, spies = Estimators.create, []
+
+    def spying(config: Config, sequence: Any) -> Estimators:
+        parts = create(config, sequence)
+        if anchor_too:
+            spies.append(_SpyDepth(parts.anchor.reference, **spy))
+            return replace(parts, anchor=AnchoredDepth(DepthSettings(anchor="depth-pro"), spies[-1]))
+        spies.append(_SpyDepth(parts.depth, **spy))
+        return replace(parts, depth=spies[-1])
+
+    monkeypatch.setattr(Estimators, "create", spying)
+    return spies
+
+
+def _called(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, note: Callable[..., None]) -> None:
+    real = getattr(owner, name)
+
+    def watched(self: Any, *arguments: Any) -> Any:
+        note(*arguments)
+        return real(self, *arguments)
+
+    monkeypatch.setattr(owner, name, watched)
+
+
+def _position_errors_mm(result: Any, folder: Path) -> np.ndarray:
+    return np.linalg.norm(result.trajectory.positions_mm - true_poses(folder)[:, :3, 3], axis=1)
+
+
+def test_every_frame_is_tracked_and_a_surface_found(folder: Path) -> None:
+    result = reconstruct(open_sequence(folder), with_true_depth(folder))
+    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (FRAMES - 1)
+    assert [record.index for record in result.records] == list(range(FRAMES))
+    assert _position_errors_mm(result, folder).max() < 0.6
+    assert result.lost == []
+    assert len(result.mesh.faces) > 1000
+    truth = trimesh.load(folder / "mesh_truth.ply", process=False)
+    world = trimesh.transform_points(result.mesh.vertices, read_trajectory(folder).T_world_camera[0])
+    distances_mm, _ = KDTree(truth.vertices).query(world)
+    assert np.median(distances_mm) < 1.0
+
+
+def test_the_same_input_gives_the_same_result(folder: Path) -> None:
+    once, again = (reconstruct(open_sequence(folder), with_true_depth(folder)) for _ in range(2))
+    np.testing.assert_array_equal(once.trajectory.T_world_camera, again.trajectory.T_world_camera)
+    np.testing.assert_array_equal(once.mesh.faces, again.mesh.faces)
+    np.testing.assert_allclose(once.mesh.vertices, again.mesh.vertices, atol=1e-5)
+
+
+def test_truth_is_never_handed_to_an_estimator(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spies = _spied(monkeypatch)
+    tracked: list[Any] = []
+    _called(monkeypatch, Tracker, "track", tracked.append)
+    reconstruct(open_sequence(folder), with_true_depth(folder))
+    assert len(spies[0].seen) == len(tracked) == FRAMES
+    for frame in [*spies[0].seen, *tracked]:
+        assert type(frame) is Frame
+        assert frame.depth_mm is None
+        assert frame.T_world_camera is None
+
+
+def test_removing_the_truth_changes_nothing(folder: Path, tmp_path: Path) -> None:
+    bare = only_images(folder, tmp_path / "bare")
+    (bare / "camera.yaml").write_bytes((folder / "camera.yaml").read_bytes())
+    truth, none = open_sequence(folder), open_sequence(bare)
+    assert next(iter(truth))[1] is not None
+    assert next(iter(none))[1] is None
+    config = Config.load()
+    with_truth, without = reconstruct(truth, config), reconstruct(none, config)
+    np.testing.assert_array_equal(with_truth.trajectory.T_world_camera, without.trajectory.T_world_camera)
+
+
+def test_a_black_frame_is_lost_and_tracking_resumes(interrupted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    links: list[Any] = []
+    steps: list[Step] = []
+    _called(monkeypatch, Mapis, "refine", lambda *arguments: links.append(arguments[3]))
+    config = with_true_depth(interrupted)
+    result = reconstruct(open_sequence(interrupted), config, observers=(steps.append,))
+    assert [record.index for record in result.lost] == [4]
+    assert result.lost[0].track.reason.startswith("only ")
+    np.testing.assert_array_equal(result.records[4].T_world_camera, result.records[3].T_world_camera)
+    assert steps[4].frame.T_world_camera is None
+    assert np.delete(_position_errors_mm(result, interrupted), 4).max() < 0.6
+    assert links[4] is None
+    assert steps[5].refined.warped_share == 0.0
+    assert steps[6].refined.warped_share > 0.5
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_black_frames_at_the_start_are_left_behind(noisy: bool, tmp_path: Path) -> None:
+    """The noise of a sensor in the dark (0.4 % of its range) must not pass for tissue: it would fix the world."""
+    folder = write_tiny(tmp_path / "late", "black:0-1", frames=6)
+    for index in () if noisy else (0, 1):
+        cv2.imwrite(str(folder / f"{index:04d}_color.png"), np.zeros((*SIZE[::-1], 3), np.uint8))
+    result = reconstruct(open_sequence(folder), with_true_depth(folder))
+    assert [record.track.status for record in result.records] == ["lost"] * 2 + ["initial"] + ["ok"] * 3
+    np.testing.assert_array_equal(result.records[2].T_world_camera, np.eye(4))
+    errors = result.trajectory.positions_mm[2:] - true_poses(folder, 2)[2:, :3, 3]
+    assert np.linalg.norm(errors, axis=1).max() < 0.6
+
+
+def test_a_frame_that_is_too_dark_to_track_fixes_no_scale(folder: Path, tmp_path: Path) -> None:
+    """A bright corner is tissue, but no more than the tracker would refuse: the next frame's median is the prior."""
+    bare = only_images(folder, tmp_path / "bare")
+    first = cv2.imread(str(bare / "0000.png"))
+    first[: 4 * SIZE[1] // 5] = 0
+    first[:, SIZE[0] // 3 :] = 0
+    cv2.imwrite(str(bare / "0000.png"), first)
+    steps: list[Step] = []
+    reconstruct(open_sequence(bare, frames=slice(0, 3)), Config.load(), observers=(steps.append,))
+    assert [step.track.status for step in steps] == ["lost", "initial", "ok"]
+    assert steps[0].frame.valid.mean() > 0.02
+    assert np.isnan(steps[0].raw_mm).all()
+    distance_mm = steps[1].raw_mm * np.linalg.norm(steps[1].frame.camera.rays, axis=-1)
+    assert np.nanmedian(distance_mm[steps[1].frame.valid]) == pytest.approx(35.0, rel=1e-3)
+
+
+def test_smoothing_forgets_what_was_before_a_loss(interrupted: Path) -> None:
+    smoothing = {"smoothing__method": "wema", "smoothing__dynamic": False}
+    result = reconstruct(open_sequence(interrupted), with_true_depth(interrupted, **smoothing))
+    raw = np.stack([record.track.T_world_camera for record in result.records])
+    moved = np.abs(result.trajectory.T_world_camera - raw).max(axis=(1, 2))
+    np.testing.assert_array_equal(moved[[0, 1, 4, 5, 6]], 0.0)
+    assert moved[[2, 3, 7, 8]].min() > 1e-3
+
+
+def test_nothing_but_black_is_an_input_error(tmp_path: Path) -> None:
+    black = write_black(tmp_path / "black")
+    with pytest.raises(InputError, match=r"no frame of .*black could be used: .*usable"):
+        reconstruct(open_sequence(black), out=tmp_path / "out")
+    assert not (tmp_path / "out" / "trajectory.tum").exists()
+
+
+@pytest.mark.parametrize(
+    ("preset", "order"), [("default", ["track", "refine"]), ("paper", ["refine", "track"]), ("realtime", None)]
+)
+def test_order_of_tracking_and_refining(
+    preset: str, order: list[str] | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    motions: list[Any] = []
+    _called(monkeypatch, Tracker, "track", lambda frame: calls.append("track"))
+    _called(monkeypatch, Mapis, "refine", lambda *a: (calls.append("refine"), motions.append(a[4])))
+    without_networks = {**WITHOUT_NETWORKS, "depth__anchor": "auto"}
+    config = with_true_depth(folder, preset, **without_networks)
+    result = reconstruct(open_sequence(folder), config)
+    assert calls == (order or ["track", "refine"]) * FRAMES
+    assert [motion is None for motion in motions] == [True] + [preset == "paper"] * (FRAMES - 1)
+    assert result.lost == []
+    assert _position_errors_mm(result, folder).max() < 1.5
+
+
+def test_the_papers_form_runs_on_predicted_depth(folder: Path) -> None:
+    chosen = {**WITHOUT_NETWORKS, "depth__backend": "shading", "depth__anchor": "auto"}
+    result = reconstruct(open_sequence(folder), with_true_depth(folder, "paper", **chosen))
+    assert result.provenance["tracked"] >= FRAMES - 1
+    assert result.provenance["estimators"]["anchor"].startswith("shading prior")
+    assert [record.depth_scale for record in result.records] == [1.0] * FRAMES
+
+
+def test_the_motion_given_to_mapis_takes_previous_points_to_the_current_camera(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    motions: list[Any] = []
+    _called(monkeypatch, Mapis, "refine", lambda *arguments: motions.append(arguments[4]))
+    reconstruct(open_sequence(folder), with_true_depth(folder))
+    poses = true_poses(folder)
+    for i in range(1, FRAMES):
+        np.testing.assert_allclose(motions[i], np.linalg.inv(poses[i]) @ poses[i - 1], atol=0.3)
+        assert np.linalg.norm(motions[i][:3, 3] - (np.linalg.inv(poses[i]) @ poses[i - 1])[:3, 3]) < 0.2
+
+
+def test_smoothing_is_of_the_result_and_not_of_the_tracking(folder: Path) -> None:
+    smoothing = {"smoothing__method": "wema", "smoothing__dynamic": False}
+    rough = reconstruct(open_sequence(folder), with_true_depth(folder))
+    smooth = reconstruct(open_sequence(folder), with_true_depth(folder, **smoothing))
+    x, y = rough.trajectory.positions_mm, smooth.trajectory.positions_mm
+    np.testing.assert_array_equal(y[:2], x[:2])
+    np.testing.assert_allclose(y[2:], 0.6 * x[2:] + 0.3 * x[1:-1] + 0.1 * x[:-2], atol=2e-3)
+    for a, b in zip(rough.records, smooth.records, strict=True):
+        np.testing.assert_array_equal(a.track.T_world_camera, b.track.T_world_camera)
+
+
+@pytest.mark.parametrize(("every", "fused"), [(1, [0, 1, 2, 3, 5, 6, 7, 8]), (3, [0, 3, 7])])
+def test_lost_frames_are_not_fused_and_every_counts_tracked_ones(
+    every: int, fused: list[int], interrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+    _called(monkeypatch, TsdfVolume, "integrate", lambda frame: seen.append(frame.index))
+    reconstruct(open_sequence(interrupted), with_true_depth(interrupted, fusion__every=every))
+    assert seen == fused
+
+
+def test_depth_files_take_the_scale_of_the_inputs_calibration(folder: Path, tmp_path: Path) -> None:
+    """Depth maps kept apart from the frames mean what the frames' camera.yaml says of them."""
+    for file in folder.glob("*_depth.tiff"):
+        units = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(tmp_path / file.with_suffix(".png").name), units)
+    steps: list[Step] = []
+    reconstruct(open_sequence(folder), with_true_depth(tmp_path), observers=(steps.append,))
+    truth = next(iter(open_sequence(folder)))[1]
+    assert truth is not None
+    np.testing.assert_allclose(steps[0].raw_mm, truth.depth_mm, rtol=1e-5)
+
+
+def test_fusion_can_be_turned_off(folder: Path) -> None:
+    result = reconstruct(open_sequence(folder), with_true_depth(folder, fusion__enabled=False))
+    assert len(result.mesh.faces) == 0
+    assert result.provenance["tracked"] == FRAMES
+
+
+@pytest.mark.parametrize("anchor_too", [False, True])
+def test_an_unknown_camera_takes_depth_pros_focal_length(
+    anchor_too: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spies = _spied(monkeypatch, anchor_too, name="depth-pro", focal_px=83.25)
+    sequence = open_sequence(only_images(folder, tmp_path / "bare"))
+    result = reconstruct(sequence, Config.load())
+    assert result.camera.fx == pytest.approx(83.25)
+    assert result.camera.fy == pytest.approx(83.25)
+    assert (result.camera.width, result.camera.height) == SIZE
+    assert result.provenance["camera"]["source"] == "estimated: Depth Pro on frame 0"
+    assert spies[0].seen[-1].camera.fx == pytest.approx(83.25)
+    assert sequence.camera.fx != pytest.approx(83.25)
+
+
+@pytest.mark.parametrize(("name", "focal_px"), [("depth-anything", 83.0), ("depth-pro", None)])
+def test_an_unknown_camera_stays_assumed_without_a_focal_length(
+    name: str, focal_px: float | None, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _spied(monkeypatch, name=name, focal_px=focal_px)
+    sequence = open_sequence(only_images(folder, tmp_path / "bare"))
+    result = reconstruct(sequence, Config.load())
+    assert result.camera == sequence.camera
+    assert "assumed" in result.provenance["camera"]["source"]
+    assert any("assumed" in note for note in result.provenance["notes"])
+
+
+def test_a_known_camera_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _spied(monkeypatch, name="depth-pro", focal_px=500.0)
+    sequence = open_sequence(folder)
+    assert reconstruct(sequence, with_true_depth(folder)).camera == sequence.camera
+
+
+def test_perception_runs_ahead_in_another_thread(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spies = _spied(monkeypatch)
+    done: list[int] = []
+    ahead = threading.Event()
+
+    def wait_for_the_next(step: Step) -> None:
+        for _ in range(1000):
+            if len(spies[0].seen) >= min(step.frame.index + 2, FRAMES) or ahead.wait(0.01):
+                break
+        done.append(len(spies[0].seen))
+
+    reconstruct(open_sequence(folder), with_true_depth(folder), observers=(wait_for_the_next,))
+    assert done == [min(i + 2, FRAMES) for i in range(FRAMES)]
+    assert threading.main_thread().name not in spies[0].threads
+
+
+@pytest.mark.parametrize("fails_at", [1, 4, FRAMES])
+def test_an_error_in_the_look_ahead_comes_out(fails_at: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    create = Estimators.create
+
+    def breaking(config: Config, sequence: Any) -> Estimators:
+        parts = create(config, sequence)
+        spy = _SpyDepth(parts.depth)
+        spy.fails_at = fails_at
+        return replace(parts, depth=spy)
+
+    monkeypatch.setattr(Estimators, "create", breaking)
+    steps: list[Step] = []
+    with pytest.raises(RuntimeError, match="the network broke"):
+        reconstruct(open_sequence(folder), with_true_depth(folder), observers=(steps.append,))
+    assert len(steps) == fails_at - 1
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("perceive")]
+
+
+def test_a_frame_of_another_size_is_told_from_the_look_ahead(folder: Path, tmp_path: Path) -> None:
+    bare = only_images(folder, tmp_path / "bare")
+    cv2.imwrite(str(bare / "0005.png"), np.full((60, 80, 3), 90, np.uint8))
+    with pytest.raises(InputError, match=r"0005\.png: it is 80x60 px"):
+        reconstruct(open_sequence(bare), Config.load())
+
+
+def test_an_observers_error_ends_the_run(folder: Path) -> None:
+    def stop(step: Step) -> None:
+        if step.frame.index == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(open_sequence(folder), with_true_depth(folder), observers=(stop,))

@@ -1,0 +1,280 @@
+"""The folder of a run: what lies in it, that it can be read back, and what may not be overwritten."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from tiny_phantom import FRAMES, with_true_depth, write_tiny
+
+from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap.calibration import read_calibration
+from scopemap.config import Config
+from scopemap.errors import InputError
+from scopemap.pipeline import Step
+from scopemap.reconstruction import DEPTH_SCALE_MM, DepthWriter, FrameRecord, prepare_folder
+from scopemap.trajectory import read_trajectory
+
+COLUMNS = "index time_s name status reason keyframe residual inlier_share overlap iterations depth_scale warped_share"
+LOST = 6
+
+
+@dataclass(frozen=True)
+class _Run:
+    phantom: Path
+    out: Path
+    result: Reconstruction
+    steps: list[Step]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
+    folder = tmp_path_factory.mktemp("run")
+    phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}")
+    steps: list[Step] = []
+    config = with_true_depth(phantom)
+    result = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
+    return _Run(phantom, folder / "out", result, steps)
+
+
+def _rows(out: Path) -> list[dict[str, str]]:
+    with (out / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_contents(run: _Run) -> None:
+    names = [
+        "camera.yaml",
+        "config.toml",
+        "depth",
+        "frames.csv",
+        "mesh.glb",
+        "mesh.ply",
+        "provenance.json",
+        "trajectory.tum",
+    ]
+    assert sorted(path.name for path in run.out.iterdir()) == names
+    depth = [f"{i:06d}.png" for i in range(FRAMES)]
+    assert sorted(path.name for path in (run.out / "depth").iterdir()) == [*depth, "depth.json"]
+
+
+def test_frames_table(run: _Run) -> None:
+    rows = _rows(run.out)
+    assert list(rows[0]) == COLUMNS.split()
+    assert [int(row["index"]) for row in rows] == list(range(FRAMES))
+    expected = ["initial", *["ok"] * (FRAMES - 1)]
+    expected[LOST] = "lost"
+    assert [row["status"] for row in rows] == expected
+    assert [row["name"] for row in rows] == [f"{i:04d}_color.png" for i in range(FRAMES)]
+    assert [int(row["keyframe"]) for row in rows] == [record.track.keyframe for record in run.result.records]
+    np.testing.assert_allclose([float(row["time_s"]) for row in rows], np.arange(FRAMES) / 30, atol=1e-6)
+    assert rows[LOST]["reason"]
+    assert all(row["reason"] == "" for row in rows if row["status"] == "ok")
+
+
+def test_numbers_that_do_not_exist_are_empty(run: _Run) -> None:
+    rows = _rows(run.out)
+    for name in ("residual", "inlier_share", "overlap"):
+        assert rows[0][name] == ""
+        told = [float(row[name]) for row in rows if row["status"] == "ok"]
+        known = [getattr(record.track, name) for record in run.result.records if record.track.status == "ok"]
+        np.testing.assert_allclose(told, known, rtol=1e-4)
+    assert [int(row["iterations"]) for row in rows] == [record.track.iterations for record in run.result.records]
+    assert {float(row["depth_scale"]) for row in rows} == {1.0}
+
+
+def test_trajectory_is_read_back(run: _Run) -> None:
+    for source in (run.out, run.out / "trajectory.tum"):
+        back = read_trajectory(source)
+        np.testing.assert_allclose(back.T_world_camera, run.result.trajectory.T_world_camera, atol=1e-8)
+    back = read_trajectory(run.out)
+    np.testing.assert_array_equal(back.indices, run.result.trajectory.indices)
+    np.testing.assert_array_equal(back.status, run.result.trajectory.status)
+    np.testing.assert_array_equal(back.T_world_camera[LOST], back.T_world_camera[LOST - 1])
+
+
+def test_depth_is_read_back_to_half_a_unit(run: _Run) -> None:
+    scale = json.loads((run.out / "depth" / "depth.json").read_text())
+    assert scale == {"scale_mm": DEPTH_SCALE_MM, "unknown": 0}
+    for step in run.steps:
+        image = cv2.imread(str(run.out / "depth" / f"{step.frame.index:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint16
+        known = np.isfinite(step.refined.depth_mm)
+        np.testing.assert_array_equal(image > 0, known)
+        error = np.abs(image[known] * scale["scale_mm"] - step.refined.depth_mm[known])
+        assert error.max() <= 0.501 * DEPTH_SCALE_MM
+
+
+def test_depth_folder_serves_as_depth_files(run: _Run) -> None:
+    steps: list[Step] = []
+    again = reconstruct(open_sequence(run.phantom), with_true_depth(run.out / "depth"), observers=(steps.append,))
+    assert again.provenance["estimators"]["depth_kind"] == "measured"
+    assert again.provenance["estimators"]["depth_scale"] == "0.01 mm per unit (depth.json)"
+    for before, after in zip(run.steps, steps, strict=True):
+        np.testing.assert_allclose(after.raw_mm, before.refined.depth_mm, atol=0.501 * DEPTH_SCALE_MM)
+    difference = again.trajectory.positions_mm - run.result.trajectory.positions_mm
+    assert np.abs(difference).max() < 0.02
+
+
+def test_mesh_files_hold_the_surface(run: _Run) -> None:
+    ply = trimesh.load(run.out / "mesh.ply", process=False)
+    np.testing.assert_allclose(ply.vertices, run.result.mesh.vertices, atol=1e-4)
+    np.testing.assert_array_equal(ply.faces, run.result.mesh.faces)
+    glb = trimesh.load(run.out / "mesh.glb", force="mesh", process=False)
+    np.testing.assert_allclose(np.sort(glb.extents), np.sort(ply.extents) / 1000, rtol=1e-3)
+
+
+def test_camera_and_settings_are_read_back(run: _Run) -> None:
+    camera = run.result.camera
+    back = read_calibration(run.out / "camera.yaml", (camera.width, camera.height)).camera.central
+    np.testing.assert_allclose(back.matrix, camera.matrix, rtol=1e-9)
+    assert Config.load(file=run.out / "config.toml") == run.result.config
+
+
+def test_provenance(run: _Run) -> None:
+    told = json.loads((run.out / "provenance.json").read_text())
+    assert told == json.loads(json.dumps(run.result.provenance))
+    assert (told["frames"], told["tracked"], told["dataset"]) == (FRAMES, FRAMES - 1, "c3vd")
+    assert told["input"] == str(run.phantom)
+    assert "camera.yaml" in told["camera"]["source"]
+    assert told["camera"]["fx"] == pytest.approx(80.0)
+    assert told["estimators"]["anchor"] == "measured depth"
+    assert set(told["versions"]) >= {"scopemap", "numpy", "torch", "python"}
+    parts = told["seconds"]
+    assert {"read", "perceive", "track and fuse", "mesh", "total"} <= set(parts)
+    assert parts["total"] >= max(parts["track and fuse"], parts["mesh"])
+
+
+def test_a_result_in_memory_can_be_saved_later(run: _Run, tmp_path: Path) -> None:
+    run.result.save(tmp_path / "deep" / "later")
+    for name in ("trajectory.tum", "frames.csv", "config.toml", "camera.yaml", "provenance.json", "mesh.ply"):
+        assert (tmp_path / "deep" / "later" / name).read_bytes() == (run.out / name).read_bytes()
+
+
+def test_without_a_folder_nothing_is_written(run: _Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = with_true_depth(run.phantom, fusion__enabled=False)
+    result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
+    assert list(tmp_path.iterdir()) == []
+    result.save(tmp_path / "empty")
+    assert not (tmp_path / "empty" / "mesh.glb").exists()
+
+
+def test_record_of_a_lost_frame_repeats_the_last_pose(run: _Run) -> None:
+    record = FrameRecord.of(run.steps[LOST])
+    assert run.steps[LOST].frame.T_world_camera is None
+    np.testing.assert_array_equal(record.T_world_camera, run.steps[LOST].track.T_world_camera)
+    assert [lost.index for lost in run.result.lost] == [LOST]
+
+
+def test_depth_writer_at_the_ends_of_its_range(run: _Run, tmp_path: Path) -> None:
+    step = run.steps[0]
+    depth = np.full(step.refined.depth_mm.shape, np.nan, np.float32)
+    depth[0, :6] = [0.01, 0.014, 655.34, 655.36, 5000.0, np.inf]
+    frame = replace(step.frame, index=1234567)
+    DepthWriter(tmp_path)(replace(step, frame=frame, refined=replace(step.refined, depth_mm=depth)))
+    image = cv2.imread(str(tmp_path / "depth" / "1234567.png"), cv2.IMREAD_UNCHANGED)
+    assert image[0, :6].tolist() == [1, 1, 65534, 0, 0, 0]
+    assert not image[1:].any()
+
+
+def test_prepare_makes_a_folder_and_takes_an_empty_one(tmp_path: Path) -> None:
+    prepare_folder(tmp_path / "a" / "b", overwrite=False)
+    prepare_folder(tmp_path / "a" / "b", overwrite=False)
+    assert (tmp_path / "a" / "b").is_dir()
+
+
+def test_prepare_refuses_what_is_in_the_way(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match="a file of that name is in the way"):
+            prepare_folder(file, overwrite=overwrite)
+        with pytest.raises(InputError, match="cannot write a run to"):
+            prepare_folder(file / "inside", overwrite=overwrite)
+    with pytest.raises(InputError, match=r"it is not empty; .*--overwrite"):
+        prepare_folder(tmp_path, overwrite=False)
+    assert file.read_text() == "mine"
+
+
+def test_overwrite_takes_away_the_earlier_run_and_nothing_else(run: _Run, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    config = with_true_depth(run.phantom, fusion__enabled=False)
+    reconstruct(open_sequence(run.phantom, frames=slice(0, 4)), config, out=out)
+    (out / "notes.txt").write_text("keep")
+    (out / "mine").mkdir()
+    (out / "mine" / "a.png").write_text("keep")
+    (out / "mesh.glb").write_text("of the earlier run")
+    with pytest.raises(InputError, match="not empty"):
+        reconstruct(open_sequence(run.phantom), config, out=out)
+    reconstruct(open_sequence(run.phantom, frames=slice(5, 8)), config, out=out, overwrite=True)
+    assert (out / "notes.txt").read_text() == "keep"
+    assert (out / "mine" / "a.png").read_text() == "keep"
+    assert not (out / "mesh.glb").exists()
+    assert sorted(path.name for path in (out / "depth").glob("*.png")) == [f"{i:06d}.png" for i in (5, 6, 7)]
+    assert [row["index"] for row in _rows(out)] == ["5", "6", "7"]
+
+
+def test_overwrite_takes_away_a_run_that_broke_off(run: _Run, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare_folder(out, overwrite=False)
+    DepthWriter(out)(run.steps[0])
+    with pytest.raises(InputError, match="not empty"):
+        prepare_folder(out, overwrite=False)
+    prepare_folder(out, overwrite=True)
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("reach_mm", "scale_mm"), [(0.0, 0.01), (300.0, 0.01), (655.34, 0.01), (656.0, 0.02), (5000.0, 0.1), (65534.0, 1.0)]
+)
+def test_the_step_of_depth_grows_with_its_reach(run: _Run, reach_mm: float, scale_mm: float, tmp_path: Path) -> None:
+    step = run.steps[0]
+    depth_mm = np.full(step.refined.depth_mm.shape, reach_mm, np.float32)
+    DepthWriter(tmp_path, reach_mm)(replace(step, refined=replace(step.refined, depth_mm=depth_mm)))
+    assert json.loads((tmp_path / "depth" / "depth.json").read_text()) == {"scale_mm": scale_mm, "unknown": 0}
+    image = cv2.imread(str(tmp_path / "depth" / f"{step.frame.index:06d}.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(image * scale_mm, reach_mm, atol=0.501 * scale_mm)
+
+
+def test_what_cannot_be_written_is_an_input_error(run: _Run, tmp_path: Path) -> None:
+    writer = DepthWriter(tmp_path)
+    (tmp_path / "depth" / "depth.json").unlink()
+    (tmp_path / "depth").rmdir()
+    with pytest.raises(InputError, match=r"cannot write .*000000\.png"):
+        writer(run.steps[0])
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="cannot write depth to"):
+        DepthWriter(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot write the result to"):
+        run.result.save(tmp_path / "file")
+
+
+def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) -> None:
+    """Measured depth is known however far it is: ten centimetres of phantom, taken as ten metres."""
+    config = with_true_depth(run.phantom, depth__files_scale_mm=0.15)
+    result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config, out=tmp_path / "out")
+    scale_mm = json.loads((tmp_path / "out" / "depth" / "depth.json").read_text())["scale_mm"]
+    assert scale_mm == 0.2
+    depth = cv2.imread(str(tmp_path / "out" / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED) * scale_mm
+    assert (depth > 0).mean() > 0.9
+    assert np.median(depth) > 1000
+    assert any("raise fusion.max_depth_mm and fusion.voxel_mm" in text for text in result.provenance["warnings"])
+    assert run.result.provenance["warnings"] == []
+
+
+def test_overwrite_spares_a_folder_that_is_no_run(run: _Run, tmp_path: Path) -> None:
+    """A data set too may hold `camera.yaml` and `depth/`: they are its owner's."""
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth" / "0000.png").write_text("measured")
+    (tmp_path / "camera.yaml").write_text("calibrated")
+    with pytest.raises(InputError):
+        prepare_folder(tmp_path, overwrite=True)
+    assert (tmp_path / "depth" / "0000.png").read_text() == "measured"
+    assert (tmp_path / "camera.yaml").read_text() == "calibrated"

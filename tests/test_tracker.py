@@ -1,0 +1,207 @@
+"""Alignment and tracking on phantom frames with exact truth, and what happens to frames that show nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scopemap.config import OdometrySettings
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.odometry import Tracker
+from scopemap.odometry.pyramid import build_pyramid
+from scopemap.odometry.rtdl import align
+from scopemap.phantom import PhantomSpec, prepare, render_frame
+
+SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
+SETTINGS = OdometrySettings(finest_level=0)
+
+
+@cache
+def _sequence() -> tuple[list[Frame], np.ndarray]:
+    """Frames with true depth, and their true poses relative to the first."""
+    phantom, frames = prepare(SPEC), []
+    for index in range(SPEC.frames or 0):
+        rgb, depth_mm = render_frame(phantom, index)
+        valid = np.isfinite(depth_mm) & (rgb.max(-1) > 20) & (rgb.max(-1) < 240)
+        frames.append(Frame(index, index / 30, rgb, SPEC.camera, valid, depth_mm))
+    return frames, inverse(phantom.poses[0]) @ phantom.poses
+
+
+def _errors(T_estimated: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
+    """Translation (mm) and rotation (deg) between two motions."""
+    difference = inverse(T_true) @ T_estimated
+    return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(rotation_angle_rad(difference[:3, :3])))
+
+
+def _track_all(settings: OdometrySettings, frames: list[Frame]) -> list[np.ndarray]:
+    tracker, poses = Tracker(settings), []
+    for frame in frames:
+        track = tracker.track(frame)
+        poses.append(track.T_world_camera)
+        if track.status != "lost" and tracker.wants_keyframe():
+            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+    return poses
+
+
+def test_alignment_finds_the_true_motion() -> None:
+    frames, truth = _sequence()
+    reference = build_pyramid(frames[0], SETTINGS, trust_slope=True)
+    found = align(reference, build_pyramid(frames[6], SETTINGS), np.eye(4), SETTINGS)
+    moved_mm, turned_deg = _errors(inverse(found.motion.T_current_reference), truth[6])
+    assert np.linalg.norm(truth[6][:3, 3]) > 1.5  # standing still would not do
+    assert moved_mm < 0.1
+    assert turned_deg < 0.15
+    assert found.inlier_share > 0.6
+    assert found.overlap > 0.6
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"channels": "grey"},
+        {"channels": "normalised"},
+        {"solver": "gauss-newton"},
+        {"rotation_first": False},
+        {"lamp_gamma": 0.0, "gain_bias": False},
+        {"start": "velocity"},
+        {"start": "identity", "keyframe_every": 2},
+        {"finest_level": 1},
+    ],
+)
+def test_every_ablation_tracks_and_changes_the_result(changes: dict[str, object]) -> None:
+    frames, truth = _sequence()
+    plain = _track_all(SETTINGS, frames)
+    poses = _track_all(SETTINGS.model_copy(update=changes), frames)
+    moved_mm, turned_deg = _errors(poses[-1], truth[-1])
+    assert moved_mm < 0.6
+    assert turned_deg < 1.0
+    assert np.abs(poses[-1] - plain[-1]).max() > 0
+
+
+def test_gain_and_bias_make_up_for_exposure() -> None:
+    frames, truth = _sequence()
+    darker = replace(frames[3], rgb=(0.8 * frames[3].rgb).astype(np.uint8))
+    errors = {}
+    for gain_bias in (True, False):
+        settings = SETTINGS.model_copy(update={"channels": "grey", "gain_bias": gain_bias})
+        reference = build_pyramid(frames[0], settings, trust_slope=True)
+        found = align(reference, build_pyramid(darker, settings), np.eye(4), settings)
+        errors[gain_bias] = _errors(inverse(found.motion.T_current_reference), truth[3])[0]
+    assert errors[True] < 0.25 * errors[False]
+    assert errors[True] < 0.2
+
+
+def test_rotations_stay_rotations_over_many_frames() -> None:
+    frames, _ = _sequence()
+    there_and_back = (frames + frames[::-1]) * 3
+    poses = _track_all(SETTINGS, there_and_back)
+    deviation = [np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() for T in poses]
+    assert max(deviation) < 1e-12
+
+
+def test_first_frame_is_the_world() -> None:
+    frames, _ = _sequence()
+    track = Tracker(SETTINGS).track(frames[0])
+    assert track.status == "initial"
+    np.testing.assert_array_equal(track.T_world_camera, np.eye(4))
+
+
+def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
+    frames, truth = _sequence()
+    noise = np.random.default_rng(0).integers(0, 255, frames[0].rgb.shape, dtype=np.uint8)
+    spoilt = list(frames)
+    spoilt[5] = replace(frames[5], valid=np.zeros_like(frames[5].valid))
+    spoilt[6] = replace(frames[6], rgb=noise)
+    tracker, tracks = Tracker(SETTINGS), []
+    for frame in spoilt:
+        track = tracker.track(frame)
+        tracks.append(track)
+        if track.status == "initial":
+            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+    assert [track.status for track in tracks] == ["initial"] + ["ok"] * 4 + ["lost"] * 2 + ["ok"] * 5
+    assert tracks[5].reason == "only 0% of the image is usable"
+    assert "agree with the keyframe" in tracks[6].reason
+    np.testing.assert_array_equal(tracks[6].T_world_camera, tracks[4].T_world_camera)
+    moved_mm, turned_deg = _errors(tracks[-1].T_world_camera, truth[-1])
+    assert moved_mm < 0.3
+    assert turned_deg < 0.4
+
+
+def test_a_jump_is_not_believed() -> None:
+    frames, _ = _sequence()
+    tracker = Tracker(SETTINGS.model_copy(update={"max_step": 1e-4}))
+    first = tracker.track(frames[0])
+    tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+    track = tracker.track(frames[4])
+    assert track.status == "lost"
+    assert "jump" in track.reason
+
+
+def test_a_keyframe_without_depth_is_refused() -> None:
+    frames, _ = _sequence()
+    tracker = Tracker(SETTINGS)
+    blind = replace(frames[0], depth_mm=np.full_like(frames[0].depth_mm, np.nan), T_world_camera=np.eye(4))
+    assert not tracker.adopt(blind, measured=True)
+    assert tracker.track(frames[1]).status == "initial"
+    with pytest.raises(ValueError, match="needs a depth and a pose"):
+        tracker.adopt(frames[0], measured=True)
+
+
+def test_pyramid_sizes_cameras_and_masks() -> None:
+    frames, _ = _sequence()
+    views = build_pyramid(frames[0], OdometrySettings(levels=9, finest_level=1, min_side_px=16))
+    assert [view.weight.shape for view in views] == [(64, 80), (32, 40), (16, 20)]
+    # A ray through a point keeps its direction at every level: x = (u - cx) / fx.
+    for view in views:
+        fx, _, cx, _ = view.intrinsics
+        edge = (-0.5 - cx) / fx
+        assert edge == pytest.approx((-0.5 - SPEC.camera.cx) / SPEC.camera.fx)
+    assert all((view.slope == 0).all() for view in views)
+
+
+def test_masked_pixels_do_not_bleed_into_coarser_levels() -> None:
+    frames, _ = _sequence()
+    spoilt = frames[0].rgb.copy()
+    spoilt[~frames[0].valid] = 255
+    twin = replace(frames[0], rgb=spoilt)
+    for one, two in zip(build_pyramid(frames[0], SETTINGS), build_pyramid(twin, SETTINGS), strict=True):
+        used = one.weight > 0
+        np.testing.assert_allclose(one.channels[:, used], two.channels[:, used], atol=1e-4)
+
+
+def test_slope_of_a_plane_is_its_normal() -> None:
+    frames, _ = _sequence()
+    camera = frames[0].camera
+    plane = np.array([0.004, -0.002, 0.03])  # plane . X = 1
+    depth_mm = (1.0 / (camera.rays @ plane)).astype(np.float32)
+    view = build_pyramid(replace(frames[0], depth_mm=depth_mm), SETTINGS, trust_slope=True)[0]
+    np.testing.assert_allclose(view.slope[20:-20, 20:-20], np.broadcast_to(plane[:2], (88, 120, 2)), atol=1e-5)
+
+
+def test_lamp_explains_the_dimming_of_a_facing_wall() -> None:
+    """A wall of one colour lit by the camera's lamp: with the lamp modelled, moving back leaves no residual."""
+    frames, _ = _sequence()
+    camera = frames[0].camera
+    from scopemap.odometry.residuals import Loss, residual_images
+
+    def wall(distance_mm: float) -> Frame:
+        length = distance_mm * np.linalg.norm(camera.rays, axis=-1)
+        cosine = distance_mm / length
+        linear = 4000.0 * (cosine / length**2)
+        grey = np.clip(255 * linear**0.35 / 4.0, 0, 255)
+        rgb = np.repeat(grey[..., None], 3, -1).astype(np.uint8)
+        depth = np.full(grey.shape, distance_mm, np.float32)
+        return Frame(0, 0.0, rgb, camera, np.ones(grey.shape, bool), depth)
+
+    settings = OdometrySettings(finest_level=0, channels="grey")
+    near, far = (build_pyramid(wall(d), settings, trust_slope=True)[0] for d in (30.0, 36.0))
+    back = se3_exp(np.array([0, 0, 0, 0, 0, 6.0]))
+    sizes = {}
+    for gamma in (0.0, 0.35):
+        loss = Loss(np.ones(1), 1.0, np.ones(1), np.array([True]), gamma)
+        sizes[gamma] = np.nanmean(np.abs(residual_images(near, far, back, np.array([1.0, 0.0]), loss)))
+    assert sizes[0.35] < 0.05 * sizes[0.0]

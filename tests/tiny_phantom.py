@@ -1,0 +1,49 @@
+"""A phantom of few and small frames, with its true depth, for tests of the whole way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.config import Config
+from scopemap.geometry.se3 import inverse
+from scopemap.phantom import PhantomSpec, parse_events, write_phantom
+from scopemap.trajectory import read_trajectory
+
+FRAMES = 9
+SIZE = (160, 128)
+
+
+def write_tiny(folder: Path, events: str = "", frames: int = FRAMES) -> Path:
+    spec = PhantomSpec(frames=frames, width=SIZE[0], height=SIZE[1], seed=3, events=parse_events(events))
+    write_phantom(spec, folder)
+    return folder
+
+
+def with_true_depth(folder: Path, preset: str = "default", **changes: object) -> Config:
+    """Settings that take the depth of `folder`; `odometry__huber=2` is odometry.huber=2."""
+    given = {key.replace("__", "."): value for key, value in changes.items()}
+    return Config.load(preset, settings={"depth.backend": f"files:{folder}", **given})  # type: ignore[arg-type]
+
+
+def true_poses(folder: Path, first: int = 0) -> np.ndarray:
+    """Poses (N, 4, 4) relative to that of frame `first`."""
+    poses = read_trajectory(folder).T_world_camera
+    return inverse(poses[first]) @ poses
+
+
+def only_images(folder: Path, target: Path) -> Path:
+    """The colour images of a phantom and nothing that tells of truth or camera."""
+    target.mkdir()
+    for file in sorted(folder.glob("*_color.png")):
+        (target / file.name.replace("_color", "")).write_bytes(file.read_bytes())
+    return target
+
+
+def write_black(folder: Path, frames: int = 4) -> Path:
+    folder.mkdir()
+    for index in range(frames):
+        cv2.imwrite(str(folder / f"{index:04d}.png"), np.full((SIZE[1], SIZE[0], 3), 2, np.uint8))
+    return folder
