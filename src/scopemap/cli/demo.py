@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scopemap.cli.options import parse_settings
+from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import render_progress, run_progress
 
 if TYPE_CHECKING:
@@ -22,14 +22,12 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for phantom, run and pictures.")] = Path(
         "scopemap-demo"
     ),
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as odometry.huber=2.")
-    ] = None,
+    settings: SetPairs = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier demo's run; its phantom is used again.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render a phantom colon, reconstruct it, and compare with the truth; no network, no weights."""
     silent = quiet or as_json

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from scopemap.cli.options import AsJson
 from scopemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def evaluate(
     paper_units: Annotated[
         bool, typer.Option("--paper-units", help="Also the figures of the paper's table 1, rotations in radians.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON only.")] = False,
+    as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
 ) -> None:
     """Compare a trajectory with the truth.

@@ -10,16 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from scopemap import weights
+from scopemap.cli.options import AsJson, Quiet
 from scopemap.errors import WeightsError
 
 app = typer.Typer(help="Weights of the networks: list, pull, verify.", no_args_is_help=True)
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-
 
 @app.command("list")
-def list_(as_json: Json = False, quiet: Quiet = False) -> None:
+def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the known weights and whether they are there."""
     _show(weights.overview(), as_json, quiet)
 
@@ -27,7 +25,7 @@ def list_(as_json: Json = False, quiet: Quiet = False) -> None:
 @app.command()
 def pull(
     name: Annotated[str, typer.Argument(help="A name from `scopemap models list`, or any hub id (owner/model).")],
-    as_json: Json = False,
+    as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Download weights into the weights folder (SCOPEMAP_WEIGHTS_DIR, or the user's cache)."""
@@ -38,7 +36,7 @@ def pull(
 @app.command()
 def verify(
     name: Annotated[str | None, typer.Argument(help="Weights to check; all that are there, if left out.")] = None,
-    as_json: Json = False,
+    as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Hash weights anew and compare them with what is pinned or was recorded."""

@@ -1,12 +1,20 @@
-"""Texts of the command line turned into values; a text that cannot be read is a `SettingsError`."""
+"""Options that several commands share, and their texts turned into values; what cannot be read is a `SettingsError`."""
 
 from __future__ import annotations
 
 import json
 import re
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from scopemap.errors import SettingsError
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
+SetPairs = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as odometry.huber=2.")
+]
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from scopemap.cli.options import parse_settings, parse_size
+from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_size
 from scopemap.cli.progress import render_progress
 
 
@@ -27,8 +27,8 @@ def phantom(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, gloss, ...")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing but errors and JSON")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render synthetic endoscopy with true poses, depth and mesh, in the C3VD layout."""
     # Imported here, so that --help does not wait for the kernels.

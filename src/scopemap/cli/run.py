@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.cli.options import parse_near_far, parse_settings, parse_size, parse_slice
+from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_near_far, parse_settings, parse_size, parse_slice
 from scopemap.cli.progress import run_progress
 
 if TYPE_CHECKING:
@@ -70,12 +70,10 @@ def run(
         typer.Option(metavar="WxH", help="Working size, px; else the input's over a whole number, at most 400 px."),
     ] = None,
     device: Annotated[DeviceChoice | None, typer.Option(help="Where networks run.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as odometry.huber=2.")
-    ] = None,
+    settings: SetPairs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Reconstruct camera poses, depth and a tissue surface from a video."""
     from scopemap.config import Config
