@@ -21,7 +21,7 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
-LENIENT = FusionSettings(min_weight=0.2)
+LENIENT = FusionSettings(max_depth_mm=150.0, min_weight=0.2)
 GREY = (120, 110, 100)
 
 
