@@ -136,7 +136,7 @@ def test_a_black_frame_is_lost_and_tracking_resumes(interrupted: Path, monkeypat
     links: list[Any] = []
     steps: list[Step] = []
     _called(monkeypatch, Mapis, "refine", lambda *arguments: links.append(arguments[3]))
-    config = with_true_depth(interrupted)
+    config = with_true_depth(interrupted, mapis__frame_scale="robust")  # measured depth alone needs no link
     result = reconstruct(open_sequence(interrupted), config, observers=(steps.append,))
     assert [record.index for record in result.lost] == [4]
     assert result.lost[0].track.reason.startswith("only ")

@@ -117,7 +117,7 @@ class OdometrySettings(Settings):
     )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
-    min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated images: 0.37")
+    min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
     max_step: float = Field(0.5, gt=0, description="largest jump between frames: rad, and mm over mean depth")
 
@@ -204,6 +204,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapis.blend": "linear",
         "mapis.recursive": False,
         "mapis.compare_warped": False,
+        "mapis.perceptual_score": True,
         "networks.flow": "raft-large",
         "networks.perceptual": "lpips",
         "odometry.keyframe_every": 2,
@@ -215,7 +216,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "smoothing.method": "wema",
     },
     "realtime": {
-        "networks.flow": "dis",
         "networks.perceptual": "structure",
         "odometry.max_iterations": 15,
         "fusion.voxel_mm": 1.5,

@@ -98,7 +98,7 @@ class Pipeline:
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
         self._volume = TsdfVolume(config.fusion)
-        self._rgb_previous: np.ndarray | None = None
+        self._previous: Frame | None = None
         self._last: Track | None = None
         self._fusable = 0
 
@@ -112,8 +112,8 @@ class Pipeline:
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
         raw_mm = self.estimators.anchor.depth_mm(estimate, shown)
-        link = self._link(frame.rgb)
-        self._rgb_previous = frame.rgb
+        link = self._link(frame, estimate.kind)
+        self._previous = frame
         return Percept(frame, raw_mm, estimate.kind, link)
 
     def step(self, percept: Percept) -> Step:
@@ -125,13 +125,11 @@ class Pipeline:
             known = percept if track.status != "lost" else replace(percept, link=None)
             refined = self._refine(known, self._motion(track))
         frame = replace(percept.frame, depth_mm=refined.depth_mm)
+        track = self._keyed(track, frame, measured=percept.kind == "measured")
         if track.status == "lost":
             self._mapis.forget()
             self._smooth.forget()
         else:
-            frame = replace(frame, T_world_camera=track.T_world_camera)
-            if self._tracker.wants_keyframe():
-                self._tracker.adopt(frame, measured=percept.kind == "measured")
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
         self._last = track
@@ -141,15 +139,27 @@ class Pipeline:
         """Return the surface of all frames so far, world mm; may be empty."""
         return self._volume.extract_mesh()
 
-    def _link(self, rgb: np.ndarray) -> Correspondence | None:
-        if self._rgb_previous is None:
+    def _keyed(self, track: Track, frame: Frame, *, measured: bool) -> Track:
+        """Make the frame a keyframe where one is due; a first frame that cannot be one fixes no world and is lost."""
+        if track.status == "lost" or not self._tracker.wants_keyframe():
+            return track
+        adopted = self._tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=measured)
+        if track.status == "initial" and not adopted:
+            return replace(track, status="lost", reason="too little of its depth is known to start from")
+        return track
+
+    def _link(self, frame: Frame, kind: DepthKind) -> Correspondence | None:
+        """Link a masked frame to the one before it; None for the first, and where MAPIS would not use it."""
+        past, settings = self._previous, self.config.mapis
+        if past is None or not self._mapis.links(kind):
             return None
-        settings = self.config.mapis
-        flow = pair_flow(self.estimators.flow, self._rgb_previous, rgb, settings.consistency_px)
-        past = pull(self._rgb_previous, flow.to_previous) if settings.compare_warped else self._rgb_previous
-        distance = self.estimators.perceptual.compare(past, rgb)
+        flow = pair_flow(self.estimators.flow, past.rgb, frame.rgb, settings.consistency_px)
+        # What is masked in either frame shows no tissue that could be carried over.
+        seen = pull(past.valid.astype(np.float32), flow.to_previous) > 0.5
+        rgb = pull(past.rgb, flow.to_previous) if settings.compare_warped else past.rgb
+        distance = self.estimators.perceptual.compare(rgb, frame.rgb)
         values = np.full_like(distance.map, distance.score) if settings.perceptual_score else distance.map
-        return Correspondence(flow.to_previous, flow.consistent, values)
+        return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
         camera: PinholeCamera = percept.frame.camera

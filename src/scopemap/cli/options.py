@@ -27,7 +27,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def parse_slice(text: str) -> slice:
     """Return the slice of "A:B:S", a Python slice over the input's frames; A, B and S may be left out."""
-    if not re.fullmatch(r"-?\d*:-?\d*(:\d*)?", text):
+    if not re.fullmatch(r"(-?\d+)?:(-?\d+)?(:\d*)?", text):
         raise SettingsError(f"cannot read the frames '{text}': expected START:STOP or START:STOP:STEP such as 0:100")
     return slice(*(int(part) if part else None for part in text.split(":")))
 

@@ -40,7 +40,7 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the result.")],
     preset: Annotated[
         PresetChoice | None,
-        typer.Option(help="paper: the method as published; default: what measures best; realtime: fast."),
+        typer.Option(help="paper: the method as published; default: best of what needs no download; realtime: fast."),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")

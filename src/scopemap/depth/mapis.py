@@ -73,21 +73,33 @@ class Mapis:
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         warped_mm = self._warped(camera, link, T_current_previous)
-        frame_scale = self.settings.frame_scale
-        if frame_scale == "robust" or (frame_scale == "auto" and kind != "measured"):
+        if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm = scaled_mm
-        blend = self.settings.blend if self.settings.blend != "auto" else _natural_blend(kind)
+        blend = self._blend(kind)
         if link is not None and blend != "none":
             weight = np.where(np.isfinite(warped_mm), self._weight(blend, link.distance), np.float32(0.0))
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
         self._carried_mm = depth_mm if self.settings.recursive else scaled_mm
         return RefinedDepth(depth_mm, self._scale, float(np.isfinite(warped_mm).mean()))
 
+    def links(self, kind: DepthKind) -> bool:
+        """Return whether depth of this kind is compared with the frame before it at all."""
+        return self._scales(kind) or self._blend(kind) != "none"
+
     def forget(self) -> None:
         """Let the next frame start without a previous depth; the scale found last is held."""
         self._carried_mm = None
+
+    def _scales(self, kind: DepthKind) -> bool:
+        frame_scale = self.settings.frame_scale
+        return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
+
+    def _blend(self, kind: DepthKind) -> str:
+        if self.settings.blend != "auto":
+            return self.settings.blend
+        return "none" if kind == "measured" else "exponential"
 
     def _warped(
         self, camera: PinholeCamera, link: Correspondence | None, T_current_previous: np.ndarray | None
@@ -110,10 +122,6 @@ class Mapis:
             case "paper-equation":
                 return np.clip(distance, 0, 1)
         return np.full_like(distance, self.settings.constant_weight)
-
-
-def _natural_blend(kind: DepthKind) -> str:
-    return "none" if kind == "measured" else "exponential"
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:

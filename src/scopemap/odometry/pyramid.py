@@ -13,7 +13,6 @@ from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
 from scopemap.odometry.residuals import View
 
-CHANNELS = {"grey": ("grey",), "normalised": ("normalised",), "both": ("grey", "normalised")}
 _GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
 _SLOPE_SIGMA_PX = 1.5
 _NOISE_LEVEL = 2.0  # grey levels of local deviation below which an area counts as flat
@@ -23,14 +22,16 @@ def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool
     """Return the levels from `finest_level` (first) to the coarsest (last), each half the size of the one before.
 
     `trust_slope` says that the depth is good enough for tangent planes; predicted depth is not (its slopes follow the
-    paint of the tissue), and every point then counts as facing the camera.
+    paint of the tissue), and every point then counts as lying on a plane parallel to the image.
 
     Levels whose short side would fall below `min_side_px` are left out; the finest is always there. A frame without
     depth gives views that can only be tracked, not tracked against.
     """
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = frame.valid.astype(np.float32)
-    depth = np.full(grey.shape, np.nan, np.float32) if frame.depth_mm is None else frame.depth_mm
+    depth = np.full(grey.shape, np.nan, np.float32)
+    if frame.depth_mm is not None:
+        depth = np.where(frame.valid, frame.depth_mm, np.float32(np.nan))
     camera = frame.camera
     views: list[View] = []
     for level in range(settings.levels):
@@ -70,11 +71,8 @@ def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
 
 
 def _channels(grey: np.ndarray, weight: np.ndarray, settings: OdometrySettings) -> np.ndarray:
-    images = [
-        grey / _GREY_UNIT if name == "grey" else _normalised(grey, weight, settings.normalise_sigma_px)
-        for name in CHANNELS[settings.channels]
-    ]
-    return np.stack(images).astype(np.float32)
+    """Grey values and locally normalised grey values, (2, H, W) float32."""
+    return np.stack([grey / _GREY_UNIT, _normalised(grey, weight, settings.normalise_sigma_px)]).astype(np.float32)
 
 
 def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -33,9 +33,10 @@ class View(NamedTuple):
 
     Attributes
     ----------
-    channels : (C, H, W) float32, raw grey values or locally normalised ones.
+    channels : (C, H, W) float32, of which `Loss` says how each is compared.
     weight : (H, W) float32, 0 where a pixel must not be used.
-    slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = facing or unknown.
+    slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = parallel to the image,
+    or unknown.
     depth_mm : (H, W) float32, NaN = unknown (only the reference's is read).
     intrinsics : (4,) float64 fx, fy, cx, cy in px of this level.
     """
@@ -179,6 +180,8 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
             ky = loss.gamma * (3.0 * y / distance - my / lift)
             kz = loss.gamma * (3.0 * z / distance - mz / lift)
             for c in range(channels):
+                if loss.share[c] <= 0.0:
+                    continue
                 value, du, dv = _bilinear(current.channels[c], a, b, i, j)
                 shown = float(reference.channels[c, row, column])
                 k, free = 0.0, PARAMETERS - 2

@@ -14,9 +14,9 @@ import numpy as np
 from scopemap.config import OdometrySettings
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 from scopemap.odometry.dogleg import Options, Problem, Quadratic, minimise
-from scopemap.odometry.pyramid import CHANNELS
 from scopemap.odometry.residuals import PARAMETERS, Loss, View, normal_equations, residual_images
 
+_LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
 _MAD_TO_SIGMA = 1.4826
 _INLIER = 0.5
 
@@ -34,9 +34,9 @@ class Alignment:
 
     Attributes
     ----------
-    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level, in
-    local deviations where the normalised channel is compared, else in units of 32 grey levels.
-    inlier_share : share of the used pixels whose residual is below half such a unit.
+    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level, of the
+    normalised channel whatever was minimised, so in local deviations of the grey value.
+    inlier_share : share of the used pixels whose residual is below half a local deviation.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
     """
 
@@ -67,9 +67,8 @@ def align(reference: list[View], current: list[View], start: np.ndarray, setting
 
 
 def _loss(sigma: np.ndarray, settings: OdometrySettings) -> Loss:
-    lit = np.array([name == "grey" for name in CHANNELS[settings.channels]])
-    share = np.where(lit, settings.grey_share, 1.0)
-    return Loss(sigma, settings.huber, share, lit, settings.lamp_gamma)
+    share = {"grey": (1.0, 0.0), "normalised": (0.0, 1.0), "both": (settings.grey_share, 1.0)}[settings.channels]
+    return Loss(sigma, settings.huber, np.array(share), _LIT, settings.lamp_gamma)
 
 
 def _residuals(reference: View, current: View, motion: Motion, settings: OdometrySettings) -> np.ndarray:
@@ -84,7 +83,7 @@ def _align_level(
     loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
     least_weight = 0.5 * np.isfinite(start[0]).sum()
     free = np.array(
-        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.lit.any() else [])
+        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
     )
 
     def linearise(state: Motion) -> Quadratic:
