@@ -54,7 +54,9 @@ class DepthSettings(Settings):
     files_scale_mm: float | None = Field(None, gt=0, description="mm per unit of depth files; None: found or assumed")
     shading_median_mm: float = Field(35.0, gt=0, description="stated prior: median distance of tissue in frame 1, mm")
     shading_exponent: float = Field(0.6, gt=0, le=1, description="distance = k * brightness^-exponent")
-    max_depth_mm: float = Field(300.0, gt=0, description="depth beyond this is unknown, unless it is measured")
+    max_depth_mm: float = Field(
+        300.0, gt=0, description="depth beyond this is unknown, unless measured or stated by near-far"
+    )
 
 
 class MapisSettings(Settings):
@@ -144,8 +146,8 @@ class FusionSettings(Settings):
     """Volumetric fusion; voxel and truncation as Endo-Depth-and-Motion uses on the same kind of data."""
 
     enabled: bool = True
-    voxel_mm: float = Field(1.0, gt=0)
-    truncation_mm: float = Field(5.0, gt=0)
+    voxel_mm: float = Field(1.0, ge=0.05)
+    truncation_mm: float = Field(5.0, ge=0.05)
     max_depth_mm: float = Field(100.0, gt=0, description="depth beyond this is not fused")
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     min_weight: float = Field(1.5, ge=0, description="voxels with less weight give no surface")

@@ -17,7 +17,7 @@ import trimesh
 from scopemap.camera import PinholeCamera
 from scopemap.config import Config, DepthSettings
 from scopemap.datasets import Sequence
-from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth
+from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.flow import FlowEstimator, create_flow, pair_flow
@@ -77,13 +77,23 @@ class Estimators:
         )
 
     def reach_mm(self, settings: DepthSettings) -> float:
-        """Return how far depth may reach, mm: `max_depth_mm`, or what the files can hold where it is measured."""
+        """Return how far depth may reach, mm: as the settings say, or what the files can hold where it is measured."""
         measured_mm = self.depth.measured_reach_mm if isinstance(self.depth, FilesDepth) else None
-        return measured_mm or settings.max_depth_mm
+        return measured_mm or reach_mm(settings)
 
     def provenance(self) -> dict[str, str]:
         """Return names, versions and hashes of the parts, and what fixed the scale."""
-        parts = self.depth.provenance() | self.flow.provenance() | self.perceptual.provenance()
+        parts = self.depth.provenance()
+        others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance] = {
+            "flow": self.flow,
+            "perceptual": self.perceptual,
+        }
+        if self.anchor.reference.name == "depth-pro":
+            others["anchor"] = self.anchor.reference
+        for role, part in others.items():
+            # Several parts have weights and hashes: each says whose.
+            facts = part.provenance()
+            parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
         return parts | {"anchor": self.anchor.description}
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from scopemap.config import Config, FusionSettings
 from scopemap.datasets import Sequence
 from scopemap.errors import InputError
+from scopemap.masking import is_constant
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder
 
@@ -51,9 +52,10 @@ def reconstruct(
     started = time.perf_counter()
     estimators = Estimators.create(config, sequence)
     if out is not None:
+        _refuse_own_input(Path(out), sequence, config)
         prepare_folder(Path(out), overwrite=overwrite)
         observers = (DepthWriter(Path(out), estimators.reach_mm(config.depth)), *observers)
-    sequence, estimators = _with_best_camera(sequence, estimators)
+    sequence = _with_best_camera(sequence, estimators)
     distances = _Distances()
     observers = (distances, *observers)
     pipeline, clock = Pipeline(config, estimators), _Clock()
@@ -110,11 +112,11 @@ class _Distances:
 
 
 def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[Step]:
-    frames = iter(sequence)
+    frames = sequence.frames()
 
     def perceive_next() -> Percept | None:
-        item = clock.timed("read", next, frames, None)
-        return None if item is None else clock.timed("perceive", pipeline.perceive, item[0])
+        frame = clock.timed("read", next, frames, None)
+        return None if frame is None else clock.timed("perceive", pipeline.perceive, frame)
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="perceive") as ahead:
         coming: Future[Percept | None] = ahead.submit(perceive_next)
@@ -129,16 +131,24 @@ def _observed(step: Step, observers: tuple[Observer, ...]) -> FrameRecord:
     return FrameRecord.of(step)
 
 
-def _with_best_camera(sequence: Sequence, estimators: Estimators) -> tuple[Sequence, Estimators]:
-    """Take an unknown camera's focal length from Depth Pro, where it is in use anyway."""
+def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
+    """Raise `InputError` where the result would replace what the run reads."""
+    kind, _, folder = config.depth.backend.partition(":")
+    for source in [sequence.path, *([Path(folder)] if kind == "files" else [])]:
+        if source.resolve().is_relative_to(out.resolve()):
+            raise InputError(f"cannot write a run to {out}: its input {source} lies there; name another folder")
+
+
+def _with_best_camera(sequence: Sequence, estimators: Estimators) -> Sequence:
+    """Take an unknown camera's focal length from Depth Pro's view of the first lit frame, where it is in use anyway."""
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if sequence.calibrated or network is None:
-        return sequence, estimators
-    first, _ = next(iter(sequence))
-    focal_px = network.estimate(first).focal_px
-    if focal_px is None:
-        return sequence, estimators
-    return sequence.with_focal(focal_px, f"estimated: Depth Pro on frame {first.index}"), estimators
+        return sequence
+    first = next((frame for frame in sequence.frames() if not is_constant(frame.rgb)), None)
+    focal_px = None if first is None else network.estimate(first).focal_px
+    if first is None or focal_px is None:
+        return sequence
+    return sequence.with_focal(focal_px, f"estimated: Depth Pro on frame {first.index}")
 
 
 def _provenance(

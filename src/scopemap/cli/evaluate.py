@@ -131,6 +131,8 @@ def _mesh_figures(trajectory: Path, truth: Path, similarity: Similarity) -> dict
     from scopemap.evaluation.surface import compare_surfaces
 
     mesh = _read_mesh(mesh_file)
+    if not len(mesh.faces):  # a run that fused nothing still has poses to be measured
+        return dict.fromkeys(("mesh_accuracy_mm", "mesh_accuracy_p90_mm", "mesh_completeness_mm"), math.nan)
     mesh.vertices = similarity.transform_points(mesh.vertices)
     report = compare_surfaces(mesh, _read_mesh(truth_file))
     return {
@@ -147,7 +149,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # the readers of mesh files raise whatever their parsers raise
         raise InputError(f"cannot read the mesh {path}: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or mesh.area == 0:
+    if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"the mesh {path} holds no surface")
     return mesh
 

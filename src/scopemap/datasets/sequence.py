@@ -144,10 +144,15 @@ class Sequence:
 
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
+        for frame in self.frames():
+            yield frame, self._truth(frame.index)
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two."""
         found = 0
         for item in self.source.frames(self.selection):
             rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
-            yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name), self._truth(item.index)
+            yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
             found += 1
         if found < 2:
             raise InputError(f"reading {self.path}: {found} readable frame(s) in the selection, two are needed")

@@ -79,7 +79,7 @@ class AnchoredDepth:
     def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
         """Return metric depth (H, W) float32 in mm, NaN = unknown or not positive.
 
-        Depth that is not measured is NaN too beyond `settings.max_depth_mm`, where an estimate says nothing any more.
+        Depth that is not measured is NaN too beyond `reach_mm`, where an estimate says nothing any more.
         All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
         anchor.
         """
@@ -89,7 +89,7 @@ class AnchoredDepth:
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         if estimate.kind == "measured":
             return depth_mm
-        return np.where(depth_mm <= self._settings.max_depth_mm, depth_mm, np.float32(np.nan))
+        return np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
         """Fix the conversion; return this frame's depth (H, W) where it is the anchor's and not the conversion's."""
@@ -104,7 +104,7 @@ class AnchoredDepth:
             self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
         else:
             reference = self._reference.estimate(frame)
-            known = usable & (reference.values > 0) & (reference.values <= self._settings.max_depth_mm)
+            known = usable & (reference.values > 0) & (reference.values <= reach_mm(self._settings))
             if known.mean() < _LEAST_SHARE:
                 return None
             focal_px = reference.focal_px or frame.camera.fx
@@ -132,8 +132,7 @@ class AnchoredDepth:
         if estimate.kind == "depth":
             return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
         if self._settings.fit_shift:
-            farthest_mm = max(self._settings.max_depth_mm, *(self._settings.near_far_mm or (0.0,)))
-            return fit_affine_disparity(target.depth_mm, target.values, farthest_mm)
+            return fit_affine_disparity(target.depth_mm, target.values, reach_mm(self._settings))
         baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px)
         return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
 
@@ -146,6 +145,11 @@ class AnchoredDepth:
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
         return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"
+
+
+def reach_mm(settings: DepthSettings) -> float:
+    """Return how far predicted depth may reach, mm: a stated farthest tissue is believed beyond `max_depth_mm`."""
+    return max(settings.max_depth_mm, *(settings.near_far_mm or (0.0,)))
 
 
 def _check_range(settings: DepthSettings) -> None:

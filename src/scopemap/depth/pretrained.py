@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scopemap import weights
+from scopemap.checkpoints import REGISTRY
 from scopemap.errors import WeightsError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def load_pretrained(model_class: type[PreTrainedModel], model: str) -> tuple[Any
     from transformers import AutoConfig, AutoImageProcessor
 
     untyped: Any = model_class
-    folder = Path(model) if Path(model).is_dir() else weights.locate(model)
+    folder = Path(model) if _is_local(model) else weights.locate(model)
     try:
         found = AutoConfig.from_pretrained(folder, local_files_only=True).model_type
         wanted = untyped.config_class.model_type
@@ -46,8 +47,13 @@ def load_pretrained(model_class: type[PreTrainedModel], model: str) -> tuple[Any
     return network, processor, {"model": model, **_origin(folder, model)}
 
 
+def _is_local(model: str) -> bool:
+    """Return whether `model` is a folder; a name of the registry never is, whatever lies in the working directory."""
+    return model not in REGISTRY and Path(model).is_dir()
+
+
 def _origin(folder: Path, model: str) -> dict[str, str]:
     """Return the commit, if the model was pulled, and the hash of each file of weights."""
     hashes = {f"sha256 {file.name}": weights.sha256_of(file) for file in sorted(folder.glob("*.safetensors"))}
-    revision = "" if Path(model).is_dir() else weights.recorded_revision(model)
+    revision = "" if _is_local(model) else weights.recorded_revision(model)
     return ({"revision": revision} if revision else {}) | hashes

@@ -1,0 +1,106 @@
+"""Runs that must not pretend: no depth to start from, an input in the way, parts whose facts must not mix."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_phantom import FRAMES, with_true_depth
+
+from scopemap.config import Config
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.depth.anchor import reach_mm
+from scopemap.depth.mapis import Mapis
+from scopemap.errors import InputError, SettingsError
+from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.pipeline import Estimators, Pipeline
+from scopemap.runner import reconstruct
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("refusals") / "phantom"
+    write_phantom(PhantomSpec(scene="colon", frames=FRAMES, width=160, height=128, seed=2), target)
+    return target
+
+
+def _depth_files(folder: Path, values_mm: list[float]) -> Path:
+    folder.mkdir()
+    for index, value in enumerate(values_mm):
+        np.save(folder / f"{index:04d}_depth.npy", np.full((128, 160), value, np.float32))
+    return folder
+
+
+def test_without_any_depth_no_frame_counts_as_tracked(folder: Path, tmp_path: Path) -> None:
+    empty = _depth_files(tmp_path / "empty", [0.0] * FRAMES)
+    with pytest.raises(InputError, match="too little of its depth is known"):
+        reconstruct(open_sequence(folder), with_true_depth(empty))
+
+
+def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: Path) -> None:
+    late = _depth_files(tmp_path / "late", [0.0, 0.0] + [30.0] * (FRAMES - 2))
+    result = reconstruct(open_sequence(folder), with_true_depth(late))
+    status = [record.track.status for record in result.records]
+    assert status == ["lost", "lost", "initial"] + ["ok"] * (FRAMES - 3)
+
+
+@pytest.mark.parametrize("source", ["frames", "depth"])
+def test_a_run_never_overwrites_what_it_reads(folder: Path, tmp_path: Path, source: str) -> None:
+    out = tmp_path / "out"
+    reconstruct(open_sequence(folder), with_true_depth(folder), out=out)
+    kept = sorted(out.rglob("*"))
+    config = with_true_depth(out / "depth") if source == "depth" else with_true_depth(folder)
+    with pytest.raises(InputError, match=r"its input .* lies there"):
+        reconstruct(open_sequence(folder), config, out=out if source == "depth" else folder, overwrite=True)
+    assert sorted(out.rglob("*")) == kept
+
+
+def test_masked_pixels_are_not_linked(folder: Path) -> None:
+    config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
+    sequence = open_sequence(folder)
+    pipeline = Pipeline(config, Estimators.create(config, sequence))
+    percepts = [pipeline.perceive(frame) for frame in sequence.frames()]
+    assert not percepts[0].frame.valid.all()
+    for past, percept in itertools.pairwise(percepts):
+        assert percept.link is not None
+        np.testing.assert_array_equal(percept.link.consistent, past.frame.valid & percept.frame.valid)
+
+
+def test_measured_depth_needs_no_link(folder: Path) -> None:
+    config = with_true_depth(folder)
+    assert not Mapis(config.mapis).links("measured")
+    assert Mapis(config.mapis).links("depth")
+    sequence = open_sequence(folder)
+    pipeline = Pipeline(config, Estimators.create(config, sequence))
+    assert all(pipeline.perceive(frame).link is None for frame in sequence.frames())
+
+
+def test_facts_of_the_parts_do_not_overwrite_each_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = Config.load(settings={"networks.perceptual": "structure"})
+    estimators = Estimators.create(config, open_sequence(folder))
+    monkeypatch.setattr(estimators.flow, "provenance", lambda: {"flow": "raft", "sha256": "f"})
+    monkeypatch.setattr(estimators.perceptual, "provenance", lambda: {"perceptual": "lpips", "sha256": "p"})
+    facts = estimators.provenance()
+    assert (facts["flow"], facts["flow sha256"], facts["perceptual sha256"]) == ("raft", "f", "p")
+
+
+def test_frames_are_read_without_their_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(Sequence, "_truth", lambda self, index: asked.append(index))
+    sequence = open_sequence(folder)
+    assert [frame.index for frame in sequence.frames()] == list(range(FRAMES))
+    assert asked == []
+    assert len(list(sequence)) == FRAMES
+    assert asked == list(range(FRAMES))
+
+
+def test_a_stated_farthest_tissue_is_believed() -> None:
+    assert reach_mm(Config.load().depth) == 300.0
+    assert reach_mm(Config.load(settings={"depth.near_far_mm": (50, 400)}).depth) == 400.0
+
+
+def test_a_voxel_too_small_to_store_is_refused() -> None:
+    with pytest.raises(SettingsError, match="voxel_mm"):
+        Config.load(settings={"fusion.voxel_mm": 1e-5})
