@@ -82,6 +82,25 @@ def test_the_conversion_is_fitted_once_and_held() -> None:
     np.testing.assert_allclose(1 / second_mm - 1 / TRUTH_MM, 0.007, rtol=1e-2)
 
 
+def test_a_metric_anchor_is_asked_again_where_that_is_wanted() -> None:
+    reference = Metric()
+    anchor, fitted, depths = anchored(reference, anchor="depth-pro", reanchor_every=3), [], []
+    for index in range(7):
+        drifting = disparity(scale=0.07 * 1.1**index)
+        depths.append(np.nanmedian(anchor.depth_mm(drifting, frame(index))))
+        fitted.append(anchor.just_fitted)
+    assert fitted == [True, False, False, True, False, False, True]
+    np.testing.assert_allclose([depths[3], depths[6]], depths[0], rtol=1e-3)
+    assert depths[2] != pytest.approx(depths[0], rel=1e-2)
+
+
+def test_a_range_is_of_frame_1_and_never_asked_again() -> None:
+    anchor = anchored(near_far_mm=(10.0, 60.0), reanchor_every=1)
+    anchor.depth_mm(disparity(), frame(0))
+    anchor.depth_mm(disparity(), frame(1))
+    assert not anchor.just_fitted
+
+
 def test_without_shift_it_is_the_papers_baseline_and_frame_1_keeps_the_metric_depth() -> None:
     anchor = anchored(anchor="depth-pro", fit_shift=False)
     estimate, first = disparity(), frame()

@@ -179,6 +179,16 @@ def test_forget_cuts_the_chain_and_holds_the_scale() -> None:
     np.testing.assert_allclose(after.depth_mm, 1.5 * OTHER, rtol=1e-5)
 
 
+def test_an_anchored_frame_starts_the_chain_anew() -> None:
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
+    mapis.refine(DEPTH, "depth", CAMERA, None, None)
+    assert mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None).scale == pytest.approx(0.5, rel=1e-5)
+    anchored = mapis.refine(3 * OTHER, "depth", CAMERA, _link(), None, anchored=True)
+    np.testing.assert_array_equal(anchored.depth_mm, 3 * OTHER)
+    after = mapis.refine(OTHER, "depth", CAMERA, _link(), None)
+    assert after.scale == pytest.approx(3.0, rel=1e-5)
+
+
 def test_the_first_frame_is_its_raw_depth() -> None:
     refined = Mapis(Config().mapis).refine(DEPTH, "depth", CAMERA, None, None)
     np.testing.assert_array_equal(refined.depth_mm, DEPTH)

@@ -78,9 +78,9 @@ def _spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any
 def _called(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, note: Callable[..., None]) -> None:
     real = getattr(owner, name)
 
-    def watched(self: Any, *arguments: Any) -> Any:
+    def watched(self: Any, *arguments: Any, **options: Any) -> Any:
         note(*arguments)
-        return real(self, *arguments)
+        return real(self, *arguments, **options)
 
     monkeypatch.setattr(owner, name, watched)
 

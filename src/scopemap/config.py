@@ -46,6 +46,9 @@ class DepthSettings(Settings):
     anchor: Literal["auto", "near-far", "depth-pro", "shading"] = Field(
         "auto", description="metric anchor of frame 1; auto: near-far if given, else the depth's own mm, else shading"
     )
+    reanchor_every: int = Field(
+        0, ge=0, description="ask a metric anchor again every n-th frame (best a multiple of keyframe_every); 0: once"
+    )
     near_far_mm: tuple[float, float] | None = Field(None, description="nearest and farthest tissue in frame 1, mm")
     fit_shift: bool = Field(True, description="fit scale and shift to the anchor; False: the paper's baseline only")
     files_kind: Literal["auto", "disparity", "depth", "measured"] = Field(

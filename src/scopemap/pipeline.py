@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 
-from scopemap.camera import PinholeCamera
 from scopemap.config import Config, DepthSettings
 from scopemap.datasets import Sequence
 from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
@@ -37,13 +36,15 @@ class Percept:
     Attributes
     ----------
     frame : masked. raw_mm : (H, W) float32, anchored but not yet consistent, NaN = unknown. kind : of the estimate.
-    link : correspondence with the frame before it, None for the first.
+    link : correspondence with the frame before it, None for the first. anchored : whether the metric anchor was fitted
+    to this very frame.
     """
 
     frame: Frame
     raw_mm: np.ndarray
     kind: DepthKind
     link: Correspondence | None
+    anchored: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class Pipeline:
         raw_mm = self.estimators.anchor.depth_mm(estimate, shown)
         link = self._link(frame, estimate.kind)
         self._previous = frame
-        return Percept(frame, raw_mm, estimate.kind, link)
+        return Percept(frame, raw_mm, estimate.kind, link, self.estimators.anchor.just_fitted)
 
     def step(self, percept: Percept) -> Step:
         """Track a frame, make its depth consistent, fuse it."""
@@ -172,8 +173,9 @@ class Pipeline:
         return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
-        camera: PinholeCamera = percept.frame.camera
-        return self._mapis.refine(percept.raw_mm, percept.kind, camera, percept.link, T_current_previous)
+        camera = percept.frame.camera
+        raw_mm, kind, link = percept.raw_mm, percept.kind, percept.link
+        return self._mapis.refine(raw_mm, kind, camera, link, T_current_previous, anchored=percept.anchored)
 
     def _motion(self, track: Track) -> np.ndarray | None:
         """Motion from the previous frame to this one, None unless both poses are known."""

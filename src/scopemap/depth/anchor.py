@@ -50,7 +50,9 @@ class AnchoredDepth:
     frame (`depth-pro`), the shading prior (`shading`), or (`auto`) the range if one is given, else the estimate's own
     millimetres if it has them, else shading. Measured depth is never touched.
 
-    reference : the estimator that is asked, once, where the anchor is neither the range nor the estimate itself.
+    `settings.reanchor_every` asks the reference again every so many frames: a metric network then bounds the drift.
+
+    reference : the estimator that is asked where the anchor is neither the range nor the estimate itself.
     Raises `SettingsError` where `near-far` is asked for and no range, or an impossible one, is given.
     """
 
@@ -60,6 +62,7 @@ class AnchoredDepth:
         self._reference = reference
         self._conversion: AffineDisparity | DepthScale | None = None
         self._description = "not anchored: no usable frame yet"
+        self._frames_held = 0
 
     @property
     def description(self) -> str:
@@ -70,6 +73,11 @@ class AnchoredDepth:
     def reference(self) -> DepthEstimator:
         """The estimator that is asked where the anchor is neither the range nor the estimate itself."""
         return self._reference
+
+    @property
+    def just_fitted(self) -> bool:
+        """Whether the frame that came last fixed the conversion, so that its depth needs no scale from the past."""
+        return self._conversion is not None and self._frames_held == 0
 
     @property
     def conversion(self) -> AffineDisparity | DepthScale | None:
@@ -83,13 +91,20 @@ class AnchoredDepth:
         All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
         anchor.
         """
-        first_mm = self._anchor(estimate, frame) if self._conversion is None else None
+        self._frames_held += 1
+        first_mm = self._anchor(estimate, frame) if self._is_due(estimate) else None
         if self._conversion is None:
             return np.full(estimate.values.shape, np.nan, dtype=np.float32)
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         if estimate.kind == "measured":
             return depth_mm
         return np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
+
+    def _is_due(self, estimate: DepthEstimate) -> bool:
+        if self._conversion is None:
+            return True
+        every = self._settings.reanchor_every
+        return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
         """Fix the conversion; return this frame's depth (H, W) where it is the anchor's and not the conversion's."""
@@ -112,6 +127,7 @@ class AnchoredDepth:
             self._conversion = self._fitted(estimate, target)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
             first_mm = None if self._settings.fit_shift else reference.values
+        self._frames_held = 0
         self._description = self._described(source, estimate, frame)
         return first_mm
 

@@ -65,13 +65,18 @@ class Mapis:
         camera: PinholeCamera,
         link: Correspondence | None,
         T_current_previous: np.ndarray | None,
+        *,
+        anchored: bool = False,
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
         `raw_mm` is (H, W) float32; `link` is None for the first frame. With a motion the previous depth is moved by
-        it; with None its values are carried unchanged, as in the paper.
+        it; with None its values are carried unchanged, as in the paper. A frame that was just `anchored` to a metric
+        depth takes nothing from the past: the chain of scales starts anew with it.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
+        if anchored:
+            self._scale, link = 1.0, None
         warped_mm = self._warped(camera, link, T_current_previous)
         if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
