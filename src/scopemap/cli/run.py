@@ -50,7 +50,9 @@ def run(
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Calibration: OpenCV YAML, or text 'fx fy cx cy [k1 k2 p1 p2 k3]'."),
+        typer.Option(
+            metavar="FILE", help="Calibration: OpenCV YAML, or text 'fx fy cx cy', then k1 k2 p1 p2 k3 if any."
+        ),
     ] = None,
     fov: Annotated[
         float, typer.Option(min=5.0, max=170.0, help="Horizontal field of view, degrees, where the camera is unknown.")
