@@ -27,7 +27,7 @@ HEADER = (
     "| run | frames tracked | alignment | ATE | rotation mean / max | 10: mm / deg | TLR | mesh to truth | ms |\n"
     "|---|---|---|---|---|---|---|---|---|"
 )
-LIGHT = {"networks.perceptual": "structure"}
+LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
 NO_SURFACE = {"fusion.enabled": False}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "default": {},

@@ -306,7 +306,7 @@ def test_bad_input_is_one_line(
         (("--near-far", "80:10"), "nearest must be positive and smaller"),
         (("--depth", "sonar"), "unknown depth 'sonar'"),
         (("--depth", "files:/nowhere"), "/nowhere is no folder"),
-        (("--flow", "farneback"), "unknown flow 'farneback': choose one of raft-small"),
+        (("--flow", "farneback"), "unknown flow 'farneback': choose one of auto"),
         (("--dataset", "hamlyn"), "unknown data set 'hamlyn': choose one of c3vd"),
         (("--dataset", "video"), "it is a folder"),
         (("--camera", "/nowhere.yaml"), "cannot read the calibration"),

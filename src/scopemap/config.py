@@ -87,7 +87,10 @@ class MapisSettings(Settings):
 class NetworkSettings(Settings):
     """Flow and perceptual networks."""
 
-    flow: str = Field("dis", description="raft-small | raft-large | dis | none")
+    flow: str = Field(
+        "auto",
+        description="raft-small | raft-large | dis | none | auto: raft-small if at hand, else dis",
+    )
     flow_iterations: int = Field(12, ge=1, description="RAFT's refinement steps")
     perceptual: Literal["auto", "lpips", "structure"] = Field(
         "auto", description="lpips: AlexNet; structure: local structural similarity, no weights; auto: what is at hand"
@@ -221,6 +224,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "smoothing.method": "wema",
     },
     "realtime": {
+        "networks.flow": "dis",
         "networks.perceptual": "structure",
         "odometry.max_iterations": 15,
         "fusion.voxel_mm": 1.5,

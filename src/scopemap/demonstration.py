@@ -34,8 +34,8 @@ from scopemap.trajectory import read_trajectory
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
 """The phantom of the demonstration."""
 
-# LPIPS would be used where its weights happen to lie; figures must not depend on that.
-_WITHOUT_WEIGHTS = {"networks.perceptual": "structure"}
+# RAFT and LPIPS would be used where their weights happen to lie; figures must not depend on that.
+_WITHOUT_WEIGHTS = {"networks.flow": "dis", "networks.perceptual": "structure"}
 _DRAWN_FRAMES = 4
 _MISSING = float("nan")
 

@@ -63,7 +63,10 @@ def run(
     depth: Annotated[
         str | None, typer.Option(help="shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files).")
     ] = None,
-    flow: Annotated[str | None, typer.Option(help="dis, raft-small, raft-large or none.")] = None,
+    flow: Annotated[
+        str | None,
+        typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small if at hand, else dis."),
+    ] = None,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
     ] = None,
