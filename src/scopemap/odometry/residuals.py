@@ -12,8 +12,8 @@ normalised channel is blind to light: it has neither gain nor bias nor fall-off.
 this order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference,
 gain, bias.
 
-One thread on purpose: a level is a few milliseconds of work, the other core has the networks and the fusion to do, and
-on a busy machine waking threads some fifty times a frame costs more than it saves (BENCHMARK.md).
+One thread on purpose: a pass is a few milliseconds of work at most, the other core has the networks to do, and waking
+threads some fifty times a frame was many times slower than one thread on a busy machine.
 """
 
 from __future__ import annotations
