@@ -1,9 +1,10 @@
 """Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
 
 Order of precedence: defaults < preset < TOML file < single settings (`--set odometry.huber=2`); the preset itself may
-be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its
-constants (section "WEMA-RTDL"), so values are ours: those of the tracker were chosen by trial on the sequences of
-BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that were not searched.
+be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282;
+it publishes none of its constants (section "WEMA-RTDL"), so values are ours: those of the tracker were chosen by trial
+on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that
+were not searched.
 """
 
 from __future__ import annotations
