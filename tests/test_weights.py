@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,17 +49,17 @@ def _forbidden(*args: object, **kwargs: object) -> None:
 
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
-    """A hub that serves these files at commit "c0ffee"."""
+    """A hub that serves these files; its newest commit is "c0ffee"."""
     served = {"config.json": b"{}", "model.safetensors": b"weights", "extra/part.safetensors": b"more"}
 
     def download(repo: str, *, revision: str, local_dir: Path, allow_patterns: list[str]) -> None:
-        assert revision == "c0ffee"
+        assert revision == (weights.find(repo).revision or "c0ffee")
         for name, content in served.items():
             path = Path(local_dir) / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
 
-    def model_info(self: object, repo: str, revision: str | None) -> SimpleNamespace:
+    def model_info(self: object, repo: str) -> SimpleNamespace:
         return SimpleNamespace(sha="c0ffee")
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
@@ -114,14 +115,24 @@ def test_pull_fetches_checks_and_records(folder: Path, monkeypatch: pytest.Monke
     assert record["sha256"] == hashlib.sha256(CONTENT).hexdigest()
 
 
-def test_unpinned_repository_is_held_to_its_first_pull(folder: Path, hub: dict[str, bytes]) -> None:
-    assert not weights.is_present("depth-pro")
-    place = weights.pull("depth-pro")
-    assert weights.recorded_revision("depth-pro") == "c0ffee"
-    assert weights.locate("apple/DepthPro-hf") == place
+@pytest.mark.parametrize(
+    ("name", "revision"),
+    [("depth-pro", checkpoints.find("depth-pro").revision), ("someone/their-depth", "c0ffee")],
+)
+def test_repository_is_held_to_its_first_pull(folder: Path, hub: dict[str, bytes], name: str, revision: str) -> None:
+    assert not weights.is_present(name)
+    place = weights.pull(name)
+    assert weights.recorded_revision(name) == revision
+    assert weights.locate(name) == weights.locate(checkpoints.find(name).location) == place
     (place / "model.safetensors").write_bytes(b"WEIGHTS")
     with pytest.raises(WeightsError, match="damaged"):
-        weights.locate("depth-pro")
+        weights.locate(name)
+
+
+def test_every_registered_repository_is_pinned_by_revision() -> None:
+    hub = [checkpoint for checkpoint in REGISTRY.values() if checkpoint.source == "hub"]
+    assert {checkpoint.name for checkpoint in hub} == {"depth-anything", "depth-pro"}
+    assert all(re.fullmatch(r"[0-9a-f]{40}", checkpoint.revision) for checkpoint in hub)
 
 
 def test_pinned_repository_refuses_other_content(folder: Path, hub: dict[str, bytes]) -> None:

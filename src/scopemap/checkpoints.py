@@ -27,7 +27,7 @@ class Checkpoint:
     source : where it comes from: the Hugging Face hub, torchvision's weights enums, or the user's own hands.
     location : hub repository, torchvision's name of the weights, or where to fetch them by hand.
     files : file below the weights folder to its SHA-256 or that hash's leading digits; empty = recorded when pulled.
-    revision : commit of the hub repository; "" = the newest at the first pull, recorded then.
+    revision : commit of the hub repository; "" = the newest at the first pull, recorded then (the user's own choices).
     """
 
     name: str
@@ -122,6 +122,7 @@ _ALL = (
         place="depth-pro",
         source="hub",
         location="apple/DepthPro-hf",
+        revision="de816c8ce7168afcb231f96d501d72b869d0beda",
     ),
 )
 REGISTRY: dict[str, Checkpoint] = {checkpoint.name: checkpoint for checkpoint in _ALL}

@@ -185,7 +185,7 @@ def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
     from huggingface_hub.utils import disable_progress_bars, enable_progress_bars
 
     (enable_progress_bars if progress else disable_progress_bars)()
-    commit = HfApi().model_info(checkpoint.location, revision=checkpoint.revision or None).sha
+    commit = checkpoint.revision or HfApi().model_info(checkpoint.location).sha
     snapshot_download(
         checkpoint.location,
         revision=commit,
