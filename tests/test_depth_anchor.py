@@ -192,3 +192,20 @@ def test_constant_disparity_is_refused() -> None:
 def test_impossible_ranges_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         anchored(**values)
+
+
+@pytest.mark.parametrize(("factor", "nearest_mm"), [(30.0, 1000 / 30), (100.0, 10.0), (1000.0, 1.0)])
+def test_a_factor_divides_and_nothing_else_is_fitted(factor: float, nearest_mm: float) -> None:
+    """The paper's ablation without Depth Pro: depth is inverse to disparity, or proportional to predicted depth."""
+    seen = TRUTH_MM[1:]
+    inverse = DepthEstimate((7.0 / TRUTH_MM).astype(np.float32), "disparity")
+    for estimate in (inverse, DepthEstimate(0.2 * TRUTH_MM, "depth")):
+        anchor = anchored(anchor="factor", factor=factor, backend="elsewhere", max_depth_mm=1e4)
+        depth_mm = anchor.depth_mm(estimate, frame())
+        np.testing.assert_allclose(depth_mm, TRUTH_MM * (nearest_mm / seen.min()), rtol=1e-5)
+        assert "arbitrary" in anchor.description
+
+
+def test_a_factor_needs_something_positive() -> None:
+    with pytest.raises(InputError, match="positive"):
+        anchored(anchor="factor").depth_mm(DepthEstimate(np.zeros((40, 60), np.float32), "disparity"), frame())

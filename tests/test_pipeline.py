@@ -22,7 +22,7 @@ from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
-from scopemap.odometry import Tracker
+from scopemap.odometry import Track, Tracker
 from scopemap.pipeline import Estimators, Step
 from scopemap.trajectory import read_trajectory
 
@@ -117,8 +117,38 @@ def test_truth_is_never_handed_to_an_estimator(folder: Path, monkeypatch: pytest
     assert len(spies[0].seen) == len(tracked) == FRAMES
     for frame in [*spies[0].seen, *tracked]:
         assert type(frame) is Frame
-        assert frame.depth_mm is None
         assert frame.T_world_camera is None
+    assert all(frame.depth_mm is None for frame in spies[0].seen)
+
+
+def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
+    """It gets the same masked frames with their raw depth, and its word is final: lost frames stay lost."""
+
+    class Standing:
+        """Believes that the camera never moves, and loses every third frame."""
+
+        def __init__(self) -> None:
+            self.adopted: list[int] = []
+
+        def track(self, frame: Frame) -> Track:
+            assert frame.depth_mm is not None
+            assert np.isfinite(frame.depth_mm).any()
+            status = "initial" if frame.index == 0 else "lost" if frame.index % 3 == 2 else "ok"
+            return Track(frame.index, status, "", np.eye(4), 0)
+
+        def wants_keyframe(self) -> bool:
+            return True
+
+        def adopt(self, frame: Frame, *, measured: bool) -> bool:
+            self.adopted.append(frame.index)
+            return measured
+
+    tracker = Standing()
+    result = reconstruct(open_sequence(folder), with_true_depth(folder), tracker=tracker)
+    lost = [record.index for record in result.lost]
+    assert lost == [index for index in range(FRAMES) if index % 3 == 2]
+    assert tracker.adopted == [index for index in range(FRAMES) if index not in lost]
+    np.testing.assert_array_equal(result.trajectory.T_world_camera, np.tile(np.eye(4), (FRAMES, 1, 1)))
 
 
 def test_removing_the_truth_changes_nothing(folder: Path, tmp_path: Path) -> None:

@@ -45,8 +45,13 @@ class DepthSettings(Settings):
 
     backend: str = Field("shading", description="shading | depth-anything | depth-pro | files:FOLDER")
     model: str = Field("", description="hub id or local folder for the network back ends; empty: the pinned default")
-    anchor: Literal["auto", "near-far", "depth-pro", "shading"] = Field(
+    anchor: Literal["auto", "near-far", "depth-pro", "shading", "factor"] = Field(
         "auto", description="metric anchor of frame 1; auto: near-far if given, else the depth's own mm, else shading"
+    )
+    factor: float = Field(
+        30.0,
+        gt=0,
+        description="anchor = factor: nearest tissue of frame 1 at 1000 mm over this (an ablation)",
     )
     reanchor_every: int = Field(
         0, ge=0, description="ask a metric anchor again every n-th frame (best a multiple of keyframe_every); 0: once"

@@ -25,7 +25,7 @@ from scopemap.fusion import TsdfVolume
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import pull
 from scopemap.masking import Masker, is_constant
-from scopemap.odometry import Track, Tracker, create_smoother
+from scopemap.odometry import FrameTracker, Track, Tracker, create_smoother
 from scopemap.perceptual import PerceptualDistance, create_perceptual
 
 
@@ -99,13 +99,16 @@ class Estimators:
 
 
 class Pipeline:
-    """One run over one sequence; frames go through `perceive` and `step` in order, each once."""
+    """One run over one sequence; frames go through `perceive` and `step` in order, each once.
 
-    def __init__(self, config: Config, estimators: Estimators) -> None:
+    `tracker` takes the place of ours, which `config.odometry` describes: for baselines and others' odometry.
+    """
+
+    def __init__(self, config: Config, estimators: Estimators, tracker: FrameTracker | None = None) -> None:
         self.config = config
         self.estimators = estimators
         self._masker = Masker(config.mask)
-        self._tracker = Tracker(config.odometry)
+        self._tracker = tracker or Tracker(config.odometry)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
         self._volume = TsdfVolume(config.fusion)
@@ -130,7 +133,7 @@ class Pipeline:
     def step(self, percept: Percept) -> Step:
         """Track a frame, make its depth consistent, fuse it."""
         refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
-        track = self._tracker.track(percept.frame)
+        track = self._tracker.track(replace(percept.frame, depth_mm=percept.raw_mm))
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
             known = percept if track.status != "lost" else replace(percept, link=None)

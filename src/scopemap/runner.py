@@ -19,6 +19,7 @@ from scopemap.config import Config, FusionSettings
 from scopemap.datasets import Sequence
 from scopemap.errors import InputError
 from scopemap.masking import is_constant
+from scopemap.odometry import FrameTracker
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder
 
@@ -35,6 +36,7 @@ def reconstruct(
     out: Path | str | None = None,
     overwrite: bool = False,
     observers: tuple[Observer, ...] = (),
+    tracker: FrameTracker | None = None,
 ) -> Reconstruction:
     """Turn a sequence into poses, depth and a surface.
 
@@ -45,6 +47,7 @@ def reconstruct(
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
     observers : called with each `Step` as it is done.
+    tracker : odometry that takes the place of ours; None: as `config.odometry` says.
 
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
     """
@@ -58,7 +61,7 @@ def reconstruct(
     sequence = _with_best_camera(sequence, estimators)
     distances = _Distances()
     observers = (distances, *observers)
-    pipeline, clock = Pipeline(config, estimators), _Clock()
+    pipeline, clock = Pipeline(config, estimators, tracker), _Clock()
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")

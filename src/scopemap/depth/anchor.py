@@ -14,11 +14,12 @@ import numpy as np
 from scopemap.config import DepthSettings
 from scopemap.depth.baseline import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
-from scopemap.errors import SettingsError
+from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 
 # A frame with less that has both an estimate and an anchor cannot fix a scale: the next one is tried.
 _LEAST_SHARE = 0.02
+_FACTOR_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class AnchoredDepth:
 
     The first frame with enough usable pixels fixes the conversion, which is held for all later frames.
     `settings.anchor` chooses what it is fitted to: a given range (`near-far`), a metric network's estimate of that
-    frame (`depth-pro`), the shading prior (`shading`), or (`auto`) the range if one is given, else the estimate's own
-    millimetres if it has them, else shading. Measured depth is never touched.
+    frame (`depth-pro`), the shading prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if one is
+    given, else the estimate's own millimetres if it has them, else shading. Measured depth is never touched.
 
     `settings.reanchor_every` asks the reference again every so many frames: a metric network then bounds the drift.
 
@@ -115,6 +116,8 @@ class AnchoredDepth:
         source = self._source(estimate)
         if source == "own":
             self._conversion = DepthScale(1.0)
+        elif source == "factor":
+            self._conversion = self._by_factor(estimate, usable)
         elif source == "near-far":
             self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
         else:
@@ -131,13 +134,25 @@ class AnchoredDepth:
         self._description = self._described(source, estimate, frame)
         return first_mm
 
-    def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "reference"]:
+    def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
         anchor = self._settings.anchor
         if estimate.kind == "measured" or anchor == self._settings.backend:
             return "own"
+        if anchor == "factor":
+            return "factor"
         if anchor == "near-far" or (anchor == "auto" and self._settings.near_far_mm is not None):
             return "near-far"
         return "own" if anchor == "auto" and estimate.kind == "depth" else "reference"
+
+    def _by_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
+        """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
+        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.factor
+        positive = values[values > 0]
+        if not positive.size:
+            raise InputError("anchoring depth by a factor: no pixel of the first usable frame has a positive value")
+        if estimate.kind == "disparity":
+            return AffineDisparity(1 / (nearest_mm * float(positive.max())), 0.0)
+        return DepthScale(nearest_mm / float(positive.min()))
 
     def _range_target(self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame) -> _Target:
         values = estimate.values[usable]
@@ -157,6 +172,8 @@ class AnchoredDepth:
             return "measured depth"
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
+        if source == "factor":
+            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.factor:g}"
         name = self._settings.backend if source == "own" else self._reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"

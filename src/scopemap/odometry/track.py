@@ -1,11 +1,13 @@
-"""Track: what tracking says about one frame."""
+"""Track: what tracking says about one frame; FrameTracker: whatever can say it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
+
+from scopemap.frame import Frame
 
 Status = Literal["initial", "ok", "lost"]
 
@@ -35,3 +37,19 @@ class Track:
     inlier_share: float = float("nan")
     overlap: float = float("nan")
     iterations: int = 0
+
+
+class FrameTracker(Protocol):
+    """Says where the camera was, frame by frame, in order; `Tracker` is ours, the baselines' follow the same calls."""
+
+    def track(self, frame: Frame) -> Track:
+        """Return the pose of a frame, whose `depth_mm` is what is known of its depth so far, or say why there is none.
+
+        The first usable frame is "initial" and fixes the world.
+        """
+
+    def wants_keyframe(self) -> bool:
+        """Return whether the frame that was tracked last should become a reference for those to come."""
+
+    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+        """Make a tracked frame, with its refined depth and its pose, the reference; False where it cannot be one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,8 @@ class Tracker:
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
         if self._keyframe is None:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
-        pyramid = build_pyramid(frame, self.settings)
+        # The keyframe's points are moved: the depth of the frame itself has no say.
+        pyramid = build_pyramid(replace(frame, depth_mm=None), self.settings)
         alignment = self._best(pyramid)
         T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
         trouble = self._trouble(alignment, T_world_camera)

@@ -1,0 +1,1 @@
+"""Methods side by side on the same sequences: plans, resumable runs, scores, tables, figures."""

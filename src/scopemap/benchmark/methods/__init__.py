@@ -1,0 +1,5 @@
+"""Ours and the baselines, behind one signature."""
+
+from scopemap.benchmark.methods.method import Method, Task
+
+__all__ = ["Method", "Task"]

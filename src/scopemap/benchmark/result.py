@@ -1,0 +1,68 @@
+"""RunResult: what one method reached on one sequence, as it is kept in `result.json` of the run's folder."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from scopemap.errors import InputError
+
+FILE_NAME = "result.json"
+Status = Literal["done", "failed"]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One row of the benchmark.
+
+    Attributes
+    ----------
+    sequence, method, seed : what was run; names as the plan gives them.
+    status : "failed" where the method died; `error` then says how, in one line.
+    figures : groups of figures by name: "poses" (the keys of `PoseReport`), "paper" (`PaperReport`), "depth",
+        "consistency", "surface", and one group per named protocol. A group that could not be measured is absent, a
+        figure that could not be is NaN (null in the file).
+    timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; the only part that two runs of
+        the same plan do not share.
+    facts : where it was run and with what: machine, commit, versions, settings, alignment, quality of the truth.
+    """
+
+    sequence: str
+    method: str
+    seed: int = 0
+    status: Status = "done"
+    error: str = ""
+    figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    timing: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def figure(self, group: str, name: str) -> float:
+        """Return one figure; NaN where it is absent or could not be measured."""
+        value = self.figures.get(group, {}).get(name)
+        return float(value) if isinstance(value, int | float) else math.nan
+
+    def save(self, folder: Path) -> None:
+        """Write `result.json`; the file appears whole or not at all."""
+        draft = Path(folder) / f"{FILE_NAME}.part"
+        draft.write_text(json.dumps(_nan_to_null(asdict(self)), indent=2) + "\n", encoding="utf-8")
+        draft.replace(Path(folder) / FILE_NAME)
+
+    @classmethod
+    def load(cls, folder: Path) -> RunResult:
+        """Read `result.json`; raises `InputError` where it is missing or cannot be read."""
+        path = Path(folder) / FILE_NAME
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"cannot read the result of a benchmark run {path}: {error}") from None
+
+
+def _nan_to_null(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _nan_to_null(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_nan_to_null(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
