@@ -105,7 +105,48 @@ def test_origin_puts_the_first_pose_onto_the_first_and_none_moves_nothing() -> N
 
 def test_unknown_mode_and_unequal_lengths_are_refused() -> None:
     poses = random_poses(np.random.default_rng(4))
-    with pytest.raises(AlignmentError, match="choose none, origin, se3 or sim3"):
+    with pytest.raises(AlignmentError, match="choose none, origin, se3, sim3 or scale"):
         align_trajectories(poses, poses, "sim4")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="reference"):
         align_trajectories(poses, poses[1:], "se3")
+
+
+@few
+@given(seeds)
+def test_scale_alone_is_that_of_the_sim3_fit_and_nothing_turns(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    estimated, reference = random_poses(rng), random_poses(rng)
+    aligned, similarity = align_trajectories(estimated, reference, "scale")
+    _, sim3 = align_trajectories(estimated, reference, "sim3")
+    assert similarity.scale == sim3.scale
+    np.testing.assert_array_equal(similarity.singular_values, sim3.singular_values)
+    np.testing.assert_array_equal(aligned[:, :3, :3], estimated[:, :3, :3])
+    np.testing.assert_allclose(aligned[:, :3, 3], sim3.scale * estimated[:, :3, 3])
+
+
+@few
+@given(seeds, st.sampled_from(["se3", "sim3", "scale"]))
+def test_the_first_frames_alone_decide_the_fit_and_all_are_moved(seed: int, mode: str) -> None:
+    rng = np.random.default_rng(seed)
+    estimated, reference = random_poses(rng), random_poses(rng)
+    aligned, similarity = align_trajectories(estimated, reference, mode, first=5)  # type: ignore[arg-type]
+    _, alone = align_trajectories(estimated[:5], reference[:5], mode)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(similarity.t, alone.t)
+    np.testing.assert_array_equal(aligned, alone.transform_poses(estimated))
+    everywhere = align_trajectories(estimated, reference, mode, first=len(estimated) + 7)[0]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(everywhere, align_trajectories(estimated, reference, mode)[0])  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_fitted_is_refused() -> None:
+    rng = np.random.default_rng(5)
+    poses = random_poses(rng)
+    for mode in ("none", "origin"):
+        with pytest.raises(AlignmentError, match=f"'{mode}' fits none"):
+            align_trajectories(poses, poses, mode, first=5)  # type: ignore[arg-type]
+    with pytest.raises(AlignmentError, match="at least 3"):
+        align_trajectories(poses, poses, "se3", first=2)
+    poses[:6, :3, 3] = np.arange(6)[:, None] * np.array([1.0, 2.0, 3.0])
+    for mode in ("se3", "sim3", "scale"):
+        with pytest.raises(AlignmentError, match=r"on one line.*singular values"):
+            align_trajectories(poses, poses, mode, first=6)  # type: ignore[arg-type]
+        assert align_trajectories(poses, poses, mode)[1].scale == pytest.approx(1)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import pytest
 import trimesh
 import typer
 from sample_trajectories import as_trajectory, vector_a, write_c3vd, write_run
+from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
+from scopemap import Config, open_sequence, reconstruct
 from scopemap.cli.evaluate import evaluate
-from scopemap.errors import AlignmentError, InputError
+from scopemap.errors import AlignmentError, InputError, SettingsError
 from scopemap.geometry.align import align_trajectories
 from scopemap.trajectory import path_length_mm, write_kitti, write_tum
 
@@ -21,6 +24,10 @@ KEYS = [
     *("frames", "tracked", "align", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
     *("rotation_mean_deg", "rotation_max_deg", "rotation_unaligned_mean_deg", "rotation_unaligned_max_deg"),
     *("rpe_1_mm", "rpe_1_deg", "rpe_10_mm", "rpe_10_deg", "tlr"),
+    *("ate_median_mm", "ate_max_mm", "rpe_10mm_path_mm", "rpe_10mm_path_deg"),
+    *("ate_below_1_mm_percent", "ate_below_2_mm_percent", "ate_below_5_mm_percent"),
+    *("rotation_below_1_deg_percent", "rotation_below_2_deg_percent", "rotation_below_5_deg_percent"),
+    *("coverage", "reference_frames", "longest_tracked", "frames_until_loss"),
 ]
 
 
@@ -43,7 +50,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 )
 def test_json_has_the_keys_and_the_known_figures(folders: tuple[Path, Path], align: str, ate: float) -> None:
     figures = json.loads(run(folders[0], "--truth", folders[1], "--align", align, "--json").stdout)
-    assert list(figures) == KEYS
+    assert list(figures) == [*KEYS, "sources"]
     assert figures["align"] == align
     assert figures["ate_rmse_mm"] == pytest.approx(ate, abs=2e-6)
     assert figures["frames"] == 60
@@ -58,7 +65,7 @@ def test_sim3_is_the_default_and_the_table_says_so(folders: tuple[Path, Path]) -
 
 def test_paper_units_are_radians(folders: tuple[Path, Path]) -> None:
     figures = json.loads(run(folders[0], "--truth", folders[1], "--json", "--paper-units").stdout)
-    assert list(figures) == [*KEYS, "paper"]
+    assert list(figures) == [*KEYS, "paper", "sources"]
     assert np.degrees(figures["paper"]["r_avg_rad"]) == pytest.approx(figures["rotation_mean_deg"])
     assert figures["paper"]["t_fin_mm"] == pytest.approx(0.225936, abs=2e-6)
     assert "R_avg +- std (rad)" in run(folders[0], "--truth", folders[1], "--paper-units").stdout
@@ -114,7 +121,9 @@ def test_mesh_is_moved_by_the_alignment_of_the_trajectory(tmp_path: Path) -> Non
     larger.vertices = (larger.vertices - similarity.t) @ similarity.R / similarity.scale
     larger.export(run_folder / "mesh.ply")
     figures = json.loads(run(run_folder, "--truth", truth_folder, "--json").stdout)
-    assert list(figures) == [*KEYS, "mesh_accuracy_mm", "mesh_accuracy_p90_mm", "mesh_completeness_mm"]
+    mesh_keys = ["mesh_accuracy_mm", "mesh_accuracy_p90_mm", "mesh_completeness_mm", "surface"]
+    assert list(figures) == [*KEYS, *mesh_keys, "sources"]
+    assert figures["surface"]["f_2mm"] == pytest.approx(1.0)
     assert figures["mesh_accuracy_mm"] == pytest.approx(1.0, abs=0.02)
     assert figures["mesh_accuracy_p90_mm"] == pytest.approx(1.0, abs=0.05)
     assert figures["mesh_completeness_mm"] == pytest.approx(1.0, abs=0.02)
@@ -128,3 +137,61 @@ def test_refusals(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     assert isinstance(run(tmp_path / "none", "--truth", folders[1], code=1).exception, InputError)
     assert "sim4" in run(folders[0], "--truth", folders[1], "--align", "sim4", code=2).output
     run(folders[0], code=2)
+
+
+def test_csv_is_one_figure_a_line_and_the_same_as_json(folders: tuple[Path, Path]) -> None:
+    given = (folders[0], "--truth", folders[1], "--protocol", "evo")
+    rows = dict(csv.reader(run(*given, "--csv").stdout.splitlines()))
+    figures = json.loads(run(*given, "--json").stdout)
+    assert float(rows["ate_rmse_mm"]) == pytest.approx(figures["ate_rmse_mm"])
+    assert rows["align"] == "sim3"
+    assert float(rows["evo.evo_sim3_ape_rmse_mm"]) == pytest.approx(figures["evo"]["evo_sim3_ape_rmse_mm"])
+    assert "0.308821" in rows["ate_rmse_mm"]
+
+
+def test_protocols_keep_their_own_names(folders: tuple[Path, Path]) -> None:
+    figures = json.loads(run(folders[0], "--truth", folders[1], "--json", "--protocol", "af").stdout)
+    assert figures["af"]["af_ate_mean_mm"] == pytest.approx(0.177045, abs=1e-6)
+    assert "5 frames" in figures["af"]["description"]
+    table = run(folders[0], "--truth", folders[1], "--protocol", "af").stdout
+    assert "af_ate_mean_mm" in table
+    refused = run(folders[0], "--truth", folders[1], "--protocol", "afs", code=1).exception
+    assert isinstance(refused, SettingsError)
+    assert "endogslam" in str(refused)
+
+
+def test_alignment_by_scale_and_on_the_first_frames(folders: tuple[Path, Path]) -> None:
+    scale = json.loads(run(folders[0], "--truth", folders[1], "--align", "scale", "--json").stdout)
+    assert scale["ate_rmse_mm"] == pytest.approx(17.469604, abs=2e-6)
+    every = json.loads(run(folders[0], "--truth", folders[1], "--json").stdout)
+    first = json.loads(run(folders[0], "--truth", folders[1], "--align-first", 20, "--json").stdout)
+    assert first["ate_rmse_mm"] > every["ate_rmse_mm"]
+
+
+def test_units_and_kinds_of_both_sides_are_asked_for_apart(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+    estimated, reference = (as_trajectory(poses) for poses in vector_a())
+    write_kitti(tmp_path / "estimate.txt", estimated, unit="m")
+    write_kitti(tmp_path / "truth.txt", reference)
+    given = (tmp_path / "estimate.txt", "--truth", tmp_path / "truth.txt", "--unit", "m", "--truth-unit", "mm")
+    figures = json.loads(run(*given, "--truth-kind", "kitti", "--json").stdout)
+    assert figures["tlr"] == pytest.approx(0.436782, abs=1e-6)
+    assert "KITTI" in figures["sources"]["truth"]
+    assert isinstance(run(*given, "--kind", "kitty", code=1).exception, SettingsError)
+
+
+def test_depth_and_its_consistency_are_measured_on_demand(tmp_path: Path) -> None:
+    """A run on true depth has no depth error, and its depth agrees from frame to frame as well as the truth does."""
+    truth = write_tiny(tmp_path / "phantom", frames=4)
+    settings = {"networks.flow": "dis", "networks.perceptual": "structure", "fusion.enabled": False}
+    config = Config.load(settings={"depth.backend": f"files:{truth}"} | settings)
+    reconstruct(open_sequence(truth), config, out=tmp_path / "run")
+    figures = json.loads(run(tmp_path / "run", "--truth", truth, "--depth", "--consistency", "--json").stdout)
+    assert figures["depth"]["abs_rel"] < 1e-3
+    assert figures["depth"]["scaling"] == "median"
+    assert figures["consistency"]["frames"] == 4
+    assert figures["consistency"]["tae_reference"]["percent"] < 2
+    assert figures["consistency"]["scale"] == pytest.approx(1, abs=1e-3)
+    bare = write_run(tmp_path / "bare", as_trajectory(vector_a()[0]))
+    refused = run(bare, "--truth", truth, "--align", "origin", "--depth", code=1).exception
+    assert isinstance(refused, InputError)
+    assert "no depth maps" in str(refused)

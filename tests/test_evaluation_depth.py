@@ -1,7 +1,8 @@
-"""Depth errors: hand-computed figures, scaling, unknown pixels."""
+"""Depth errors: hand-computed figures, scaling of images and sequences, caps, unknown pixels, jitter of the scale."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 
 import numpy as np
@@ -9,9 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.evaluation.depth import evaluate_depth, mean_depth_report
+from scopemap.errors import SettingsError
+from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthFit, DepthReport, evaluate_depth, mean_depth_report
+from scopemap.evaluation.depth_sequence import depth_scale, evaluate_depth_sequence, fit_sequence, scale_jitter
 
 TRUTH = np.array([[10.0, 20.0], [40.0, np.nan]], dtype=np.float32)
+ALL = (1e-3, float("inf"))
+
+
+def errors_of(report: DepthReport) -> list[float]:
+    return [report.abs_rel, report.sq_rel_mm, report.rmse_mm, report.rmse_log, report.mae_mm]
 
 
 def test_figures_computed_by_hand() -> None:
@@ -29,6 +37,9 @@ def test_figures_computed_by_hand() -> None:
 
 def test_delta_is_strict() -> None:
     assert evaluate_depth(np.array([[1.25]]), np.array([[1.0]])).delta_1 == 0
+    assert evaluate_depth(np.array([[1.25**2]]), np.array([[1.0]])).delta_2 == 0
+    assert evaluate_depth(np.array([[1.0]]), np.array([[1.25**3]])).delta_3 == 0
+    assert evaluate_depth(np.array([[1.2499]]), np.array([[1.0]])).delta_1 == 1
 
 
 @settings(max_examples=25, deadline=None)
@@ -60,7 +71,8 @@ def test_range_of_the_truth_is_exclusive() -> None:
 def test_nothing_to_compare_is_nan_not_zero() -> None:
     report = evaluate_depth(np.full((2, 2), np.nan), np.ones((2, 2)))
     assert (report.pixels, report.coverage) == (0, 0)
-    assert all(np.isnan(value) for key, value in asdict(report).items() if key not in ("pixels", "coverage"))
+    figures = {key: value for key, value in asdict(report).items() if key not in ("scaling", "pixels", "coverage")}
+    assert np.isnan(list(figures.values())).all()
 
 
 def test_sizes_must_agree() -> None:
@@ -77,3 +89,200 @@ def test_mean_is_over_images_and_leaves_out_empty_ones() -> None:
     assert mean.coverage == pytest.approx(2 / 3)
     assert np.isnan(mean_depth_report([empty]).abs_rel)
     assert np.isnan(mean_depth_report([]).abs_rel)
+
+
+# ---- scale and shift, clipping
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), scale=st.floats(0.1, 10), shift=st.floats(-0.009, 0.05))
+def test_scale_and_shift_removes_any_affine_change_of_disparity(seed: int, scale: float, shift: float) -> None:
+    truth = np.random.default_rng(seed).uniform(5, 100, size=(12, 9))
+    predicted = 1 / (scale * (1 / truth + shift))
+    report = evaluate_depth(predicted, truth, scaling="scale-and-shift")
+    assert report.scaling == "scale-and-shift"
+    assert errors_of(report) == pytest.approx([0] * 5, abs=1e-6)
+    assert report.scale == pytest.approx(scale, rel=1e-6)
+    assert report.shift_per_mm == pytest.approx(-shift, abs=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), scaling=st.sampled_from(["median", "scale-and-shift"]))
+def test_scaled_errors_do_not_depend_on_the_scale_of_the_prediction(seed: int, scaling: str) -> None:
+    rng = np.random.default_rng(seed)
+    truth, predicted = rng.uniform(5, 100, (2, 12, 9))
+    first, second = (
+        evaluate_depth(factor * predicted, truth, scaling=scaling, truth_range_mm=(1.0, 90.0), clip_prediction=True)  # type: ignore[arg-type]
+        for factor in (1.0, 7.5)
+    )
+    assert errors_of(second) == pytest.approx(errors_of(first))
+    assert first.scale == pytest.approx(7.5 * second.scale)
+
+
+def test_scale_and_shift_is_the_least_squares_solution() -> None:
+    rng = np.random.default_rng(3)
+    truth, predicted = rng.uniform(5, 100, (2, 30, 20))
+    unknown = np.where(rng.random(truth.shape) < 0.2, np.nan, truth)
+    known = np.isfinite(unknown)
+    design = np.stack([1 / predicted[known], np.ones(known.sum())], -1)
+    slope, shift = np.linalg.lstsq(design, 1 / truth[known], rcond=None)[0]
+    report = evaluate_depth(predicted, unknown, scaling="scale-and-shift")
+    assert (1 / report.scale, report.shift_per_mm) == pytest.approx((slope, shift))
+    scaled = 1 / (slope / predicted[known] + shift)
+    assert report.mae_mm == pytest.approx(np.mean(np.abs(scaled - truth[known])))
+
+
+def test_prediction_without_variation_becomes_the_mean_disparity_of_the_truth() -> None:
+    report = evaluate_depth(np.full((1, 2), 7.0), np.array([[10.0, 30.0]]), scaling="scale-and-shift")
+    assert report.scale == float("inf")
+    assert 1 / report.shift_per_mm == pytest.approx(15)
+    assert report.mae_mm == pytest.approx((5 + 15) / 2)
+
+
+def test_disparity_that_a_shift_makes_negative_is_a_kilometre_away() -> None:
+    fit = DepthFit("scale-and-shift", scale=2.0, shift_per_mm=-0.01)
+    assert fit.apply(np.array([10.0, 50.0, 80.0])) == pytest.approx([25.0, 1e6, 1e6])
+    assert np.isnan(fit.apply(np.array([np.nan, 0.0, -1.0]))).all()
+
+
+def test_a_fit_found_elsewhere_is_applied_and_named() -> None:
+    report = evaluate_depth(TRUTH / 3, TRUTH, scaling=DepthFit("sequence-median", 3.3))
+    assert (report.scaling, report.scale) == ("sequence-median", 3.3)
+    assert report.abs_rel == pytest.approx(0.1)
+
+
+def test_clipping_follows_scaling_and_leaves_the_choice_of_pixels() -> None:
+    truth = np.array([[100.0, 100.0, 140.0, 170.0]])
+    predicted = np.array([[50.0, 50.0, 90.0, 50.0]])
+    limits = DEPTH_RANGES_MM["scared"]
+    free = evaluate_depth(predicted, truth, scaling="median", truth_range_mm=limits)
+    clipped = evaluate_depth(predicted, truth, scaling="median", truth_range_mm=limits, clip_prediction=True)
+    # 170 lies beyond the cap; 90 becomes 180, which is clipped to 150.
+    assert (free.pixels, clipped.pixels, clipped.scale) == (3, 3, 2)
+    assert (free.mae_mm, clipped.mae_mm) == pytest.approx((40 / 3, 10 / 3))
+
+
+def test_ranges_are_those_of_the_published_protocols() -> None:
+    assert (DEPTH_RANGES_MM["scared"], DEPTH_RANGES_MM["hamlyn"]) == ((1e-3, 150), (1, 300))
+    assert (DEPTH_RANGES_MM["c3vd"], DEPTH_RANGES_MM["serv-ct"]) == ((1e-3, 100), (1, 180))
+
+
+def test_an_unknown_scaling_is_refused() -> None:
+    with pytest.raises(SettingsError, match="'mean': choose one of none, median, scale-and-shift"):
+        evaluate_depth(TRUTH, TRUTH, scaling="mean")  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="sequence-median"):
+        evaluate_depth(TRUTH, TRUTH, scaling="sequence-median")  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="sequence-scale-and-shift"):
+        evaluate_depth_sequence(list, scaling="mean")  # type: ignore[arg-type]
+
+
+def test_images_scaled_in_different_ways_have_no_mean() -> None:
+    reports = [evaluate_depth(TRUTH, TRUTH), evaluate_depth(TRUTH, TRUTH, scaling="median")]
+    with pytest.raises(SettingsError, match="median, none"):
+        mean_depth_report(reports)
+
+
+# ---- sequences
+
+
+class Frames:
+    """A factory of frames that counts how often it is asked for them."""
+
+    def __init__(self, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.frames, self.passes = frames, 0
+
+    def __call__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        self.passes += 1
+        for predicted, truth in self.frames:
+            yield predicted.copy(), truth.copy()
+
+
+def flickering(factors: list[float]) -> Frames:
+    truths = np.random.default_rng(1).uniform(5, 100, (len(factors), 12, 9))
+    return Frames([(truth / factor, truth) for truth, factor in zip(truths, factors, strict=True)])
+
+
+def test_one_scale_for_the_sequence_shows_the_flicker_that_a_scale_per_image_hides() -> None:
+    frames = flickering([2.0, 2.2, 2.0])
+    hidden = evaluate_depth_sequence(frames, scaling="median")
+    assert frames.passes == 1
+    assert hidden.mean.abs_rel == pytest.approx(0, abs=1e-9)
+    shown = evaluate_depth_sequence(frames, scaling="sequence-median")
+    assert frames.passes == 3
+    assert [frame.scale for frame in shown.frames] == [shown.fit.scale] * 3
+    s = shown.fit.scale
+    assert shown.mean.abs_rel == pytest.approx(np.mean([abs(s / 2 - 1), abs(s / 2.2 - 1), abs(s / 2 - 1)]))
+    assert (shown.scaling, shown.mean.scaling, hidden.mean.scaling) == ("sequence-median", "sequence-median", "median")
+    for report in (hidden, shown):
+        assert report.jitter.frames == 3
+        assert report.jitter.log_step == pytest.approx(np.log(1.1))
+        assert report.jitter.log_std == pytest.approx(np.log(1.1) * np.sqrt(2) / 3)
+
+
+def test_sequence_median_is_the_ratio_of_the_pooled_medians() -> None:
+    rng = np.random.default_rng(5)
+    frames = [(rng.uniform(0.1, 9, (7, n)), rng.uniform(5, 100, (7, n))) for n in (3, 40)]
+    frames[1][0][0] = np.nan
+    known = [np.isfinite(predicted) for predicted, _ in frames]
+    d, g = (np.concatenate([pair[i][k] for pair, k in zip(frames, known, strict=True)]) for i in (0, 1))
+    fit = fit_sequence(Frames(frames), "sequence-median", ALL)
+    assert fit.scale == pytest.approx(np.median(g) / np.median(d), rel=3e-5)
+
+
+def test_sequence_scale_and_shift_is_least_squares_over_the_pixels_of_all_frames() -> None:
+    rng = np.random.default_rng(6)
+    frames = [(rng.uniform(0.1, 9, (7, n)), rng.uniform(5, 100, (7, n))) for n in (3, 40, 11)]
+    d, g = (np.concatenate([pair[i].ravel() for pair in frames]) for i in (0, 1))
+    slope, shift = np.linalg.lstsq(np.stack([1 / d, np.ones_like(d)], -1), 1 / g, rcond=None)[0]
+    fit = fit_sequence(Frames(frames), "sequence-scale-and-shift", ALL)
+    assert (1 / fit.scale, fit.shift_per_mm) == pytest.approx((slope, shift))
+    whole = [(d[None], g[None])]
+    alone = evaluate_depth(*whole[0], scaling="scale-and-shift")
+    assert evaluate_depth_sequence(Frames(whole), scaling="sequence-scale-and-shift").mean.rmse_mm == pytest.approx(
+        alone.rmse_mm
+    )
+
+
+def test_one_affine_change_of_disparity_is_removed_from_a_sequence() -> None:
+    truths = np.random.default_rng(2).uniform(5, 100, (4, 12, 9))
+    frames = Frames([(1 / (0.3 / truth + 0.02), truth) for truth in truths])
+    report = evaluate_depth_sequence(frames, scaling="sequence-scale-and-shift", truth_range_mm=(5.0, 90.0))
+    assert report.mean.abs_rel == pytest.approx(0, abs=1e-9)
+    assert report.mean.pixels == pytest.approx(np.mean([(truth < 90).sum() for truth in truths]))
+    unscaled = evaluate_depth_sequence(frames)
+    assert (unscaled.fit, unscaled.mean.scale) == (DepthFit("none"), 1)
+    assert unscaled.mean.abs_rel > 0.2
+
+
+def test_frames_without_truth_break_no_sequence() -> None:
+    nothing = (np.ones((2, 2)), np.full((2, 2), np.nan))
+    frames = Frames([(TRUTH / 2, TRUTH), nothing, (TRUTH / 2, TRUTH)])
+    report = evaluate_depth_sequence(frames, scaling="sequence-median")
+    assert report.fit.scale == pytest.approx(2, rel=3e-5)
+    assert report.mean.abs_rel < 1e-4
+    assert (report.jitter.frames, report.jitter.log_std) == (2, 0)
+    assert np.isnan(report.jitter.log_step)
+    for scaling in ("sequence-median", "sequence-scale-and-shift"):
+        empty = evaluate_depth_sequence(Frames([nothing]), scaling=scaling)  # type: ignore[arg-type]
+        assert (empty.fit.scale, empty.mean.pixels) == (1, 0)
+        assert np.isnan(empty.mean.abs_rel)
+
+
+# ---- jitter
+
+
+def test_jitter_of_factors_computed_by_hand() -> None:
+    jitter = scale_jitter(np.array([1.0, np.e, np.nan, np.e, 1.0, np.e**3]))
+    assert jitter.frames == 5
+    assert jitter.log_std == pytest.approx(np.std([0, 1, 1, 0, 3]))
+    assert jitter.log_step == pytest.approx((1 + 1 + 3) / 3)
+    assert np.isnan(scale_jitter(np.array([2.0])).log_std)
+    assert np.isnan(scale_jitter(np.array([])).log_step)
+
+
+def test_factor_of_a_frame_is_the_median_of_the_ratios() -> None:
+    predicted = np.array([[1.0, 2.0, 4.0, 0.0]])
+    truth = np.array([[10.0, 30.0, 4.0, 5.0]])
+    assert depth_scale(predicted, truth) == 10
+    assert depth_scale(predicted, truth, (11.0, 40.0)) == 15
+    assert np.isnan(depth_scale(predicted, np.full((1, 4), np.nan)))

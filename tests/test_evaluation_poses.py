@@ -14,27 +14,24 @@ from sample_trajectories import as_trajectory, vector_a
 from scopemap.errors import AlignmentError
 from scopemap.evaluation.pose_errors import (
     ErrorSummary,
+    below_percent,
     frame_pairs,
     path_pairs,
     relative_errors,
     rotation_errors_rad,
     translation_errors_mm,
 )
-from scopemap.evaluation.poses import associate, evaluate_poses, match, paper_report
-from scopemap.geometry.align import Similarity, align_trajectories, umeyama
+from scopemap.evaluation.poses import associate, evaluate_poses, match
+from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import se3_exp, so3_exp
 from scopemap.trajectory import Trajectory
 
-MODES = ("none", "origin", "se3", "sim3")
+MODES = ("none", "origin", "se3", "sim3", "scale")
 
 
-def aligned_a(mode: str) -> tuple[np.ndarray, np.ndarray, float]:
+def aligned_a(mode: str) -> tuple[np.ndarray, np.ndarray]:
     estimated, reference = vector_a()
-    if mode == "scale only":
-        scale = umeyama(estimated[:, :3, 3], reference[:, :3, 3], with_scale=True).scale
-        return Similarity(scale, np.eye(3), np.zeros(3)).transform_poses(estimated), reference, scale
-    aligned, similarity = align_trajectories(estimated, reference, mode)
-    return aligned, reference, similarity.scale
+    return align_trajectories(estimated, reference, mode)[0], reference
 
 
 def last_digit(*values: float) -> object:
@@ -49,7 +46,7 @@ def last_digit(*values: float) -> object:
         ("se3", (5.585285, 5.280142), (1.107530, 1.067505), (0.557375, 0.521526), 4.796169, 4.766312),
         ("sim3", (0.308821, 0.299139), (1.107530, 1.067505), (0.437467, 0.424599), 0.493046, 0.552066),
         ("origin", (8.782756, 8.196073), (1.385196, 1.297134), (0.557375, 0.521526), 4.796169, 4.766312),
-        ("scale only", (17.469604, 16.816942), (56.728720, 56.726869), (0.437467, 0.424599), 0.493046, 0.552066),
+        ("scale", (17.469604, 16.816942), (56.728720, 56.726869), (0.437467, 0.424599), 0.493046, 0.552066),
     ],
 )
 def test_vector_a(
@@ -60,7 +57,7 @@ def test_vector_a(
     ten_consecutive: float,
     ten_all: float,
 ) -> None:
-    aligned, reference, _ = aligned_a(mode)
+    aligned, reference = aligned_a(mode)
     ape = ErrorSummary.of(np.linalg.norm(translation_errors_mm(aligned, reference), axis=1))
     angle = ErrorSummary.of(np.degrees(rotation_errors_rad(aligned, reference)))
     assert (ape.rmse, ape.mean) == last_digit(*translation)
@@ -86,7 +83,7 @@ def test_vector_a(
     ],
 )
 def test_vector_a_over_path(mode: str, length_mm: float, consecutive: bool, count: int, rmse: float) -> None:
-    aligned, reference, _ = aligned_a(mode)
+    aligned, reference = aligned_a(mode)
     pairs = path_pairs(aligned[:, :3, 3], length_mm, consecutive=consecutive)
     assert len(pairs) == count
     assert (ErrorSummary.of(relative_errors(aligned, reference, pairs)[0]).rmse,) == last_digit(rmse)
@@ -108,61 +105,6 @@ def test_vector_a_lengths_scale_and_report() -> None:
     assert (report.frames, report.tracked, report.align) == (60, 60, "sim3")
 
 
-VECTOR_B = {
-    "se3": {
-        "mean": (3.669195, 2.341892, 2.333184),
-        "rmse": (4.145455, 2.594043, 2.698434),
-        "final": (1.230978, 1.221572, 3.921726),
-        "max": (6.096605, 4.355449, 5.292149),
-        "below_mean_percent": (45.0, 48.333, 50.0),
-        "total": (4.288062, 7.161335, 40.0),
-        "tlr": 0.436782,
-    },
-    "sim3": {
-        "mean": (0.189220, 0.127828, 0.159267),
-        "rmse": (0.210457, 0.141311, 0.176379),
-        "final": (0.073127, 0.139029, 0.162390),
-        "max": (0.309066, 0.216446, 0.263024),
-        "below_mean_percent": (43.333, 40.0, 41.667),
-        "total": (0.225936, 0.423998, 45.0),
-        "tlr": 1.090946,
-    },
-}
-
-
-@pytest.mark.parametrize("mode", ["se3", "sim3"])
-def test_vector_b(mode: str) -> None:
-    aligned, reference, scale = aligned_a(mode)
-    known = VECTOR_B[mode]
-    error = translation_errors_mm(aligned, reference)
-    axes = [asdict(ErrorSummary.of(np.abs(error[:, axis]))) for axis in range(3)]
-    for name in ("mean", "rmse", "final", "max"):
-        assert tuple(axis[name] for axis in axes) == last_digit(*known[name]), name
-    shares = tuple(axis["below_mean_percent"] for axis in axes)
-    assert shares == pytest.approx(known["below_mean_percent"], abs=5.1e-4)
-    total = ErrorSummary.of(np.linalg.norm(error, axis=1))
-    assert (total.final, total.max, total.below_mean_percent) == last_digit(*known["total"])
-    report = paper_report(match(*(as_trajectory(poses) for poses in vector_a()), mode))
-    assert (report.t_fin_mm, report.t_max_mm, report.t_below_avg_percent) == last_digit(*known["total"])
-    degrees = np.degrees([report.r_avg_rad, report.r_fin_rad, report.r_max_rad])
-    assert tuple(degrees) == last_digit(1.067505, 1.245602, 1.697826)
-    assert report.r_below_avg_percent == pytest.approx(50.0)
-    # The vector's ratio for Sim(3) is after scaling; the report's is always before.
-    assert (report.tlr * scale,) == last_digit(known["tlr"])
-    assert report.rmse_mm**2 == pytest.approx(report.t_avg_mm**2 + report.t_std_mm**2)
-    assert report.lost_percent == 0
-
-
-def test_three_figures_whose_source_is_off_in_the_last_digit_are_as_evo_has_them() -> None:
-    from evo.core.trajectory import PosePath3D
-
-    estimated, reference = (PosePath3D(poses_se3=list(poses)) for poses in vector_a())
-    assert (reference.path_length,) == last_digit(48.895807)
-    estimated.align(reference)
-    z = np.abs(estimated.positions_xyz - reference.positions_xyz)[:, 2]
-    assert (np.sqrt(np.mean(z**2)), z.max()) == last_digit(VECTOR_B["se3"]["rmse"][2], VECTOR_B["se3"]["max"][2])
-
-
 def random_pair(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     count = int(rng.integers(12, 40))
@@ -177,49 +119,80 @@ def random_pair(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return walk(), walk()
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(MODES))
-def test_agrees_with_evo(seed: int, mode: str) -> None:
-    from evo.core import metrics
+def evo_pair(estimated: np.ndarray, reference: np.ndarray, mode: str, first: int | None = None) -> tuple:
+    """Return reference and aligned estimate as evo has them."""
     from evo.core.trajectory import PosePath3D
 
-    estimated, reference = random_pair(seed)
-    report = evaluate_poses(as_trajectory(estimated), as_trajectory(reference), mode)
     theirs, truth = (PosePath3D(poses_se3=list(copy.deepcopy(poses))) for poses in (estimated, reference))
     if mode == "origin":
         theirs.align_origin(truth)
     elif mode != "none":
-        theirs.align(truth, correct_scale=mode == "sim3")
-
-    def rmse(metric: metrics.PE, statistic: metrics.StatisticsType = metrics.StatisticsType.rmse) -> float:
-        metric.process_data((truth, theirs))
-        return metric.get_statistic(statistic)
-
-    relation, mean = metrics.PoseRelation, metrics.StatisticsType.mean
-    rpe = [
-        metrics.RPE(kind, delta=delta, delta_unit=metrics.Unit.frames, all_pairs=True)
-        for delta in (1, 10)
-        for kind in (relation.translation_part, relation.rotation_angle_deg)
-    ]
-    expected = [
-        rmse(metrics.APE(relation.translation_part)),
-        rmse(metrics.APE(relation.translation_part), mean),
-        rmse(metrics.APE(relation.rotation_angle_deg), mean),
-        *(rmse(metric) for metric in rpe),
-    ]
-    found = [report.ate_rmse_mm, report.ate_mean_mm, report.rotation_mean_deg]
-    found += [report.rpe_1_mm, report.rpe_1_deg, report.rpe_10_mm, report.rpe_10_deg]
-    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
+        kinds = {"correct_scale": mode == "sim3", "correct_only_scale": mode == "scale"}
+        theirs.align(truth, **kinds, n=-1 if first is None else first)
+    return truth, theirs
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), consecutive=st.booleans())
-def test_path_pairs_agree_with_evo(seed: int, consecutive: bool) -> None:
-    from evo.core import filters
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(MODES), first=st.sampled_from([None, 4, 9]))
+def test_absolute_errors_agree_with_evo(seed: int, mode: str, first: int | None) -> None:
+    from evo.core import metrics
 
-    poses, _ = random_pair(seed)
-    theirs = filters.filter_pairs_by_path(list(poses), 7.0, tol=0.7, all_pairs=not consecutive)
-    assert path_pairs(poses[:, :3, 3], 7.0, consecutive=consecutive).tolist() == [list(pair) for pair in theirs]
+    estimated, reference = random_pair(seed)
+    first = None if mode in ("none", "origin") else first
+    matched = match(as_trajectory(estimated), as_trajectory(reference), mode, first=first)
+    assert matched.fitted_frames == {"none": 0, "origin": 1}.get(mode, first or len(estimated))
+    distance = np.linalg.norm(translation_errors_mm(matched.aligned, matched.reference), axis=1)
+    angle_deg = np.degrees(rotation_errors_rad(matched.aligned, matched.reference))
+    relation = metrics.PoseRelation
+    for errors, kind in ((distance, relation.translation_part), (angle_deg, relation.rotation_angle_deg)):
+        theirs = metrics.APE(kind)
+        theirs.process_data(evo_pair(estimated, reference, mode, first))
+        np.testing.assert_allclose(errors, theirs.error, rtol=1e-6, atol=1e-6)
+        summary = asdict(ErrorSummary.of(errors))
+        expected = theirs.get_all_statistics()
+        assert {key: summary[key] for key in expected} == pytest.approx(expected, rel=1e-6)
+    report = evaluate_poses(as_trajectory(estimated), as_trajectory(reference), mode, first=first)
+    found = (report.ate_rmse_mm, report.ate_median_mm, report.ate_max_mm, report.rotation_mean_deg)
+    ate = ErrorSummary.of(distance)
+    assert found == pytest.approx((ate.rmse, ate.median, ate.max, np.mean(angle_deg)))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    mode=st.sampled_from(MODES),
+    delta=st.sampled_from([("frames", 1), ("frames", 10), ("frames", 4), ("meters", 7.0), ("meters", 20.0)]),
+    consecutive=st.booleans(),
+    from_reference=st.booleans(),
+)
+def test_relative_errors_agree_with_evo(
+    seed: int, mode: str, delta: tuple[str, float], consecutive: bool, from_reference: bool
+) -> None:
+    from evo.core import filters, metrics
+
+    estimated, reference = random_pair(seed)
+    aligned, _ = align_trajectories(estimated, reference, mode)
+    unit, length = delta
+    positions = (reference if from_reference else aligned)[:, :3, 3]
+    if unit == "frames":
+        pairs = frame_pairs(len(aligned), int(length), consecutive=consecutive)
+    else:
+        pairs = path_pairs(positions, length, consecutive=consecutive)
+    relation = metrics.PoseRelation
+    for errors, kind in zip(
+        relative_errors(aligned, reference, pairs),
+        (relation.translation_part, relation.rotation_angle_rad),
+        strict=True,
+    ):
+        options = {"all_pairs": not consecutive, "pairs_from_reference": from_reference}
+        theirs = metrics.RPE(kind, length, metrics.Unit[unit], **options)
+        try:
+            theirs.process_data(evo_pair(estimated, reference, mode))
+        except filters.FilterException:  # no pair: evo refuses, we have no errors
+            assert len(pairs) == 0
+            continue
+        assert [second for _, second in pairs.tolist()] == theirs.delta_ids
+        np.testing.assert_allclose(errors, theirs.error, rtol=1e-6, atol=1e-7)
 
 
 @settings(max_examples=20, deadline=None)
@@ -229,23 +202,16 @@ def test_perfect_and_sim3_of_the_truth_give_zero(seed: int) -> None:
     _, truth = random_pair(seed)
     for mode in MODES:
         report = evaluate_poses(as_trajectory(truth), as_trajectory(truth), mode)
-        errors = {key: value for key, value in asdict(report).items() if key.endswith(("_mm", "_deg"))}
-        assert max(errors.values()) == pytest.approx(0, abs=1e-6)
-        assert report.tlr == 1
+        errors = [value for key, value in asdict(report).items() if key.endswith(("_mm", "_deg"))]
+        assert np.nanmax(errors) == pytest.approx(0, abs=1e-6)
+        assert [value for key, value in asdict(report).items() if key.endswith("_percent")] == [100] * 6
+        assert report.tlr == report.coverage == 1
     scale = rng.uniform(0.1, 10)
     moved = Similarity(scale, so3_exp(rng.normal(size=3)), rng.normal(scale=30, size=3)).transform_poses(truth)
     report = evaluate_poses(as_trajectory(moved), as_trajectory(truth), "sim3")
     assert [report.ate_rmse_mm, report.rotation_max_deg, report.rpe_10_mm] == pytest.approx([0, 0, 0], abs=1e-5)
     assert report.scale == pytest.approx(1 / scale)
     assert report.tlr == pytest.approx(scale)
-
-
-def test_opposite_camera_axes_give_pi_after_alignment_and_nothing_unaligned() -> None:
-    _, truth = vector_a()
-    flipped = truth @ np.diag([1.0, -1.0, -1.0, 1.0])
-    report = paper_report(match(as_trajectory(flipped), as_trajectory(truth), "none"))
-    assert [report.r_avg_rad, report.r_max_rad, report.r_fin_rad] == pytest.approx([np.pi] * 3)
-    assert report.t_max_mm == 0
 
 
 def test_lost_frames_are_left_out_of_all_but_the_held_figure() -> None:
@@ -261,9 +227,8 @@ def test_lost_frames_are_left_out_of_all_but_the_held_figure() -> None:
         np.linalg.norm(truth[k, :3, 3] - truth[held, :3, 3]) for k, held in ((20, 19), (21, 19), (22, 19), (59, 58))
     ]
     assert report.ate_hold_rmse_mm == pytest.approx(np.sqrt(np.sum(np.square(gaps)) / 60))
-    assert paper_report(match(as_trajectory(estimate, lost), as_trajectory(truth), "origin")).lost_percent == (
-        pytest.approx(100 * 4 / 60)
-    )
+    assert (report.longest_tracked, report.frames_until_loss) == (36, 20)
+    assert report.coverage == pytest.approx(56 / 60)
 
 
 def test_lost_frames_do_not_take_part_in_the_fit() -> None:
@@ -275,19 +240,57 @@ def test_lost_frames_do_not_take_part_in_the_fit() -> None:
     assert found.ate_hold_rmse_mm > 5 * found.ate_rmse_mm
 
 
-def test_the_papers_rpe_takes_its_pairs_from_the_reference() -> None:
+def test_the_error_over_path_takes_its_pairs_from_the_reference_and_skips_lost_frames() -> None:
     from evo.core import metrics
-    from evo.core.trajectory import PosePath3D
 
     estimated, reference = vector_a()
-    report = paper_report(match(as_trajectory(estimated), as_trajectory(reference), "none"))
-    theirs = metrics.RPE(
-        metrics.PoseRelation.translation_part, 10.0, metrics.Unit.meters, all_pairs=True, pairs_from_reference=True
-    )
-    theirs.process_data(tuple(PosePath3D(poses_se3=list(poses)) for poses in (reference, estimated)))
-    statistics = theirs.get_all_statistics()
-    found = (report.rpe_10_mm_path_mm, report.rpe_10_mm_path_std_mm)
-    assert found == pytest.approx((statistics["mean"], statistics["std"]))
+    report = evaluate_poses(as_trajectory(estimated), as_trajectory(reference), "none")
+    relation = metrics.PoseRelation
+    found = (report.rpe_10mm_path_mm, report.rpe_10mm_path_deg)
+    for value, kind in zip(found, (relation.translation_part, relation.rotation_angle_deg), strict=True):
+        theirs = metrics.RPE(kind, 10.0, metrics.Unit.meters, all_pairs=True, pairs_from_reference=True)
+        theirs.process_data(evo_pair(estimated, reference, "none"))
+        assert value == pytest.approx(theirs.get_statistic(metrics.StatisticsType.rmse))
+    nonsense = reference.copy()
+    nonsense[20:25] = se3_exp(np.full(6, 7.0))
+    report = evaluate_poses(as_trajectory(nonsense, (20, 21, 22, 23, 24)), as_trajectory(reference), "none")
+    assert report.rpe_10mm_path_mm == pytest.approx(0, abs=1e-9)
+
+
+def test_shares_below_fixed_limits_are_strict_and_the_same_for_all_methods() -> None:
+    assert below_percent(np.array([0.5, 1.0, 1.5, 4.0]), 1.0) == 25
+    assert np.isnan(below_percent(np.empty(0), 1.0))
+    _, truth = vector_a()
+    estimate = truth.copy()
+    estimate[:12, 0, 3] += 0.9
+    estimate[12:30, 0, 3] += 1.5
+    estimate[30:36, 0, 3] += 4.5
+    estimate[36:, 0, 3] += 9
+    estimate[:15] = estimate[:15] @ se3_exp(np.array([0, 0, np.radians(1.5), 0, 0, 0]))
+    report = evaluate_poses(as_trajectory(estimate), as_trajectory(truth), "none")
+    below = (report.ate_below_1_mm_percent, report.ate_below_2_mm_percent, report.ate_below_5_mm_percent)
+    assert below == pytest.approx((20, 50, 60))
+    turned = (report.rotation_below_1_deg_percent, report.rotation_below_2_deg_percent)
+    assert (*turned, report.rotation_below_5_deg_percent) == pytest.approx((75, 100, 100))
+
+
+def test_coverage_counts_missing_frames_like_lost_ones_but_only_within_the_span() -> None:
+    estimate, truth = (as_trajectory(poses) for poses in vector_a())
+    part = estimate.rows(np.array([10, 11, 12, 13, 17, 18, 19]))
+    report = evaluate_poses(part, truth, "se3")
+    assert report.coverage == pytest.approx(7 / 10)
+    assert (report.frames, report.reference_frames, report.longest_tracked) == (7, 60, 7)
+    by_time = match(part, truth, "se3", by="time")
+    assert (by_time.associated_by, by_time.reference_in_span, by_time.coverage) == ("time", 10, report.coverage)
+    unknown = replace(truth, status=np.where(np.arange(60) == 15, "lost", truth.status))
+    assert evaluate_poses(part, unknown, "se3").coverage == pytest.approx(7 / 9)
+
+
+def test_loss_is_told_by_its_first_frame_and_the_longest_stretch_between() -> None:
+    poses = vector_a()
+    for lost, longest, until in (((), 60, 60), ((59,), 59, 59), ((0, 1), 58, 0), ((7, 30), 29, 7)):
+        report = evaluate_poses(as_trajectory(poses[0], lost), as_trajectory(poses[1]), "sim3")
+        assert (report.longest_tracked, report.frames_until_loss) == (longest, until)
 
 
 def test_frames_lost_from_the_start_and_frames_lost_in_the_truth() -> None:
@@ -339,3 +342,4 @@ def test_association_by_time_is_nearest_one_to_one_and_bounded() -> None:
     assert rows[0].tolist() == [1, 2, 4]
     assert rows[1].tolist() == [0, 1, 3]
     assert [len(r) for r in associate(estimate, reference.rows(np.zeros(5, dtype=bool)))] == [0, 0]
+    assert [len(r) for r in associate(estimate, reference, max_gap_s=0.02)] == [4, 4]

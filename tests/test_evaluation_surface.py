@@ -1,6 +1,9 @@
-"""Surfaces: closed forms on planes and spheres, exactness against brute force, the stated bound."""
+"""Surfaces: closed forms on planes and spheres, exactness against brute force, the stated bound, flat figures."""
 
 from __future__ import annotations
+
+import json
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +11,17 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.evaluation.surface import FScore, compare_surfaces, distance_to_mesh, surface_points
+from scopemap.evaluation.surface import (
+    FScore,
+    compare_surfaces,
+    distance_to_mesh,
+    normal_consistency,
+    oriented_samples,
+    report_of_nothing,
+    surface_figures,
+    surface_points,
+)
+from scopemap.geometry.se3 import se3, so3_exp
 
 
 def brute_force(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
@@ -120,3 +133,93 @@ def test_empty_surfaces_are_refused() -> None:
 def test_f_score() -> None:
     assert FScore(1.0, 0.5, 1.0).f_score == pytest.approx(2 / 3)
     assert FScore(1.0, 0.0, 0.0).f_score == 0
+
+
+def part(mesh: trimesh.Trimesh, chosen: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[chosen], process=False)
+
+
+def test_what_nobody_saw_is_not_asked_for() -> None:
+    whole = wavy_sheet(41, 1.0)
+    seen = whole.triangles_center[:, 0] < 20
+    half = part(whole, seen)
+    blind, informed = compare_surfaces(half, whole), compare_surfaces(half, whole, observed=half)
+    assert blind.completeness.mean_mm > 3
+    assert not blind.observed_only
+    assert math.isnan(blind.coverage_2mm)
+    assert informed.observed_only
+    assert informed.completeness.mean_mm == pytest.approx(0, abs=1e-9)
+    assert informed.coverage_2mm == 1
+    assert informed.observed_share == pytest.approx(half.area / whole.area)
+    # Beyond the seen part a prediction may still be right: accuracy is measured on the whole.
+    assert compare_surfaces(whole, whole, observed=half).accuracy.mean_mm == pytest.approx(0, abs=1e-9)
+
+
+def test_coverage_is_the_share_of_the_observed_truth_within_two_millimetres() -> None:
+    whole = wavy_sheet(41, 1.0)
+    half = part(whole, whole.triangles_center[:, 0] < 20)
+    report = compare_surfaces(half, whole, observed=whole, thresholds_mm=(0.5,))
+    assert report.coverage_2mm == pytest.approx(np.mean(distance_to_mesh(surface_points(whole), half) < 2))
+    assert report.coverage_2mm == pytest.approx(0.5 + 2 / 40, abs=0.02)
+    assert report.observed_share == 1
+    above = whole.copy()
+    above.apply_translation([0, 0, 60])
+    assert compare_surfaces(above, whole, observed=whole).coverage_2mm == 0
+
+
+def test_figures_are_flat_and_named_by_threshold() -> None:
+    upper, lower = trimesh.creation.box(extents=(30, 30, 1e-6)), trimesh.creation.box(extents=(30, 30, 1e-6))
+    upper.apply_translation([0, 0, 1.5])
+    figures = surface_figures(compare_surfaces(upper, lower, observed=lower, thresholds_mm=(1.0, 2.5)))
+    distances = {
+        f"{side}_{key}_mm" for side in ("accuracy", "completeness") for key in ("mean", "median", "rms", "p90")
+    }
+    scores = {f"{key}_{limit}" for key in ("precision", "recall", "f") for limit in ("1mm", "2.5mm")}
+    assert set(figures) == distances | scores | {"chamfer_mm", "coverage_2mm", "observed_share"}
+    assert all(type(value) is float for value in figures.values())
+    assert json.loads(json.dumps(figures)) == figures
+    assert all(figures[key] == pytest.approx(1.5, abs=1e-5) for key in (*distances, "chamfer_mm"))
+    assert (figures["f_1mm"], figures["f_2.5mm"], figures["coverage_2mm"]) == (0, 1, 1)
+
+
+def test_nothing_predicted_covers_nothing() -> None:
+    truth = wavy_sheet(21, 1.0)
+    left = part(truth, truth.triangles_center[:, 0] < 10)
+    figures = surface_figures(report_of_nothing(truth, observed=left))
+    assert set(figures) == set(surface_figures(compare_surfaces(truth, truth)))
+    assert figures["observed_share"] == pytest.approx(left.area / truth.area)
+    zero = {key for key, value in figures.items() if value == 0}
+    assert zero == {"coverage_2mm"} | {f"{name}_{limit}mm" for name in ("recall", "f") for limit in (1, 2, 5)}
+    assert sum(math.isnan(value) for value in figures.values()) == len(figures) - len(zero) - 1
+    assert math.isnan(surface_figures(report_of_nothing(truth))["coverage_2mm"])
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_exchanged_surfaces_exchange_accuracy_and_completeness_wherever_they_lie(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = wavy_sheet(12, 1.5), wavy_sheet(12, 1.5)
+    second.vertices = second.vertices + rng.normal(scale=0.8, size=second.vertices.shape)
+    there = compare_surfaces(first, second)
+    T = se3(so3_exp(rng.normal(size=3)), rng.normal(scale=50, size=3))
+    back = compare_surfaces(second.copy().apply_transform(T), first.copy().apply_transform(T))
+    assert there.chamfer_mm == pytest.approx(back.chamfer_mm)
+    assert there.accuracy.p90_mm == pytest.approx(back.completeness.p90_mm)
+    for one, other in zip(there.scores, back.scores, strict=True):
+        # Rounding may carry a single sample over the threshold.
+        assert (one.precision, one.recall) == pytest.approx((other.recall, other.precision), abs=2e-3)
+
+
+def test_normals_of_tilted_planes_agree_by_the_cosine() -> None:
+    flat = trimesh.creation.box(extents=(30, 30, 1e-6))
+    tilted = flat.copy().apply_transform(se3(so3_exp(np.array([0.5, 0, 0])), np.zeros(3)))
+    assert normal_consistency(flat, tilted) == pytest.approx(np.cos(0.5), abs=1e-3)
+    flipped = flat.copy()
+    flipped.invert()
+    assert normal_consistency(flat, flipped) == pytest.approx(1, abs=1e-3)
+
+
+def test_samples_carry_the_normal_of_their_triangle() -> None:
+    points, normals = oriented_samples(trimesh.creation.icosphere(subdivisions=4, radius=10.0))
+    outwards = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.sum(normals * outwards, axis=1).min() > 0.99

@@ -116,6 +116,62 @@ def test_seven_scenes_is_metres_and_numbered_by_file(tmp_path: Path, trajectory:
     np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera[:3], atol=1e-9)
 
 
+def test_what_was_assumed_is_said(tmp_path: Path, trajectory: Trajectory) -> None:
+    poses = trajectory.T_world_camera
+    write_run(tmp_path / "run", trajectory)
+    write_c3vd(tmp_path / "c3vd", poses)
+    write_tum(tmp_path / "ours.tum", trajectory)
+    write_kitti(tmp_path / "kitti.txt", trajectory)
+    (tmp_path / "numbered.tum").write_text("3 0 0 0 0 0 0 1\n5 0 0 0 0 0 0 1\n")
+    (tmp_path / "row_major.txt").write_text("".join(" ".join(map(repr, T.ravel().tolist())) + "\n" for T in poses))
+    (tmp_path / "7scenes").mkdir()
+    np.savetxt(tmp_path / "7scenes" / "frame-000000.pose.txt", poses[0])
+    sources = {
+        "run": "run of scopemap, camera-to-world, mm (stated)",
+        "ours.tum": "TUM, camera-to-world, mm (stated), stamps are seconds",
+        "numbered.tum": "TUM, camera-to-world, m (assumed), whole stamps taken for frame numbers",
+        "kitti.txt": "KITTI, camera-to-world, m (assumed), row = frame",
+        "c3vd": "C3VD pose.txt, stored transposed, camera-to-world, mm, row = frame",
+        "row_major.txt": "C3VD pose.txt, row-major, camera-to-world, mm, row = frame",
+        "7scenes": "7-Scenes, camera-to-world, m",
+    }
+    assert {name: read_trajectory(tmp_path / name, unit="m").source for name in sources} == sources
+    assert (
+        read_trajectory(tmp_path / "kitti.txt").rows(np.arange(3)).source
+        == "KITTI, camera-to-world, mm (assumed), row = frame"
+    )
+    assert trajectory.source == ""
+
+
+def test_seconds_since_1970_are_not_frame_numbers(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text("1403636579 0 0 0 0 0 0 1\n1403636580 0 0 0 0 0 0 1\n")
+    found = read_trajectory(tmp_path / "a.tum")
+    assert not found.has_indices
+    np.testing.assert_allclose(found.times_s, [1403636579, 1403636580])
+
+
+@pytest.mark.parametrize(
+    ("kind", "wanted"), [("tum", 8), ("kitti", 12), ("c3vd", 16), ("oneslam", 8), ("bodyslam", 12)]
+)
+def test_a_named_kind_must_fit(tmp_path: Path, kind: str, wanted: int) -> None:
+    (tmp_path / "a.txt").write_text("# three\n1 2 3\n")
+    with pytest.raises(InputError, match=rf"a\.txt, line 2: found 3 numbers where .* has {wanted} in every line"):
+        read_trajectory(tmp_path / "a.txt", kind=kind)
+    with pytest.raises(InputError, match="cannot read a trajectory from the folder"):
+        read_trajectory(tmp_path, kind=kind)
+
+
+def test_evo_reads_the_same_from_tum_and_kitti(tmp_path: Path, trajectory: Trajectory) -> None:
+    from evo.tools import file_interface
+
+    write_tum(tmp_path / "a.tum", trajectory)
+    write_kitti(tmp_path / "a.txt", trajectory)
+    theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "a.tum"))
+    np.testing.assert_allclose(read_trajectory(tmp_path / "a.tum").T_world_camera, theirs.poses_se3, atol=1e-6)
+    theirs = file_interface.read_kitti_poses_file(str(tmp_path / "a.txt"))
+    np.testing.assert_allclose(read_trajectory(tmp_path / "a.txt").T_world_camera, theirs.poses_se3, atol=1e-9)
+
+
 GOOD = "0 0 0 0 0 0 0 1\n"
 
 

@@ -200,7 +200,7 @@ class Config(Settings):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            raise SettingsError("; ".join(_explain(item) for item in error.errors())) from None
+            raise SettingsError("; ".join(explain(item) for item in error.errors())) from None
 
     def toml(self) -> str:
         """Return all settings as TOML text that `load` reads back; what is None is left out."""
@@ -278,6 +278,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
         raise SettingsError(f"cannot read the settings in {file}: {error}") from None
 
 
-def _explain(error: Any) -> str:
+def explain(error: Any) -> str:
+    """Return one phrase for an error that pydantic found: which setting, what is wrong, what was given."""
     where = ".".join(str(part) for part in error["loc"])
     return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {error['input']!r})"

@@ -106,7 +106,7 @@ def prepare_out(out: Path, *, overwrite: bool) -> None:
 
 def render(out: Path, spec: PhantomSpec = PHANTOM, progress: Callable[[int, int], None] | None = None) -> bool:
     """Render the phantom into OUT/phantom, unless it is there already; return whether it had to be rendered."""
-    if _is_rendered(out / "phantom", spec):
+    if is_rendered(out / "phantom", spec):
         return False
     write_phantom(spec, out / "phantom", progress)
     return True
@@ -158,7 +158,7 @@ def draw(demonstration: Demonstration, folder: Path) -> list[Path]:
     return files
 
 
-def _is_rendered(folder: Path, spec: PhantomSpec) -> bool:
+def is_rendered(folder: Path, spec: PhantomSpec) -> bool:
     """Whether an earlier demonstration left this very phantom; its mesh is what is written last."""
     try:
         description = json.loads((folder / "phantom.json").read_text())

@@ -154,6 +154,31 @@ class DepthWriter:
             raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
 
 
+class DepthReader:
+    """Reads back the depth of a run's folder.
+
+    Raises `InputError` where depth/depth.json is there but cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = Path(folder) / "depth"
+        description = self._folder / "depth.json"
+        self.present = description.is_file()
+        """Whether the run kept its depth."""
+        try:
+            self._scale_mm = float(json.loads(description.read_text())["scale_mm"]) if self.present else 0.0
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"cannot read {description}: {error}") from None
+
+    def read(self, index: int) -> np.ndarray | None:
+        """Return depth (H, W) float32, mm, NaN = unknown, of the frame with this number; None where none was kept."""
+        file = self._folder / f"{index:06d}.png"
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
+        if image is None:
+            return None
+        return np.where(image > 0, image * np.float32(self._scale_mm), np.float32(np.nan))
+
+
 def _step_for(reach_mm: float) -> float:
     """Return the smallest of ..., 0.01, 0.02, 0.05, 0.1, ... mm, `DEPTH_SCALE_MM` at least, that reaches so far."""
     least = max(reach_mm / _LARGEST_UNIT, DEPTH_SCALE_MM) * (1 - 1e-6)

@@ -40,8 +40,10 @@ class RunResult:
     facts: dict[str, Any] = field(default_factory=dict)
 
     def figure(self, group: str, name: str) -> float:
-        """Return one figure; NaN where it is absent or could not be measured."""
-        value = self.figures.get(group, {}).get(name)
+        """Return one figure, of a part as "part.name"; NaN where it is absent or could not be measured."""
+        value: Any = self.figures.get(group, {})
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
         return float(value) if isinstance(value, int | float) else math.nan
 
     def save(self, folder: Path) -> None:

@@ -10,6 +10,8 @@ import sys
 import typer
 
 from scopemap.cli import models
+from scopemap.cli.bench import bench
+from scopemap.cli.compare import compare
 from scopemap.cli.demo import demo
 from scopemap.cli.evaluate import evaluate
 from scopemap.cli.phantom import phantom
@@ -22,7 +24,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, demo, evaluate, phantom):
+for command in (run, demo, evaluate, compare, bench, phantom):
     app.command()(command)
 app.add_typer(models.app, name="models")
 

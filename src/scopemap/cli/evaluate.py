@@ -2,62 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from scopemap.cli.figures import OutputForm, show
 from scopemap.cli.options import AsJson
-from scopemap.errors import InputError
+from scopemap.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    import trimesh
-
+    from scopemap.datasets import Sequence
     from scopemap.evaluation.poses import MatchedTrajectories
-    from scopemap.geometry.align import Similarity
+    from scopemap.trajectory import Trajectory
 
 # Below this ratio of singular values the rotation about the path is hardly fixed by it.
 _WEAK_LINE_RATIO = 1e-3
-
-_LABELS = {
-    "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",
-    "ate_hold_rmse_mm": "ATE RMSE, lost frames held (mm)",
-    "ate_mean_mm": "ATE mean (mm)",
-    "rotation_mean_deg": "rotation error, mean (deg)",
-    "rotation_max_deg": "rotation error, largest (deg)",
-    "rotation_unaligned_mean_deg": "rotation since frame 1, unaligned, mean (deg)",
-    "rotation_unaligned_max_deg": "rotation since frame 1, unaligned, largest (deg)",
-    "rpe_1_mm": "RPE over 1 frame, RMSE (mm)",
-    "rpe_1_deg": "RPE over 1 frame, RMSE (deg)",
-    "rpe_10_mm": "RPE over 10 frames, RMSE (mm)",
-    "rpe_10_deg": "RPE over 10 frames, RMSE (deg)",
-    "tlr": "TLR, path estimated / true, unaligned",
-    "mesh_accuracy_mm": "mesh to true surface, mean (mm)",
-    "mesh_accuracy_p90_mm": "mesh to true surface, 90th percentile (mm)",
-    "mesh_completeness_mm": "true surface to mesh, mean (mm)",
-}
-
-_PAPER_ROWS = (
-    ("T_avg +- std (mm)", "t_avg_mm", "t_std_mm"),
-    ("R_avg +- std (rad)", "r_avg_rad", "r_std_rad"),
-    ("RMSE (mm)", "rmse_mm"),
-    ("T_fin (mm)", "t_fin_mm"),
-    ("R_fin (rad)", "r_fin_rad"),
-    ("RPE +- std over 1 frame (mm)", "rpe_1_frame_mm", "rpe_1_frame_std_mm"),
-    ("RPE +- std over 10 mm of true path (mm)", "rpe_10_mm_path_mm", "rpe_10_mm_path_std_mm"),
-    ("T_max (mm)", "t_max_mm"),
-    ("R_max (rad)", "r_max_rad"),
-    ("T < T_avg (%)", "t_below_avg_percent"),
-    ("R < R_avg (%)", "r_below_avg_percent"),
-    ("TLR", "tlr"),
-    ("lost frames (%)", "lost_percent"),
-)
 
 
 class AlignChoice(StrEnum):
@@ -67,6 +29,7 @@ class AlignChoice(StrEnum):
     ORIGIN = "origin"
     SE3 = "se3"
     SIM3 = "sim3"
+    SCALE = "scale"
 
 
 class UnitChoice(StrEnum):
@@ -79,28 +42,52 @@ class UnitChoice(StrEnum):
 def evaluate(
     trajectory: Annotated[
         Path,
-        typer.Argument(metavar="DIR|TRAJECTORY", help="A run's folder, or a TUM, KITTI or C3VD trajectory file."),
+        typer.Argument(
+            metavar="DIR|TRAJECTORY",
+            help="A run's folder; a TUM, KITTI or C3VD file; a SCARED folder; what OneSLAM, EndoGSLAM, Endo-2DTAM, "
+            "BodySLAM, Open3D, Endo-Depth-and-Motion or COLMAP wrote.",
+        ),
     ],
     truth: Annotated[
         Path,
         typer.Option(
-            help="True poses: a C3VD, phantom or 7-Scenes folder, or a trajectory file. With a run's mesh.ply and a "
-            "mesh_truth.ply here, the mesh is measured too, moved by the same alignment."
+            help="True poses: a data set's folder, or a trajectory file. With a run's mesh.ply and a true surface "
+            "there, the mesh is measured too, moved by the same alignment."
         ),
     ],
     align: Annotated[
-        AlignChoice, typer.Option(help="Fit before measuring: origin = first frames onto each other.")
+        AlignChoice,
+        typer.Option(help="Fit before measuring: origin = first frames onto each other, scale = sizes alone."),
     ] = AlignChoice.SIM3,
+    align_first: Annotated[
+        int | None, typer.Option(min=3, metavar="N", help="Fit on the first N tracked frames only.")
+    ] = None,
     unit: Annotated[
-        UnitChoice,
-        typer.Option(
-            help="Unit of TUM and KITTI files whose header does not say '# unit: mm' or m; all else is known."
-        ),
+        UnitChoice, typer.Option(help="Unit of a trajectory file that does not say its own.")
     ] = UnitChoice.MM,
+    truth_unit: Annotated[
+        UnitChoice | None, typer.Option(help="The same for the truth; as --unit if left out.")
+    ] = None,
+    kind: Annotated[str, typer.Option(help="Form of the trajectory file where its content fits two.")] = "auto",
+    truth_kind: Annotated[str, typer.Option(help="The same for the truth.")] = "auto",
     paper_units: Annotated[
         bool, typer.Option("--paper-units", help="Also the figures of the paper's table 1, rotations in radians.")
     ] = False,
+    protocol: Annotated[
+        list[str] | None,
+        typer.Option(help="Also the figures of another paper's protocol, by name; may be repeated."),
+    ] = None,
+    icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="Also a run's depth maps against true depth.")] = False,
+    consistency: Annotated[
+        bool, typer.Option("--consistency", help="Also the consistency of a run's depth over time.")
+    ] = False,
+    depth_scaling: Annotated[
+        str,
+        typer.Option(help="none, median, scale-and-shift, sequence-median or sequence-scale-and-shift."),
+    ] = "median",
     as_json: AsJson = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
 ) -> None:
     """Compare a trajectory with the truth.
@@ -108,50 +95,58 @@ def evaluate(
     Frames are matched by number where both sides have one (line of the pose file, index in frames.csv, whole numbers
     as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s.
     """
-    from scopemap.evaluation.poses import match, paper_report, pose_report
+    from scopemap.evaluation.paper import paper_report
+    from scopemap.evaluation.poses import match, pose_report
     from scopemap.trajectory import read_trajectory
 
-    matched = match(read_trajectory(trajectory, unit=unit.value), read_trajectory(truth, unit=unit.value), align.value)
-    figures: dict[str, Any] = asdict(pose_report(matched)) | _mesh_figures(trajectory, truth, matched.similarity)
-    paper = asdict(paper_report(matched)) if paper_units else None
+    estimate = read_trajectory(trajectory, unit=unit.value, kind=kind)
+    reference = read_trajectory(truth, unit=(truth_unit or unit).value, kind=truth_kind)
+    matched = match(estimate, reference, align.value, first=align_first)
+    figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
+    if paper_units:
+        figures["paper"] = asdict(paper_report(matched))
+    figures |= _protocols(estimate, reference, protocol or [])
+    if depth or consistency:
+        figures |= _depths(trajectory, truth, depth_scaling if depth else "", consistency=consistency)
+    figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
         _warn(matched)
-    if as_json:
-        typer.echo(json.dumps(_without_nan(figures | ({"paper": paper} if paper else {})), indent=2))
-    elif quiet:
-        typer.echo(_one_line(figures))
-    else:
-        _show(figures, paper)
+    form = OutputForm.LINE if quiet else OutputForm.TABLE
+    show(figures, OutputForm.JSON if as_json else OutputForm.CSV if as_csv else form)
 
 
-def _mesh_figures(trajectory: Path, truth: Path, similarity: Similarity) -> dict[str, float]:
-    mesh_file, truth_file = trajectory / "mesh.ply", truth / "mesh_truth.ply"
-    if not (mesh_file.is_file() and truth_file.is_file()):
+def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp: bool) -> dict[str, Any]:
+    if not (trajectory / "mesh.ply").is_file() or not truth.is_dir():
         return {}
-    from scopemap.evaluation.surface import compare_surfaces
-
-    mesh = _read_mesh(mesh_file)
-    if not len(mesh.faces):  # a run that fused nothing still has poses to be measured
-        return dict.fromkeys(("mesh_accuracy_mm", "mesh_accuracy_p90_mm", "mesh_completeness_mm"), math.nan)
-    mesh.vertices = similarity.transform_points(mesh.vertices)
-    report = compare_surfaces(mesh, _read_mesh(truth_file))
-    return {
-        "mesh_accuracy_mm": report.accuracy.mean_mm,
-        "mesh_accuracy_p90_mm": report.accuracy.p90_mm,
-        "mesh_completeness_mm": report.completeness.mean_mm,
-    }
-
-
-def _read_mesh(path: Path) -> trimesh.Trimesh:
-    import trimesh
+    from scopemap.benchmark.scoring import surface_figures_of
+    from scopemap.datasets import open_sequence
 
     try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # the readers of mesh files raise whatever their parsers raise
-        raise InputError(f"cannot read the mesh {path}: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError(f"the mesh {path} holds no surface")
-    return mesh
+        place: Sequence | Path = open_sequence(truth)
+    except InputError:  # poses and a surface, but no frames that would tell what was seen of it
+        place = truth
+    found = surface_figures_of(trajectory, place, matched.similarity, icp=icp)
+    if not found:
+        return {}
+    short = {"mesh_accuracy_mm": "accuracy_mean_mm", "mesh_accuracy_p90_mm": "accuracy_p90_mm"}
+    short |= {"mesh_completeness_mm": "completeness_mean_mm"}
+    return {name: found[long] for name, long in short.items()} | {"surface": found}
+
+
+def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) -> dict[str, Any]:
+    from scopemap.evaluation.protocols import PROTOCOLS
+
+    unknown = [name for name in names if name not in PROTOCOLS]
+    if unknown:
+        raise SettingsError(f"unknown protocol '{unknown[0]}': choose from {', '.join(PROTOCOLS)}")
+    reports = {name: PROTOCOLS[name](estimate, reference) for name in names}
+    return {name: report.figures | {"description": report.description} for name, report in reports.items()}
+
+
+def _depths(trajectory: Path, truth: Path, scaling: str, *, consistency: bool) -> dict[str, Any]:
+    from scopemap.benchmark.scoring import depth_groups
+
+    return depth_groups(trajectory, truth, scaling, consistency=consistency)
 
 
 def _warn(matched: MatchedTrajectories) -> None:
@@ -166,41 +161,3 @@ def _warn(matched: MatchedTrajectories) -> None:
             "about it is poorly fixed, so are the rotation errors",
             err=True,
         )
-
-
-def _without_nan(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: _without_nan(value) for key, value in tree.items()}
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
-
-
-def _one_line(figures: dict[str, Any]) -> str:
-    return (
-        f"ATE {figures['ate_rmse_mm']:.3f} mm, rotation {figures['rotation_unaligned_mean_deg']:.2f} deg unaligned, "
-        f"TLR {figures['tlr']:.3f} (align {figures['align']}, "
-        f"{figures['tracked']} of {figures['frames']} frames tracked)"
-    )
-
-
-def _show(figures: dict[str, Any], paper: dict[str, float] | None) -> None:
-    console = Console()
-    title = (
-        f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
-        f"scale {figures['scale']:.5g}"
-    )
-    console.print(_table(title, {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}))
-    if paper:
-        rows = {label: " +- ".join(_text(paper[key]) for key in keys) for label, *keys in _PAPER_ROWS}
-        console.print(_table("in the paper's units", rows))
-
-
-def _text(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.4f}"
-
-
-def _table(title: str, rows: dict[str, str]) -> Table:
-    table = Table("figure", title=title, title_justify="left")
-    table.add_column("value", justify="right")
-    for row in rows.items():
-        table.add_row(*row)
-    return table

@@ -35,7 +35,8 @@ class DeviceChoice(StrEnum):
 
 def run(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, a C3VD or 7-Scenes folder.")
+        Path,
+        typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the result.")],
     preset: Annotated[
@@ -46,7 +47,11 @@ def run(
         Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
     ] = None,
     dataset: Annotated[
-        str | None, typer.Option(help="c3vd, 7-scenes, video or images; told from what lies there if left out.")
+        str | None,
+        typer.Option(
+            help="scared-c, scared, hamlyn, hamlyn-tracking, c3vd, 7-scenes, video or images; told from what lies "
+            "there if left out."
+        ),
     ] = None,
     camera: Annotated[
         Path | None,

@@ -1,18 +1,20 @@
 """C3VD: phantom colonoscopy with registered truth, and what is written in its layout (github.com/DurrLab/C3VD).
 
-One folder per video: `NNNN_color.png`, `NNNN_depth.tiff`, `pose.txt`; image number = line of `pose.txt`, from 0.
-Bobrow et al., "Colonoscopy 3D video dataset with paired depth from 2D-3D registration", arXiv 2206.08903.
+One folder per video: `NNNN_color.png`, `NNNN_depth.tiff`, `pose.txt`; image number = line of `pose.txt`, from 0. Also
+C3VDv2's `rgb/NNNN.png`, `depth/NNNN_depth.tiff`, and EndoGSLAM's copy of C3VD, `color/`, `depth/`: undistorted, half
+the size, depth of 8 bit. Bobrow et al., "Colonoscopy 3D video dataset with paired depth from 2D-3D registration",
+arXiv 2206.08903; Golhar et al., arXiv 2506.24074 (v2); Wang et al., arXiv 2403.15124 (EndoGSLAM).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from scopemap.calibration import fitted_to
-from scopemap.datasets.images import ImageFolder, image_files
+from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.datasets.images import ImageFolder, decoded, image_files
 from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
@@ -29,6 +31,10 @@ CAMERA = OmnidirectionalCamera(
 )
 """Olympus CF-HQ190L as published with the data set, for pixel centres that count from 0."""
 
+UNDISTORTED_CAMERA = PinholeCamera(802.319, 801.885, 668.286, 547.733, 1350, 1080)
+"""The pinhole that EndoGSLAM undistorted C3VD to, at full size (its configuration halves the principal point plainly,
+a quarter of a pixel off what halving the images does)."""
+
 DEPTH_RANGE_MM = 100.0
 _DEPTH_SUFFIXES = (".tiff", ".tif", ".png")
 _LARGEST = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
@@ -40,7 +46,8 @@ class C3vdFolder(ImageFolder):
     name = "c3vd"
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, [file for file in image_files(path) if file.stem.endswith("_color")])
+        files, self._depth_folder, folder = _layout(path)
+        super().__init__(path, files)
         self.poses = read_poses(path / "pose.txt")
         missing = [f for number, f in zip(self.numbers, self.files, strict=True) if number >= len(self.poses)]
         if missing:
@@ -52,28 +59,67 @@ class C3vdFolder(ImageFolder):
         # A calibration of its own marks a rendering; C3VD proper was registered to real video.
         self._quality: TruthQuality = "registered" if self.camera is None else "exact"
         if self.camera is None:
-            self.camera = fitted_to(CAMERA, (self.width, self.height), "shipped for C3VD")
-            self.camera_source = "published C3VD calibration (Scaramuzza polynomial)"
+            self._use_published(undistorted=folder == "color" and self._is_reduced())
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `pose.txt` and `*_color.*` images."""
-        return (path / "pose.txt").is_file() and any(path.glob("*_color.*"))
+        """Whether `path` holds `pose.txt` and images in one of the layouts."""
+        return (path / "pose.txt").is_file() and bool(_layout(path)[0])
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the pose of the image's line in pose.txt."""
+        return self.poses[index]
 
     def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and, where its file lies beside the image, depth."""
+        """Return pose and, where the image has such a file, depth."""
         return SourceTruth(self.poses[index], self._depth_mm(index), self._quality)
 
+    def _use_published(self, undistorted: bool) -> None:
+        camera: CameraModel = UNDISTORTED_CAMERA if undistorted else CAMERA
+        self.camera = fitted_to(camera, (self.width, self.height), "shipped for C3VD")
+        self.camera_source = "published C3VD calibration (Scaramuzza polynomial)"
+        if undistorted:
+            self.camera_source = "EndoGSLAM's calibration of undistorted C3VD (pinhole)"
+            self.notes.append("depth of 8 bit, in steps of 0.39 mm: images undistorted and reduced by EndoGSLAM")
+
+    def _is_reduced(self) -> bool:
+        """Whether the first depth is of 8 bit, as in EndoGSLAM's copy; 16 bit are C3VD's, only sorted into folders."""
+        found = (file for number in self.numbers if (file := self._depth_file(number)) is not None)
+        first = next(found, None)
+        return first is None or _read_depth(first).dtype == np.uint8
+
+    def _depth_file(self, index: int) -> Path | None:
+        stem = self._file_of[index].stem.removesuffix("_color")
+        names = [f"{stem}_depth{suffix}" for suffix in _DEPTH_SUFFIXES]
+        if self._depth_folder != self.path:
+            names += [f"{stem}{suffix}" for suffix in _DEPTH_SUFFIXES]
+        return next((self._depth_folder / name for name in names if (self._depth_folder / name).is_file()), None)
+
     def _depth_mm(self, index: int) -> np.ndarray | None:
-        stem = self._file_of[index].with_suffix("").as_posix().removesuffix("_color") + "_depth"
-        file = next((Path(stem + s) for s in _DEPTH_SUFFIXES if Path(stem + s).is_file()), None)
+        file = self._depth_file(index)
         if file is None:
             return None
-        values = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if values is None or values.ndim != 2 or values.dtype not in _LARGEST:
-            raise InputError(f"reading {file}: expected a depth image of one 8- or 16-bit channel")
+        values = _read_depth(file)
         largest = _LARGEST[values.dtype]
         scale_mm = self.depth_scale_mm or DEPTH_RANGE_MM / largest
         # 0 lies outside the lens circle, the largest value was clipped.
         known = (values > 0) & (values < largest)
         return np.where(known, values * np.float32(scale_mm), np.nan).astype(np.float32)
+
+
+def _layout(path: Path) -> tuple[list[Path], Path, str]:
+    """Return the colour images, the folder of the depth files, and the folder that holds the images, "" for flat."""
+    flat = [file for file in image_files(path) if file.stem.endswith("_color")] if path.is_dir() else []
+    if flat:
+        return flat, path, ""
+    for name, needs_depth in (("color", True), ("rgb", False)):
+        if (path / name).is_dir() and ((path / "depth").is_dir() or not needs_depth):
+            return image_files(path / name), path / "depth", name
+    return [], path, ""
+
+
+def _read_depth(file: Path) -> np.ndarray:
+    values = decoded(file.read_bytes())
+    if values is None or values.ndim != 2 or values.dtype not in _LARGEST:
+        raise InputError(f"reading {file}: expected a depth image of one 8- or 16-bit channel")
+    return values

@@ -40,10 +40,35 @@ def image_files(folder: Path) -> list[Path]:
 
 def read_image(file: Path) -> np.ndarray | None:
     """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
-    # imdecode also reads names that imread cannot open on some systems.
-    data = np.fromfile(file, dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    # Decoding what was read also works for names that OpenCV cannot open on some systems.
+    return decoded_image(file.read_bytes())
+
+
+def decoded_image(content: bytes) -> np.ndarray | None:
+    """Return the image in a file's `content` as (h, w, 3) uint8 RGB; None where it holds none."""
+    image = decoded(content, cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
+    """Return the image in a file's `content` as OpenCV has it, channels turned round; None where it holds none."""
+    try:
+        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags) if content else None
+    except cv2.error:
+        return None
+
+
+def read_depth16(file: Path) -> np.ndarray | None:
+    """Return a depth image (h, w) uint16 as it is in the file, None where there is no file.
+
+    Raises `InputError` for what is no image of one 16-bit channel: depth that was squeezed into 8 bit is not the same.
+    """
+    if not file.is_file():
+        return None
+    values = decoded(file.read_bytes())
+    if values is None or values.dtype != np.uint16 or values.ndim != 2:
+        raise InputError(f"reading {file}: expected a depth image of one 16-bit channel")
+    return values
 
 
 class ImageFolder:
@@ -92,6 +117,14 @@ class ImageFolder:
                     "a sequence needs frames of one size"
                 )
             yield SourceFrame(number, number / FOLDER_RATE_HZ, rgb, file.name)
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]]:
+        """Return number and time stamp of the selected frames, of files that turn out unreadable, too."""
+        return [(number, number / FOLDER_RATE_HZ) for number in self.numbers[selection]]
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """A plain folder knows no pose."""
+        return None
 
     def truth(self, index: int) -> SourceTruth | None:
         """A plain folder knows no truth."""

@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from scopemap.calibration import Calibration, read_calibration
 from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
 from scopemap.datasets.images import ImageFolder
+from scopemap.datasets.scared import ScaredKeyframe
+from scopemap.datasets.scared_c import ScaredCKeyframe
 from scopemap.datasets.sequence import Sequence, Source, assumed_camera
 from scopemap.datasets.sevenscenes import SevenScenesFolder
 from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError
 from scopemap.rectification import Rectifier, working_camera, working_size
 
-DATASETS: dict[str, type[C3vdFolder | SevenScenesFolder | VideoFile | ImageFolder]] = {
-    kind.name: kind for kind in (C3vdFolder, SevenScenesFolder, VideoFile, ImageFolder)
-}
+Reader: TypeAlias = ScaredCKeyframe | ScaredKeyframe | VideoFile | ImageFolder  # data sets of folders are ImageFolders
+
+_KINDS: tuple[type[Reader], ...] = (
+    ScaredCKeyframe,
+    ScaredKeyframe,
+    HamlynFolder,
+    HamlynTrackingFolder,
+    C3vdFolder,
+    SevenScenesFolder,
+    VideoFile,
+    ImageFolder,
+)
+DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
 """The readers by name, in the order in which they are asked whether they recognise an input."""
 
 _SMALLEST_SIDE_PX = 32
 _DEEPEST_NESTING = 3
+_SEARCH_DEPTH = 2
+_LEAVINGS = "__MACOSX"
 
 
 def open_sequence(
@@ -70,12 +86,15 @@ def open_sequence(
     return sequence
 
 
-def _open_source(path: Path, dataset: str | None) -> C3vdFolder | SevenScenesFolder | VideoFile | ImageFolder:
+def _open_source(path: Path, dataset: str | None) -> Reader:
     if dataset is not None and dataset not in DATASETS:
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
-    path = _innermost(path)
+    try:
+        path = _innermost(path)
+    except PermissionError as error:
+        raise InputError(f"reading {error.filename}: no permission to look into it") from None
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
     if (kind == VideoFile.name) != path.is_file():
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
@@ -83,16 +102,39 @@ def _open_source(path: Path, dataset: str | None) -> C3vdFolder | SevenScenesFol
 
 
 def _innermost(path: Path) -> Path:
-    """Step into a folder that holds nothing but one folder, or that keeps its frames in `images`."""
+    """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only.
+
+    Raises `InputError` where a folder holds several sequences of a data set.
+    """
     for _ in range(_DEEPEST_NESTING):
         if any(kind.recognises(path) for kind in DATASETS.values()):
             return path
-        inner = [folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
+        inner = _folders_in(path)
         images = [folder for folder in inner if folder.name == "images"]
         if len(images or inner) != 1:
-            return path
+            return _only_sequence_below(path) or path
         path = (images or inner)[0]
     return path
+
+
+def _only_sequence_below(path: Path) -> Path | None:
+    """Return the one sequence of a data set in the folders below, or None; several are an error that names them."""
+    kinds = [kind for kind in DATASETS.values() if kind not in (VideoFile, ImageFolder)]
+    level = _folders_in(path)
+    for _ in range(_SEARCH_DEPTH):
+        found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
+        if len(found) > 1:
+            names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
+            raise InputError(f"reading {path}: it holds {len(found)} sequences ({names}); give one of them")
+        if found:
+            return found[0]
+        level = [inner for folder in level for inner in _folders_in(folder)]
+    return None
+
+
+def _folders_in(path: Path) -> list[Path]:
+    folders = (folder for folder in path.iterdir() if folder.is_dir())
+    return sorted(folder for folder in folders if not folder.name.startswith(".") and folder.name != _LEAVINGS)
 
 
 def _calibration_of(source: Source, file: Path | str | None, fov_deg: float) -> tuple[Calibration, bool]:

@@ -79,6 +79,12 @@ class Source(Protocol):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
 
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
+
     def truth(self, index: int) -> SourceTruth | None:
         """Return what is known of the frame with this `SourceFrame.index`, or None."""
 

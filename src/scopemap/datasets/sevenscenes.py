@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from scopemap.camera import PinholeCamera
-from scopemap.datasets.images import ImageFolder, image_files
+from scopemap.datasets.images import ImageFolder, image_files, read_depth16
 from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import orthonormalised
@@ -42,19 +41,21 @@ class SevenScenesFolder(ImageFolder):
         """Whether `path` holds `frame-*.color.*` and poses beside them."""
         return any(path.glob("frame-*.color.*")) and any(path.glob("frame-*.pose.txt"))
 
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the pose in the frame's file; None where tracking lost it (not finite) or there is no file."""
+        return _read_pose(self._beside(index, ".pose.txt"))
+
     def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and measured depth; a pose that tracking lost (not finite) is None."""
-        stem = self._file_of[index].as_posix().split(".color.")[0]
-        return SourceTruth(
-            _read_pose(Path(stem + ".pose.txt")), self._depth_mm(Path(stem + ".depth.png")), "registered"
-        )
+        """Return pose and measured depth."""
+        return SourceTruth(self.pose(index), self._depth_mm(self._beside(index, ".depth.png")), "registered")
+
+    def _beside(self, index: int, ending: str) -> Path:
+        return Path(self._file_of[index].as_posix().split(".color.")[0] + ending)
 
     def _depth_mm(self, file: Path) -> np.ndarray | None:
-        if not file.is_file():
+        values = read_depth16(file)
+        if values is None:
             return None
-        values = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if values is None or values.dtype != np.uint16 or values.ndim != 2:
-            raise InputError(f"reading {file}: expected a depth image of one 16-bit channel")
         depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
         return np.where(np.isin(values, _UNKNOWN), np.nan, depth_mm).astype(np.float32)
 

@@ -7,6 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 import av
+import numpy as np
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
@@ -42,14 +43,14 @@ class VideoFile:
             found = "holds one frame, two are needed" if first else "holds no readable frame"
             raise InputError(f"reading the video {path}: it {found}")
         self.width, self.height = first[0].width, first[0].height
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]
-            self._rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
-            if not self._rate_hz:
-                self._rate_hz = DEFAULT_RATE_HZ
+            self.rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
+            if not self.rate_hz:
+                self.rate_hz = DEFAULT_RATE_HZ
                 self.notes.append(f"time stamps: frame number / {DEFAULT_RATE_HZ:g} s (the video holds none)")
             self.pixel_aspect = float(stream.sample_aspect_ratio or 1.0)
-            self.count = _claimed_frames(stream, container.duration, self._rate_hz)
+            self.count = _claimed_frames(stream, container.duration, self.rate_hz)
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -64,8 +65,16 @@ class VideoFile:
                     f"reading the video {self.path}: frame {index} is {frame.width}x{frame.height} px, those before it "
                     f"are {self.width}x{self.height} px; cut the video there"
                 )
-            time_s = index / self._rate_hz if frame.time is None else frame.time
+            time_s = index / self.rate_hz if frame.time is None else frame.time
             yield SourceFrame(index, time_s, frame.to_ndarray(format="rgb24"))
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Only decoding tells how many frames there are, and when."""
+        return None
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """A video knows no pose."""
+        return None
 
     def truth(self, index: int) -> SourceTruth | None:
         """A video knows no truth."""
@@ -75,10 +84,12 @@ class VideoFile:
         index = damaged = 0
         broken = False
         try:
-            with av.open(str(self.path)) as container:
+            with av.open(str(self.path), metadata_errors="replace") as container:
                 if not container.streams.video:
                     raise InputError(f"reading the video {self.path}: it has no picture")
                 stream = container.streams.video[0]
+                if stream.codec_context is None:
+                    raise InputError(f"reading the video {self.path}: FFmpeg knows no decoder for it")
                 if stream.codec_context.name in _TEXT_CODECS:
                     raise InputError(f"reading the video {self.path}: it is a text file, not a video")
                 stream.thread_type = "AUTO"

@@ -1,20 +1,59 @@
 """Depth maps against true depth: the field's standard errors, per image, and their mean over images.
 
 Definitions: Eigen, Puhrsch and Fergus, "Depth map prediction from a single image", NeurIPS 2014, section 4.2; average
-over images, not over pixels, as AF-SfMLearner and EndoDAC report it.
+over images, not over pixels, as AF-SfMLearner and EndoDAC report it. Whole sequences, and scales that are found over
+them, are in `depth_sequence.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
-from scopemap.errors import check_shape
+from scopemap.errors import SettingsError, check_shape
 
-DepthScaling = Literal["none", "median"]
+ImageScaling = Literal["none", "median", "scale-and-shift"]
+DepthScaling = Literal["none", "median", "scale-and-shift", "sequence-median", "sequence-scale-and-shift"]
+"""How a prediction is scaled first. Per image: factor median(g) / median(d), or least squares of scale and shift in
+disparity. Per sequence: the same, found once over the pixels of all frames."""
+
+DEPTH_RANGES_MM: dict[str, tuple[float, float]] = {
+    "scared": (1e-3, 150.0),  # AF-SfMLearner and EndoDAC, evaluate_depth.py
+    "hamlyn": (1.0, 300.0),  # Endo-Depth-and-Motion and EndoOmni; AF-SfMLearner caps at 150
+    "c3vd": (1e-3, 100.0),  # EndoDAC; the data set's files end at 100
+    "serv-ct": (1.0, 180.0),  # AF-SfMLearner
+}
+"""Range of true depth that counts, both ends excluded, by data set, as the named projects evaluate it."""
+
+# Video-Depth-Anything floors fitted disparity at 1e-3 per metre: no pixel is farther than a kilometre.
+_LEAST_DISPARITY_PER_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class DepthFit:
+    """What is applied to a prediction d (mm): 1 / d' = 1 / (scale d) + shift. The default leaves it as it is.
+
+    Attributes
+    ----------
+    scaling : how it was found.
+    scale : factor on the depth; infinite where least squares found nothing of the prediction in the truth.
+    shift_per_mm : added to the disparity, 1/mm; not 0 under scale-and-shift only.
+    """
+
+    scaling: DepthScaling = "none"
+    scale: float = 1.0
+    shift_per_mm: float = 0.0
+
+    def apply(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Return depth of any shape, mm, scaled and shifted; unknown (NaN) and impossible (<= 0) values give NaN."""
+        depth_mm = np.where(depth_mm > 0, depth_mm, np.nan)
+        if self.shift_per_mm == 0 and np.isfinite(self.scale):
+            return self.scale * depth_mm
+        disparity = 1 / (self.scale * depth_mm) + self.shift_per_mm
+        return 1 / np.maximum(disparity, _LEAST_DISPARITY_PER_MM)
 
 
 @dataclass(frozen=True)
@@ -23,17 +62,20 @@ class DepthReport:
 
     Attributes
     ----------
+    scaling : how the prediction was scaled first.
     pixels : compared pixels; coverage : their share of the pixels with true depth, 0..1.
-    scale : factor applied to the prediction first (1 without scaling).
+    scale, shift_per_mm : what was applied to the prediction, as in `DepthFit` (1 and 0 without scaling).
     abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g.
     rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
     mae_mm : mean |d - g|.
     delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
     """
 
+    scaling: DepthScaling
     pixels: float
     coverage: float
     scale: float
+    shift_per_mm: float
     abs_rel: float
     sq_rel_mm: float
     rmse_mm: float
@@ -48,25 +90,72 @@ def evaluate_depth(
     predicted_mm: np.ndarray,
     truth_mm: np.ndarray,
     *,
-    scaling: DepthScaling = "none",
+    scaling: ImageScaling | DepthFit = "none",
     truth_range_mm: tuple[float, float] = (1e-3, float("inf")),
+    clip_prediction: bool = False,
 ) -> DepthReport:
     """Return the errors of a predicted depth map (H, W) against the true one (H, W), both mm, NaN = unknown.
 
-    Compared are pixels with true depth strictly inside `truth_range_mm` and a positive prediction. `median` first
-    multiplies the prediction by the ratio of the medians over these pixels, which hides a wrong scale: say so.
+    Compared are pixels with true depth strictly inside `truth_range_mm` and a positive prediction.
+
+    Parameters
+    ----------
+    predicted_mm, truth_mm : (H, W) float.
+    scaling : applied to the prediction first. `median`: the ratio of the medians over the compared pixels;
+        `scale-and-shift`: least squares in disparity over them. Both hide a wrong scale, so the report names them. Or a
+        fit found elsewhere, such as that of a whole sequence. Raises `SettingsError` for another name.
+    truth_range_mm : see `DEPTH_RANGES_MM`.
+    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and
+        Video-Depth-Anything do. Far pixels of a shifted prediction own the mean without it.
+    """
+    d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
+    coverage = len(d) / max(known, 1)
+    fit = scaling if isinstance(scaling, DepthFit) else _fit(d, g, scaling)
+    if len(d) == 0:
+        return DepthReport(fit.scaling, 0, coverage, *[float("nan")] * 10)
+    scaled = fit.apply(d)
+    if clip_prediction:
+        scaled = np.clip(scaled, *truth_range_mm)
+    return DepthReport(fit.scaling, len(d), coverage, fit.scale, fit.shift_per_mm, *_errors(scaled, g))
+
+
+def compared_depths(
+    predicted_mm: np.ndarray, truth_mm: np.ndarray, truth_range_mm: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return prediction and truth (N,) float64, mm, where both can be compared, and how many true depths there are.
+
+    Both maps are (H, W), mm, NaN = unknown. True depth counts strictly inside the range, a prediction where it is
+    positive and finite.
     """
     check_shape("predicted_mm", predicted_mm, np.shape(truth_mm))
     nearest, farthest = truth_range_mm
     known = np.isfinite(truth_mm) & (truth_mm > nearest) & (truth_mm < farthest)
     compared = known & np.isfinite(predicted_mm) & (predicted_mm > 0)
-    pixels = int(np.count_nonzero(compared))
-    coverage = pixels / max(int(np.count_nonzero(known)), 1)
-    if pixels == 0:
-        return DepthReport(0, coverage, *[float("nan")] * 9)
     d, g = predicted_mm[compared].astype(np.float64), truth_mm[compared].astype(np.float64)
-    scale = float(np.median(g) / np.median(d)) if scaling == "median" else 1.0
-    return DepthReport(pixels, coverage, scale, *_errors(scale * d, g))
+    return d, g, int(np.count_nonzero(known))
+
+
+def disparity_fit(covariance: float, variance: float, means: tuple[float, float], scaling: DepthScaling) -> DepthFit:
+    """Return the least-squares fit 1 / g = a / d + b from moments of predicted and true disparity, in 1/mm.
+
+    `variance` is the predicted disparity's, `means` are of predicted and true disparity. A prediction without any
+    variation fits any line: it becomes the mean of the truth. The same solution as Video-Depth-Anything's
+    (arXiv 2501.12375; `benchmark/eval`), by the normal equations.
+    """
+    slope = covariance / variance if variance > 0 else 0.0
+    return DepthFit(scaling, 1 / slope if slope != 0 else float("inf"), means[1] - slope * means[0])
+
+
+def _fit(d: np.ndarray, g: np.ndarray, scaling: ImageScaling) -> DepthFit:
+    if scaling not in get_args(ImageScaling):
+        raise SettingsError(f"scaling of one image '{scaling}': choose one of {', '.join(get_args(ImageScaling))}")
+    if scaling == "none" or len(d) == 0:
+        return DepthFit(scaling)
+    if scaling == "median":
+        return DepthFit(scaling, float(np.median(g) / np.median(d)))
+    x, y = 1 / d, 1 / g
+    means = float(x.mean()), float(y.mean())
+    return disparity_fit(float(np.mean((x - means[0]) * (y - means[1]))), float(np.var(x)), means, scaling)
 
 
 def _errors(d: np.ndarray, g: np.ndarray) -> list[float]:
@@ -84,10 +173,16 @@ def _errors(d: np.ndarray, g: np.ndarray) -> list[float]:
 
 
 def mean_depth_report(reports: Sequence[DepthReport]) -> DepthReport:
-    """Return the mean over images; those without a comparable pixel count in `pixels` and `coverage` only."""
+    """Return the mean over images; those without a comparable pixel count in `pixels` and `coverage` only.
+
+    Raises `SettingsError` where the images were scaled in different ways: their mean would have no name.
+    """
     if not reports:
-        return DepthReport(0, *[float("nan")] * 10)
-    table = np.array([astuple(report) for report in reports], dtype=np.float64)
+        return DepthReport("none", 0, *[float("nan")] * 11)
+    scalings = sorted({report.scaling for report in reports})
+    if len(scalings) > 1:
+        raise SettingsError(f"mean of depth errors: the images were scaled by {', '.join(scalings)}; use one of them")
+    table = np.array([astuple(report)[1:] for report in reports], dtype=np.float64)
     compared = table[:, 0] > 0
     errors = table[compared, 2:].mean(axis=0) if compared.any() else np.full(table.shape[1] - 2, np.nan)
-    return DepthReport(*(float(value) for value in (*table[:, :2].mean(axis=0), *errors)))
+    return DepthReport(scalings[0], *(float(value) for value in (*table[:, :2].mean(axis=0), *errors)))

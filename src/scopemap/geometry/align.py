@@ -6,7 +6,7 @@ IEEE TPAMI 13(4), 1991, eq. 34-43.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from scopemap.errors import AlignmentError, check_shape
 from scopemap.geometry.se3 import inverse
 
-AlignMode = Literal["none", "origin", "se3", "sim3"]
+AlignMode = Literal["none", "origin", "se3", "sim3", "scale"]
 
 # Singular values below this share of the largest are rounding, not motion.
 _RANK_TOLERANCE = 1e-12
@@ -95,17 +95,31 @@ def _refuse_degenerate(singular_values: np.ndarray, magnitude: float) -> None:
         )
 
 
-def align_trajectories(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> tuple[np.ndarray, Similarity]:
+def align_trajectories(
+    estimated: np.ndarray, reference: np.ndarray, mode: AlignMode, *, first: int | None = None
+) -> tuple[np.ndarray, Similarity]:
     """Return the estimated poses moved onto the reference, and the similarity that moved them.
 
     Both are (N, 4, 4) float64 camera-to-world, mm, matched row by row. `none` moves nothing, `origin` puts the first
-    poses onto each other, `se3` and `sim3` fit the positions (`umeyama`). Raises `AlignmentError` where the fit is
-    degenerate or `mode` is unknown.
+    poses onto each other, `se3` and `sim3` fit the positions (`umeyama`), `scale` takes the scale of the `sim3` fit and
+    neither turns nor shifts. `first` fits the first rows only (evo's `--n_to_align`) and moves all. Raises
+    `AlignmentError` where the fit is degenerate, `mode` is unknown, or `first` is given to a mode that fits nothing.
     """
     check_shape("estimated", estimated, (None, 4, 4))
     check_shape("reference", reference, (len(estimated), 4, 4))
-    similarity = _fit(estimated, reference, mode)
+    if first is not None:
+        _refuse_useless_first(first, mode)
+    similarity = _fit(estimated[:first], reference[:first], mode)
     return similarity.transform_poses(estimated), similarity
+
+
+def _refuse_useless_first(first: int, mode: AlignMode) -> None:
+    if mode in ("none", "origin"):
+        raise AlignmentError(
+            f"cannot fit the first {first} frames: alignment '{mode}' fits none; use se3, sim3 or scale"
+        )
+    if first < 3:
+        raise AlignmentError(f"cannot fit the first {first} frames: a rotation needs at least 3 positions")
 
 
 def _fit(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> Similarity:
@@ -114,6 +128,7 @@ def _fit(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> Simil
     if mode == "origin":
         T = reference[0] @ inverse(estimated[0])
         return Similarity(1.0, T[:3, :3], T[:3, 3])
-    if mode in ("se3", "sim3"):
-        return umeyama(estimated[:, :3, 3], reference[:, :3, 3], with_scale=mode == "sim3")
-    raise AlignmentError(f"unknown alignment '{mode}': choose none, origin, se3 or sim3")
+    if mode in ("se3", "sim3", "scale"):
+        found = umeyama(estimated[:, :3, 3], reference[:, :3, 3], with_scale=mode != "se3")
+        return replace(found, R=np.eye(3), t=np.zeros(3)) if mode == "scale" else found
+    raise AlignmentError(f"unknown alignment '{mode}': choose none, origin, se3, sim3 or scale")

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import trimesh
 
 from scopemap.errors import check_shape
+from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR, new_figure
 from scopemap.report.mesh_view import inside_view, outside_views, render_mesh
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-ESTIMATE_COLOUR = "#1a9850"
-TRUTH_COLOUR = "#d73027"
 _TURBO_LAST = 255
 
 
@@ -40,7 +35,7 @@ def draw_trajectories(estimate_positions_mm: np.ndarray, reference_positions_mm:
     Estimate green, truth red, the start a dot; rows of NaN (lost frames) are gaps.
     """
     check_shape("estimate_positions_mm", estimate_positions_mm, (None, 3))
-    figure = _figure(12.0, 4.2)
+    figure = new_figure(12.0, 4.2)
     paths = [("estimate", ESTIMATE_COLOUR, estimate_positions_mm)]
     if reference_positions_mm is not None:
         check_shape("reference_positions_mm", reference_positions_mm, (None, 3))
@@ -80,7 +75,7 @@ def draw_depths(
             f"drawing depths of {len(images)} images: give one or more, and as many depth maps of each kind"
         )
     near_mm, far_mm = _depth_range([depth for depths in columns.values() for depth in depths if depth is not None])
-    figure = _figure(3.0 * (1 + len(columns)), 2.5 * len(images))
+    figure = new_figure(3.0 * (1 + len(columns)), 2.5 * len(images))
     for row, image in enumerate(images):
         cells = {"image": image}
         for name, depths in columns.items():
@@ -111,7 +106,7 @@ def draw_mesh(
     views = [] if T_world_view is None else [("from the camera", inside_view(T_world_view))]
     views += zip(("from outside", "from the other side"), outside_views(frame_of, T_world_view), strict=True)
     rows = [("", mesh)] + ([] if reference_mesh is None else [("truth, ", reference_mesh)])
-    figure = _figure(4.0 * len(views), 4.6 * len(rows))
+    figure = new_figure(4.0 * len(views), 4.6 * len(rows))
     for row, (prefix, drawn) in enumerate(rows):
         for column, (title, view) in enumerate(views):
             axes = figure.add_subplot(len(rows), len(views), row * len(views) + column + 1)
@@ -127,13 +122,3 @@ def _depth_range(depths: list[np.ndarray]) -> tuple[float, float]:
         return 0.0, 1.0
     near, far = np.percentile(known, [2, 98])
     return float(near), float(max(far, near + 1e-3))
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    # Imported here, so that importing the package stays fast; a Figure with its own canvas keeps no global state.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

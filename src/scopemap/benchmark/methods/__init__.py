@@ -1,5 +1,5 @@
 """Ours and the baselines, behind one signature."""
 
-from scopemap.benchmark.methods.method import Method, Task
+from scopemap.benchmark.methods.method import Method, Task, Timing
 
-__all__ = ["Method", "Task"]
+__all__ = ["Method", "Task", "Timing"]

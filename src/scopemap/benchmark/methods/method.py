@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from scopemap.config import Config
 from scopemap.datasets import Sequence
 
 
@@ -17,30 +17,37 @@ class Task:
     Attributes
     ----------
     sequence : rectified frames; a method sees `frames()`, never the truth.
-    config : settings that all methods share: depth, its anchor, masks, fusion. A method changes nothing in `mask` and
-        `depth` but what its own description says.
-    seed : for methods with chance in them; `name` : of the sequence.
+    settings : dotted names to values, shared by all methods: depth and its anchor, masks, fusion.
+    seed : for methods with chance in them. name : of the sequence.
     """
 
     sequence: Sequence
-    config: Config
+    settings: Mapping[str, Any] = field(default_factory=dict)
     seed: int = 0
     name: str = ""
 
 
-class Method(Protocol):
-    """Turns a task into a run's folder, which is then scored by the same code for all.
+@dataclass(frozen=True)
+class Timing:
+    """How long a method took; NaN where it was not measured (an imported trajectory).
 
     Attributes
     ----------
-    title : for tables. description : what it is and where it comes from, one or two sentences.
+    ms_per_frame : wall time from the first finished frame to the last, per frame: start-up is left out.
+    track_ms_per_frame : the odometry alone.
+    seconds : by stage; stages in different threads overlap.
     """
 
-    title: str
-    description: str
+    ms_per_frame: float = float("nan")
+    track_ms_per_frame: float = float("nan")
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
-    def run(self, task: Task, out: Path) -> dict[str, Any]:
-        """Write at least trajectory.tum, frames.csv and provenance.json to `out`; return seconds by stage.
+
+class Method(Protocol):
+    """Turns a task into a run's folder, which is then scored by the same code for all."""
+
+    def run(self, task: Task, out: Path) -> Timing:
+        """Write at least trajectory.tum, frames.csv and provenance.json to `out`.
 
         Raises what the method raises: the benchmark makes a row of it.
         """

@@ -1,0 +1,140 @@
+"""Entry: one method on one sequence with one seed, as it is handed to a process of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from scopemap.benchmark.plan import MethodPlan, Plan, ProtocolPlan, SequencePlan, folder_name, spec_of
+from scopemap.config import Config
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.errors import SettingsError
+
+FILE_NAME = "entry.json"
+
+
+class Entry(BaseModel):
+    """One row-to-be.
+
+    Attributes
+    ----------
+    sequence, method, protocol, settings, seed : of the plan. data : the folder that --data names.
+    out : the benchmark's folder.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    sequence: SequencePlan
+    method: MethodPlan
+    protocol: ProtocolPlan
+    settings: dict[str, Any]
+    seed: int
+    data: Path | None
+    out: Path
+
+    @property
+    def label(self) -> str:
+        """Name for people and, made safe, for folders: the seed stands in it where it is not 0."""
+        return self.sequence.name + (f", seed {self.seed}" if self.seed else "")
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is kept."""
+        return self.out / "runs" / folder_name(self.label) / folder_name(self.method.name)
+
+    @property
+    def source(self) -> Path:
+        """The sequence's own folder or file; a phantom's is made below `out`."""
+        if self.sequence.phantom is not None:
+            return self.out / "phantoms" / folder_name(self.label)
+        return _below(self.data, self.sequence.path)
+
+    @property
+    def key(self) -> str:
+        """Fingerprint of all that decides the figures; a run with another key is not this one."""
+        described = self.model_dump(mode="json", exclude={"out", "data"})
+        return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16]
+
+    def open(self) -> Sequence:
+        """Open the sequence; raises as `open_sequence`."""
+        plan = self.sequence
+        camera = None if plan.camera is None else _below(self.data, plan.camera)
+        frames = None if plan.frames is None else slice(*plan.frames)
+        return open_sequence(self.source, dataset=plan.dataset, camera=camera, size=plan.size, frames=frames)
+
+    def shared_settings(self) -> dict[str, Any]:
+        """Return the settings that all methods are given on this sequence."""
+        settings = self.settings | self.sequence.settings
+        kind, _, folder = self.sequence.depth.partition(":")
+        if kind == "true":
+            # C3VDv2 and EndoGSLAM keep depth apart; 8 bit is depth, too, when it is the truth.
+            apart = self.source / "depth"
+            settings |= {"depth.backend": f"files:{apart if apart.is_dir() else self.source}"}
+            settings |= {"depth.files_kind": "measured"}
+        elif kind == "files":
+            settings["depth.backend"] = f"files:{_below(self.data, folder)}"
+        elif kind:
+            settings["depth.backend"] = self.sequence.depth
+        if kind:
+            # A preset may ask for a metric network: the depth that a plan names stands for itself.
+            settings.setdefault("depth.anchor", "auto")
+        if self.sequence.near_far_mm is not None:
+            settings |= {"depth.near_far_mm": self.sequence.near_far_mm, "depth.anchor": "near-far"}
+        Config.load(settings=settings)
+        return settings
+
+    def save(self) -> Path:
+        """Write the entry into its folder and return the file."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        file = self.folder / FILE_NAME
+        file.write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        return file
+
+    @classmethod
+    def load(cls, file: Path) -> Entry:
+        """Read what `save` wrote."""
+        return cls.model_validate_json(Path(file).read_text(encoding="utf-8"))
+
+
+def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out: Path) -> Iterator[Entry]:
+    """Yield the plan's rows, sequence by sequence; seeds beyond the first make sense where something is random."""
+    for sequence in sequences:
+        for seed in plan.seeds:
+            for method in plan.method:
+                if seed == plan.seeds[0] or _depends_on_seed(sequence, method):
+                    yield Entry(
+                        sequence=sequence,
+                        method=method,
+                        protocol=plan.protocol,
+                        settings=plan.settings,
+                        seed=seed,
+                        data=data,
+                        out=out,
+                    )
+
+
+def render_phantom(entry: Entry) -> None:
+    """Render the phantom of an entry, unless an earlier row did so."""
+    from scopemap.demonstration import is_rendered
+    from scopemap.phantom import write_phantom
+
+    if entry.sequence.phantom is None:
+        return
+    spec = spec_of(entry.sequence.phantom, entry.seed, entry.data)
+    if not is_rendered(entry.source, spec):
+        write_phantom(spec, entry.source)
+
+
+def _depends_on_seed(sequence: SequencePlan, method: MethodPlan) -> bool:
+    return sequence.phantom is not None or "{seed}" in method.files
+
+
+def _below(data: Path | None, path: str) -> Path:
+    if data is None:
+        raise SettingsError(f"'{path}' lies below the folder that --data names: give it")
+    return data / path

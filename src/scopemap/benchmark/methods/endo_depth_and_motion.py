@@ -1,0 +1,42 @@
+"""The tracker of Endo-Depth-and-Motion, re-derived: our own tracker with the parts taken off that it does not have.
+
+Recasens, Lamarca, Facil, Montiel and Civera, "Endo-Depth-and-Motion: reconstruction and tracking in endoscopic videos
+using depth networks and photometric constraints", RA-L 2021, arXiv 2103.16525. No code of that project was used.
+
+From the paper: pseudo-RGBD keyframes; every frame is aligned to a keyframe by its photometric residual, lifted with
+the keyframe's depth; image pyramid and robust error; Gauss-Newton. As METHOD (arXiv 2508.11282, which grew out of it)
+compares with it: rotation before the whole motion, a keyframe every 2 frames, two scales.
+
+Ours to choose, where neither gives a value: Huber's threshold (1.345 robust standard deviations, the usual one for 95 %
+efficiency), the start of each alignment (no motion against the keyframe), the steps per scale (at most 30), and a
+scale of half the working size for the rotation, then the working size for the motion. Grey values are compared as
+they are: no gain, no bias, no lamp, no local normalisation. The method has no verdict on its result: a frame is lost
+only where the image or its overlap with the keyframe is nearly empty, or the result is not finite.
+"""
+
+from __future__ import annotations
+
+from scopemap.config import OdometrySettings
+from scopemap.odometry import FrameTracker, Tracker
+
+SETTINGS = OdometrySettings(
+    keyframe_every=2,
+    levels=2,
+    finest_level=0,
+    rotation_first=True,
+    solver="gauss-newton",
+    max_iterations=30,
+    huber=1.345,
+    channels="grey",
+    lamp_gamma=0.0,
+    gain_bias=False,
+    start="identity",
+    min_inlier_share=0.0,
+    max_step=1e9,  # never reached
+)
+"""What is left of our tracker; all other settings are without effect on it or say when an image is empty."""
+
+
+def create_endo_depth_and_motion() -> FrameTracker:
+    """Return a tracker after Endo-Depth-and-Motion's paper; the benchmark gives it plain depth."""
+    return Tracker(SETTINGS)

@@ -1,0 +1,254 @@
+"""A benchmark's plan: which sequences, which methods, how they are scored; read from TOML.
+
+title = "colonoscopy"
+seeds = [0]
+
+[protocol]
+align = "sim3"
+
+[settings]                      # shared by all methods
+"fusion.voxel_mm" = 1.0
+
+[[sequence]]
+name = "cecum_t1_a"
+path = "c3vd/cecum_t1_a"        # below the folder that --data names; may hold * and ?
+depth = "files:c3vd/cecum_t1_a_depth_anything"
+near_far_mm = [13.5, 100.0]
+
+[[sequence]]
+name = "colon"
+phantom = { scene = "colon", frames = 90 }   # rendered with each seed
+depth = "true"
+
+method_sets = ["odometries"]    # methods that come with scopemap; more can follow
+
+[[method]]
+name = "ours, Gauss-Newton"
+settings = { "odometry.solver" = "gauss-newton" }
+
+[[method]]
+name = "Park"
+use = "park"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from scopemap.config import Config, Preset, explain
+from scopemap.errors import InputError, ScopemapError, SettingsError
+from scopemap.evaluation.depth import DepthScaling
+from scopemap.geometry.align import AlignMode
+from scopemap.phantom import PhantomSpec, parse_events
+
+_PLANS, _METHOD_SETS = "plans", "method_sets"
+
+
+class _Part(BaseModel):
+    """A table of the plan: frozen, no unknown key."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ProtocolPlan(_Part):
+    """How runs are scored.
+
+    Attributes
+    ----------
+    align : of the trajectory; mesh and depth in mm follow it where they are compared with the truth.
+    protocols : named protocols of other papers that are computed beside ours (`evaluation.protocols.PROTOCOLS`).
+    surface, depth, consistency : whether these are measured, where there is a truth for them. icp : the mesh also after
+        a refinement by ICP. flow : for consistency, the same for all methods, named as `networks.flow`.
+    depth_scaling : of predicted depth before it is compared with true depth.
+    depth_range_mm : of true depth that counts.
+    """
+
+    align: AlignMode = "sim3"
+    protocols: tuple[str, ...] = ()
+    surface: bool = True
+    icp: bool = False
+    depth: bool = True
+    consistency: bool = False
+    flow: str = "auto"
+    depth_scaling: DepthScaling = "median"
+    depth_range_mm: tuple[float, float] = (1e-3, 1e4)
+
+
+class SequencePlan(_Part):
+    """One sequence, or all that a pattern finds.
+
+    Attributes
+    ----------
+    name : for tables; of a pattern's finds, their path below the data folder.
+    path : below the data folder.
+    phantom : settings of a `PhantomSpec` instead of a path; its `path_file` lies below the data folder, its `seed` is
+        added to the benchmark's.
+    dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].
+    depth : "" as the settings say; "true" the sequence's own measured depth; "files:FOLDER" below the data folder.
+    near_far_mm : metric anchor of the first frame. align : instead of the protocol's.
+    settings : dotted names to values, for this sequence.
+    """
+
+    name: str = ""
+    path: str = ""
+    phantom: dict[str, Any] | None = None
+    dataset: str | None = None
+    camera: str | None = None
+    size: tuple[int, int] | None = None
+    frames: tuple[int, int] | tuple[int, int, int] | None = None
+    depth: str = ""
+    near_far_mm: tuple[float, float] | None = None
+    align: AlignMode | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SequencePlan:
+        if bool(self.path) == (self.phantom is not None):
+            raise ValueError(f"sequence '{self.name}' needs either a path or a phantom")
+        if self.phantom is not None:
+            if not self.name:
+                raise ValueError("a phantom needs a name")
+            spec_of(self.phantom, 0)
+        return self
+
+
+class MethodPlan(_Part):
+    """One method.
+
+    Attributes
+    ----------
+    name : for tables and folders. use : which (`benchmark.methods.registry.METHODS`).
+    preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
+    files : of `use = "import"`: trajectory below the data folder, with {sequence} and {seed} where they belong.
+    unit, kind : of these files.
+    """
+
+    name: str
+    use: str = "scopemap"
+    preset: Preset | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    files: str = ""
+    unit: Literal["mm", "m"] = "mm"
+    kind: str = "auto"
+
+    @model_validator(mode="after")
+    def _usable(self) -> MethodPlan:
+        if (self.use == "import") != bool(self.files):
+            raise ValueError(f"method '{self.name}': `files` and use = \"import\" belong together")
+        Config.load(self.preset, settings=self.settings)
+        return self
+
+
+class Plan(_Part):
+    """A whole benchmark."""
+
+    title: str
+    description: str = ""
+    seeds: tuple[int, ...] = (0,)
+    protocol: ProtocolPlan = ProtocolPlan()
+    settings: dict[str, Any] = Field(default_factory=dict)
+    sequence: tuple[SequencePlan, ...] = Field(min_length=1)
+    method: tuple[MethodPlan, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Plan:
+        names = Counter(folder_name(method.name) for method in self.method)
+        twice = [name for name, count in names.items() if count > 1]
+        if twice:
+            raise ValueError(f"two methods have the name '{twice[0]}' (letters and digits count)")
+        Config.load(settings=self.settings)
+        return self
+
+
+def read_plan(plan: Path | str) -> Plan:
+    """Return a plan from a TOML file, or one that comes with scopemap by its name; raises `SettingsError`."""
+    text = _text_of(plan)
+    try:
+        return Plan.model_validate(_with_sets(tomllib.loads(text)))
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"cannot read the plan {plan}: {error}") from None
+    except ValidationError as error:
+        raise SettingsError(f"the plan {plan}: " + "; ".join(explain(item) for item in error.errors())) from None
+    except ScopemapError as error:
+        raise SettingsError(f"the plan {plan}: {error}") from None
+
+
+def shipped_plans() -> list[str]:
+    """Return the names of the plans that come with scopemap."""
+    return _names(_PLANS)
+
+
+def found_sequences(plan: Plan, data: Path | None) -> tuple[list[SequencePlan], list[str]]:
+    """Return the plan's sequences with patterns replaced by what they find, and a line for each that is not there.
+
+    Raises `InputError` where none is.
+    """
+    found: list[SequencePlan] = []
+    missing: list[str] = []
+    for sequence in plan.sequence:
+        if sequence.phantom is not None:
+            found.append(sequence)
+            continue
+        if data is None:
+            missing.append(f"{sequence.path}: needs --data, the folder that holds it")
+            continue
+        places = sorted(data.glob(sequence.path))
+        if not places:
+            missing.append(f"{sequence.path}: nothing like that in {data}")
+        several = any(letter in sequence.path for letter in "*?[")
+        for place in places:
+            path = place.relative_to(data).as_posix()
+            name = path if several or not sequence.name else sequence.name
+            found.append(sequence.model_copy(update={"path": path, "name": name}))
+    if not found:
+        raise InputError(f"no sequence of the plan '{plan.title}' is there: {missing[0]}")
+    return found, missing
+
+
+def spec_of(phantom: dict[str, Any], seed: int, data: Path | None = None) -> PhantomSpec:
+    """Return what a plan's phantom is, its seed moved by `seed`; raises `SettingsError`."""
+    settings = dict(phantom)
+    events = parse_events(str(settings.pop("events", "")))
+    if "path_file" in settings and data is not None:
+        settings["path_file"] = data / settings["path_file"]
+    spec = PhantomSpec().with_settings(settings)
+    return replace(spec, seed=spec.seed + seed, events=events)
+
+
+def folder_name(name: str) -> str:
+    """Return a name that is safe for a folder."""
+    return "".join(letter if letter.isalnum() or letter in "._+" else "-" for letter in name).strip("-") or "unnamed"
+
+
+def _with_sets(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return a plan with the methods of its sets before its own."""
+    methods: list[Any] = []
+    for name in tree.pop("method_sets", []):
+        file = resources.files("scopemap.benchmark") / _METHOD_SETS / f"{name}.toml"
+        if not file.is_file():
+            raise SettingsError(f"unknown set of methods '{name}': choose from {', '.join(_names(_METHOD_SETS))}")
+        methods += tomllib.loads(file.read_text(encoding="utf-8"))["method"]
+    return tree | {"method": methods + tree.get("method", [])}
+
+
+def _names(folder: str) -> list[str]:
+    files = (resources.files("scopemap.benchmark") / folder).iterdir()
+    return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
+
+
+def _text_of(plan: Path | str) -> str:
+    shipped = resources.files("scopemap.benchmark") / _PLANS / f"{plan}.toml"
+    try:
+        return shipped.read_text(encoding="utf-8") if shipped.is_file() else Path(plan).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        known = ", ".join(shipped_plans())
+        raise SettingsError(
+            f"cannot read the plan {plan}: {error}. Name a TOML file, or one of those that come with scopemap: {known}"
+        ) from None

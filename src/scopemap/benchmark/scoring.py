@@ -1,0 +1,210 @@
+"""One run's folder against the truth of its sequence: the same figures for every method."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scopemap.benchmark.plan import ProtocolPlan
+from scopemap.config import MaskSettings
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.datasets.reference import reference_trajectory
+from scopemap.errors import AlignmentError, InputError
+from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.depth_sequence import DepthPairs, evaluate_depth_sequence, fit_sequence
+from scopemap.evaluation.image_link import ImageLinker
+from scopemap.evaluation.paper import paper_report
+from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
+from scopemap.evaluation.protocols import PROTOCOLS
+from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
+from scopemap.flow import create_flow, pair_flow
+from scopemap.geometry.align import AlignMode, Similarity
+from scopemap.masking import Masker
+from scopemap.reconstruction import DepthReader
+from scopemap.trajectory import Trajectory, read_trajectory
+
+Figures = dict[str, dict[str, Any]]
+_RAFT_ITERATIONS = 12
+_CONSISTENCY_PX = 1.0
+_MOST_VIEWS = 40
+
+
+def score(folder: Path, sequence: Sequence, protocol: ProtocolPlan, align: AlignMode | None = None) -> Figures:
+    """Return all figures that the truth of a sequence gives for a run's folder, by group.
+
+    `align` takes the place of the protocol's. Groups without a truth are left out. A trajectory that cannot be aligned
+    (too few frames tracked) has "poses" with what can be said without.
+    """
+    estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
+    figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
+    if matched is not None and protocol.surface:
+        surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
+        figures |= {"surface": surface} if surface else {}
+    depth = DepthReader(folder)
+    if depth.present:
+        if protocol.depth:
+            figures |= _depth(depth, sequence, protocol)
+        if protocol.consistency:
+            figures |= _consistency(depth, sequence, estimate, protocol)
+    return figures
+
+
+def pose_groups(
+    estimate: Trajectory, reference: Trajectory | None, protocol: ProtocolPlan, align: AlignMode
+) -> tuple[Figures, MatchedTrajectories | None]:
+    """Return "poses", "paper" and the named protocols' groups, and the alignment; without one only what needs none."""
+    figures: Figures = {"poses": _without_truth(estimate.tracked)}
+    matched = None if reference is None else _matched(estimate, reference, align)
+    if matched is None or reference is None:
+        return figures, None
+    figures |= {"poses": asdict(pose_report(matched)), "paper": asdict(paper_report(matched))}
+    return figures | _by_protocols(estimate, reference, protocol.protocols), matched
+
+
+def _without_truth(tracked: np.ndarray) -> dict[str, Any]:
+    """Return what a run says of itself; the names are those of `PoseReport`."""
+    return {
+        "frames": len(tracked),
+        "tracked": int(np.count_nonzero(tracked)),
+        "longest_tracked": longest_run(tracked),
+        "frames_until_loss": frames_until_loss(tracked),
+    }
+
+
+def _matched(estimate: Trajectory, reference: Trajectory, align: AlignMode) -> MatchedTrajectories | None:
+    try:
+        return match(estimate, reference, align)
+    except AlignmentError:
+        return None
+
+
+def _by_protocols(estimate: Trajectory, reference: Trajectory, names: tuple[str, ...]) -> Figures:
+    figures: Figures = {}
+    for name in names:
+        try:
+            report = PROTOCOLS[name](estimate, reference)
+            figures[name] = report.figures | {"description": report.description, "source": report.source}
+        except AlignmentError:  # a protocol's own fit may fail where ours does not: then it has no figure
+            continue
+    return figures
+
+
+def surface_figures_of(
+    run: Path, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
+) -> dict[str, float]:
+    """Return the figures of a run's mesh.ply against the true surface in a data set's folder; {} where there is none.
+
+    With a sequence, the part of the true surface that its views show is found, where the data set does not say it
+    itself. `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
+    """
+    file = run / "mesh.ply"
+    true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
+    if true_surface is None or not file.is_file():
+        return {}
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+        moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
+    except Exception as error:  # the readers of mesh files raise whatever their parsers raise
+        raise InputError(f"cannot read the mesh {file}: {error}") from error
+    camera = None
+    if true_surface.view is not None:
+        camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera
+    return measure_surface(moved, true_surface, camera=camera, icp=icp)
+
+
+def _seen_surface(sequence: Sequence) -> TrueSurface | None:
+    surface = read_true_surface(sequence.path)
+    if surface is None or surface.seen is not None or surface.view is not None:
+        return surface
+    stamps = sequence.source.stamps(sequence.selection) or []
+    chosen = {index for index, _ in stamps[:: max(1, len(stamps) // _MOST_VIEWS)]}
+    truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
+    views = {t.index: (t.T_world_camera, t.depth_mm) for t in truths if t.T_world_camera is not None}
+    known = {index: (T, depth_mm) for index, (T, depth_mm) in views.items() if depth_mm is not None}
+    return surface.seen_by(sequence.camera, known.values(), indices=list(known)) if known else surface
+
+
+def depth_groups(run: Path, truth: Path, scaling: str, *, consistency: bool) -> Figures:
+    """Return "depth" (unless `scaling` is "") and "consistency" of a run's depth maps against the data set in `truth`.
+
+    Raises `InputError` where the run kept no depth, or was made with another camera than the data set gives.
+    """
+    depth = DepthReader(run)
+    if not depth.present:
+        raise InputError(f"{run} holds no depth maps (depth/depth.json); only a run's folder does")
+    sequence = open_sequence(truth, size=working_size(run))
+    figures: Figures = {}
+    if scaling:
+        figures |= _depth(depth, sequence, ProtocolPlan(depth_scaling=scaling))
+    if consistency:
+        figures |= _consistency(depth, sequence, read_trajectory(run), ProtocolPlan())
+    return figures
+
+
+def working_size(run: Path) -> tuple[int, int]:
+    """Return the working size (width, height) of a run, which its depth maps have; raises `InputError`."""
+    try:
+        camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
+        return int(camera["width"]), int(camera["height"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"cannot tell the working size of the run {run} from its provenance.json: {error}") from None
+
+
+def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
+    """Return a factory of (estimated, true) depth of the frames that have both."""
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for frame, truth in sequence:
+            found_mm = depth.read(frame.index)
+            if truth is not None and truth.depth_mm is not None and found_mm is not None:
+                yield found_mm, truth.depth_mm
+
+    return pairs
+
+
+def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
+    pairs = _true_pairs(depth, sequence)
+    report = evaluate_depth_sequence(
+        pairs,
+        scaling=protocol.depth_scaling,
+        truth_range_mm=protocol.depth_range_mm,
+    )
+    if not report.frames:
+        return {}
+    return {"depth": {"scaling": report.scaling, **asdict(report.mean), "jitter": asdict(report.jitter)}}
+
+
+def _consistency(depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan) -> Figures:
+    """Measure depth over time; where depth has a truth it is brought to its scale first, one factor for all frames."""
+    scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    camera = sequence.camera
+    linker, meter = ImageLinker(camera), ConsistencyMeter(camera, scale)
+    flow, masker = create_flow(protocol.flow, _RAFT_ITERATIONS, "auto"), Masker(MaskSettings())
+    poses = dict(zip(estimate.indices.tolist(), range(len(estimate)), strict=True))
+    before: np.ndarray | None = None
+    for frame, truth in sequence:
+        # Highlights move with the lamp, and what lies outside the field of view is no tissue: the same mask for all.
+        valid = masker(frame).valid
+        found = None if before is None else pair_flow(flow, before, frame.rgb, _CONSISTENCY_PX)
+        link = linker.link(frame.rgb, valid, *((found.to_previous, found.consistent) if found else (None, None)))
+        before = frame.rgb
+        depth_mm = depth.read(frame.index)
+        row = poses.get(frame.index)
+        known = row is not None and bool(estimate.tracked[row])
+        meter.add(
+            DepthFrame(
+                np.full(valid.shape, np.nan, np.float32) if depth_mm is None else depth_mm,
+                valid,
+                estimate.T_world_camera[row] if known and row is not None else None,
+                None if truth is None else truth.T_world_camera,
+                None if truth is None else truth.depth_mm,
+            ),
+            link,
+        )
+    return {"consistency": asdict(meter.report()) | {"flow": flow.name}}

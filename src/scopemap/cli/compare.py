@@ -1,0 +1,56 @@
+"""`scopemap compare`: finished runs, and other people's trajectories, side by side."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.cli.evaluate import AlignChoice, UnitChoice
+from scopemap.cli.figures import without_nan
+from scopemap.cli.options import AsJson, Quiet
+
+
+def compare(
+    places: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Runs' folders, a benchmark's runs, or trajectory files of any system."),
+    ],
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="True poses: a data set's folder or a trajectory file; a benchmark's runs need none."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
+    names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
+    align: Annotated[AlignChoice, typer.Option(help="Fit before measuring.")] = AlignChoice.SIM3,
+    unit: Annotated[
+        UnitChoice, typer.Option(help="Unit of trajectory files that do not say their own.")
+    ] = UnitChoice.MM,
+    consistency: Annotated[
+        bool, typer.Option("--consistency", help="Also the consistency of depth over time.")
+    ] = False,
+    paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure runs against one truth, and print and write their tables and figures."""
+    from scopemap.benchmark.comparison import compared
+    from scopemap.benchmark.plan import ProtocolPlan
+    from scopemap.benchmark.presentation import present
+    from scopemap.benchmark.tables import benchmark_tables
+
+    protocol = ProtocolPlan(align=align.value, consistency=consistency)
+    given = [name.strip() for name in names.split(",")] if names else []
+    rows = compared(places, truth, protocol, names=given, unit=unit.value)
+    files = [] if out is None else present(rows, out, title="Comparison", paper_units=paper_units)
+    if as_json:
+        typer.echo(json.dumps(without_nan([asdict(row.result) for row in rows]), indent=2))
+    elif not quiet:
+        overview = benchmark_tables([row.result for row in rows])[0]
+        typer.echo(overview.without_empty().markdown())
+        typer.echo(overview.caption)
+        if files:
+            typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables")

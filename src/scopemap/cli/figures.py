@@ -1,0 +1,138 @@
+"""How figures are shown: as a table for people, as JSON, as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+_LABELS = {
+    "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",
+    "ate_hold_rmse_mm": "ATE RMSE, lost frames held (mm)",
+    "ate_mean_mm": "ATE mean (mm)",
+    "ate_median_mm": "ATE median (mm)",
+    "ate_max_mm": "ATE largest (mm)",
+    "rotation_mean_deg": "rotation error, mean (deg)",
+    "rotation_max_deg": "rotation error, largest (deg)",
+    "rotation_unaligned_mean_deg": "rotation since frame 1, unaligned, mean (deg)",
+    "rotation_unaligned_max_deg": "rotation since frame 1, unaligned, largest (deg)",
+    "rpe_1_mm": "RPE over 1 frame, RMSE (mm)",
+    "rpe_1_deg": "RPE over 1 frame, RMSE (deg)",
+    "rpe_10_mm": "RPE over 10 frames, RMSE (mm)",
+    "rpe_10_deg": "RPE over 10 frames, RMSE (deg)",
+    "rpe_10mm_path_mm": "RPE over 10 mm of true path, RMSE (mm)",
+    "rpe_10mm_path_deg": "RPE over 10 mm of true path, RMSE (deg)",
+    "tlr": "TLR, path estimated / true, unaligned",
+    "coverage": "tracked share of the true poses in its span",
+    "longest_tracked": "longest stretch without loss (frames)",
+    "frames_until_loss": "frames until the first loss",
+    "mesh_accuracy_mm": "mesh to true surface, mean (mm)",
+    "mesh_accuracy_p90_mm": "mesh to true surface, 90th percentile (mm)",
+    "mesh_completeness_mm": "true surface to mesh, mean (mm)",
+}
+_PAPER_ROWS = (
+    ("T_avg +- std (mm)", "t_avg_mm", "t_std_mm"),
+    ("R_avg +- std (rad)", "r_avg_rad", "r_std_rad"),
+    ("RMSE (mm)", "rmse_mm"),
+    ("T_fin (mm)", "t_fin_mm"),
+    ("R_fin (rad)", "r_fin_rad"),
+    ("RPE +- std over 1 frame (mm)", "rpe_1_frame_mm", "rpe_1_frame_std_mm"),
+    ("RPE +- std over 10 mm of true path (mm)", "rpe_10_mm_path_mm", "rpe_10_mm_path_std_mm"),
+    ("T_max (mm)", "t_max_mm"),
+    ("R_max (rad)", "r_max_rad"),
+    ("T < T_avg (%)", "t_below_avg_percent"),
+    ("R < R_avg (%)", "r_below_avg_percent"),
+    ("TLR", "tlr"),
+    ("lost frames (%)", "lost_percent"),
+)
+
+
+class OutputForm(Enum):
+    """Ways to show figures."""
+
+    TABLE = "table"
+    JSON = "json"
+    CSV = "csv"
+    LINE = "line"
+
+
+def show(figures: dict[str, Any], form: OutputForm) -> None:
+    """Print the figures of a trajectory, and of the groups that stand in it as dictionaries."""
+    if form is OutputForm.JSON:
+        typer.echo(json.dumps(without_nan(figures), indent=2))
+    elif form is OutputForm.CSV:
+        typer.echo(_csv(figures), nl=False)
+    elif form is OutputForm.LINE:
+        typer.echo(_one_line(figures))
+    else:
+        _tables(figures)
+
+
+def without_nan(tree: Any) -> Any:
+    """Return a tree of dictionaries and lists with null where a number is not finite, as JSON wants it."""
+    if isinstance(tree, dict):
+        return {key: without_nan(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [without_nan(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what is no list, names joined by dots."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list | tuple):
+            yield prefix + key, value
+
+
+def _csv(figures: dict[str, Any]) -> str:
+    text = io.StringIO()
+    rows = ((name, "" if isinstance(value, float) and math.isnan(value) else value) for name, value in _flat(figures))
+    csv.writer(text, lineterminator="\n").writerows([("figure", "value"), *rows])
+    return text.getvalue()
+
+
+def _one_line(figures: dict[str, Any]) -> str:
+    return (
+        f"ATE {figures['ate_rmse_mm']:.3f} mm, rotation {figures['rotation_unaligned_mean_deg']:.2f} deg unaligned, "
+        f"TLR {figures['tlr']:.3f} (align {figures['align']}, "
+        f"{figures['tracked']} of {figures['frames']} frames tracked)"
+    )
+
+
+def _tables(figures: dict[str, Any]) -> None:
+    console = Console()
+    title = (
+        f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
+        f"scale {figures['scale']:.5g}"
+    )
+    console.print(_table(title, {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}))
+    for name, group in figures.items():
+        if name == "paper":
+            rows = {label: " +- ".join(_text(group[key]) for key in keys) for label, *keys in _PAPER_ROWS}
+            console.print(_table("in the paper's units", rows))
+        elif isinstance(group, dict) and name != "sources":
+            console.print(_table(name, {key: _text(value) for key, value in _flat(group)}))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.4f}"
+    return str(value)
+
+
+def _table(title: str, rows: dict[str, str]) -> Table:
+    table = Table("figure", title=title, title_justify="left")
+    table.add_column("value", justify="right")
+    for row in rows.items():
+        table.add_row(*row)
+    return table

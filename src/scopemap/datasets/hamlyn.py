@@ -1,0 +1,111 @@
+"""Hamlyn: rectified stereo laparoscopy with depth by stereo matching, and the trackers' test sequences.
+
+`rectifiedNN/image01/0000000000.jpg` (left), `depth01/0000000000.png` (uint16 mm, 0 = none); the intrinsics lie in a
+tree of their own, `calibration/rectifiedNN/intrinsics.txt`. `hamlyn_tracking_test_data/testN/{color,depth}` and
+`intrinsics.txt`: cropped images with predicted depth. No camera pose is known in either.
+Recasens et al., "Endo-Depth-and-Motion", arXiv 2103.16525.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.camera import PinholeCamera
+from scopemap.datasets.images import ImageFolder, image_files, read_depth16
+from scopemap.datasets.sequence import SourceTruth
+from scopemap.errors import CalibrationError
+from scopemap.frame import TruthQuality
+
+_INTRINSICS = "intrinsics.txt"
+_MATRIX_SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
+_FRAME_NAME = re.compile(r"\d{10}")
+
+
+class HamlynFolder(ImageFolder):
+    """The left images of a rectified sequence; a `camera.yaml` beside `image01` wins over the published intrinsics."""
+
+    name = "hamlyn"
+    _images, _depths = "image01", "depth01"
+    _quality: TruthQuality = "stereo"
+    _origin = "stereo matching, no sensor"
+
+    def __init__(self, path: Path) -> None:
+        images = path / self._images
+        super().__init__(path, image_files(images) if images.is_dir() else [])
+        self._file_of = dict(zip(self.numbers, self.files, strict=True))
+        self.notes += [f"depth beside the images: {self._origin}", "no pose is known: the data set has none"]
+        file = self._intrinsics_file()
+        if self.camera is None and file is not None:
+            self.camera = read_intrinsics(file, (self.width, self.height))
+            self.camera_source = f"published intrinsics ({file})"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether `path` holds `image01` with images."""
+        images = path / "image01"
+        return images.is_dir() and bool(image_files(images))
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return the depth that lies beside the image, without a pose; None where there is none."""
+        values = read_depth16(self.path / self._depths / f"{self._file_of[index].stem}.png")
+        if values is None:
+            return None
+        depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
+        return SourceTruth(None, np.where(values > 0, depth_mm, np.nan).astype(np.float32), self._quality)
+
+    def _intrinsics_file(self) -> Path | None:
+        sequence = self.path.absolute()
+        parent, name = sequence.parent, sequence.name
+        places = (
+            sequence / _INTRINSICS,
+            parent / "calibration" / name / _INTRINSICS,
+            parent.parent / "calibration" / name / _INTRINSICS,
+            parent / f"intrinsics_{name}.txt",
+        )
+        return next((file for file in places if file.is_file()), None)
+
+
+class HamlynTrackingFolder(HamlynFolder):
+    """A sequence of `hamlyn_tracking_test_data`: images a bit smaller than the rectified, depth by a network."""
+
+    name = "hamlyn-tracking"
+    _images, _depths = "color", "depth"
+    _quality: TruthQuality = "predicted"
+    _origin = "predicted by Endo-Depth, cut at 300 mm"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether `path` holds `color` with 10-digit names, `depth` and `intrinsics.txt`."""
+        if not ((path / "color").is_dir() and (path / "depth").is_dir() and (path / _INTRINSICS).is_file()):
+            return False
+        files = image_files(path / "color")
+        return bool(files) and _FRAME_NAME.fullmatch(files[0].stem) is not None
+
+
+def read_intrinsics(file: Path, size: tuple[int, int]) -> PinholeCamera:
+    """Return the pinhole camera of a text file for images of `size` (width, height), px.
+
+    The file holds a 3x3, 3x4 or 4x4 matrix, in as many lines as it likes. Raises `CalibrationError` for anything else,
+    and for a camera that cannot be one of these images.
+    """
+    try:
+        numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"cannot read the intrinsics in {file}: {error}") from None
+    if numbers.size not in _MATRIX_SHAPES:
+        raise CalibrationError(
+            f"the intrinsics {file} hold {numbers.size} numbers: expected a matrix of 3x3, 3x4 or 4x4 (9, 12 or 16)"
+        )
+    K = numbers.reshape(_MATRIX_SHAPES[numbers.size])[:3, :3]
+    upright = np.allclose([K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1], 0)
+    (fx, _, cx), (_, fy, cy) = K[:2]
+    width, height = size
+    if not (upright and fx > 0 and fy > 0 and 0 <= cx < width and 0 <= cy < height):
+        raise CalibrationError(
+            f"the intrinsics {file} are not those of images of {width}x{height} px: found focal length {fx:g}, {fy:g} "
+            f"and principal point {cx:g}, {cy:g} px"
+        )
+    return PinholeCamera(float(fx), float(fy), float(cx), float(cy), width, height)

@@ -1,0 +1,152 @@
+"""Benchmark plans: read, refused, expanded into rows; those that come along."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scopemap.benchmark.entry import Entry, entries_of
+from scopemap.benchmark.methods.registry import create_method
+from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
+from scopemap.config import Config
+from scopemap.errors import InputError, SettingsError
+
+SMALL = """
+title = "small"
+seeds = [0, 3]
+settings = { "fusion.enabled" = false }
+
+[[sequence]]
+path = "clips/c*"
+depth = "files:depths"
+near_far_mm = [10, 90]
+
+[[sequence]]
+name = "tube"
+phantom = { scene = "tube", frames = 5, seed = 4, width = 64, height = 48, events = "black:2-3" }
+depth = "true"
+
+[[method]]
+name = "ours"
+
+[[method]]
+name = "theirs"
+use = "import"
+files = "theirs/{sequence}-{seed}.txt"
+"""
+
+
+def written(folder: Path, text: str = SMALL) -> Path:
+    file = folder / "plan.toml"
+    file.write_text(text)
+    return file
+
+
+def rows(folder: Path) -> list[Entry]:
+    data = folder / "data"
+    for name in ("c10", "c2"):
+        (data / "clips" / name).mkdir(parents=True)
+    plan = read_plan(written(folder))
+    sequences, missing = found_sequences(plan, data)
+    assert missing == []
+    return list(entries_of(plan, sequences, data, folder / "out"))
+
+
+def test_a_pattern_finds_clips_and_seeds_repeat_only_what_depends_on_them(tmp_path: Path) -> None:
+    found = [(row.sequence.name, row.method.name, row.seed) for row in rows(tmp_path)]
+    clips = [("clips/c10", "ours", 0), ("clips/c10", "theirs", 0), ("clips/c10", "theirs", 3)]
+    clips += [("clips/c2", *rest) for _, *rest in clips]
+    tube = [("tube", method, seed) for seed in (0, 3) for method in ("ours", "theirs")]
+    assert sorted(found) == sorted(clips + tube)
+
+
+def test_every_row_has_its_own_folder_and_fingerprint(tmp_path: Path) -> None:
+    found = rows(tmp_path)
+    assert len({row.folder for row in found}) == len({row.key for row in found}) == len(found)
+    assert all(row.folder.is_relative_to(tmp_path / "out" / "runs") for row in found)
+    again = found[0].model_copy(update={"data": tmp_path / "elsewhere", "out": tmp_path / "other"})
+    assert again.key == found[0].key
+    assert found[0].model_copy(update={"settings": {"fusion.enabled": True}}).key != found[0].key
+
+
+def test_an_entry_survives_its_file(tmp_path: Path) -> None:
+    for row in rows(tmp_path):
+        assert Entry.load(row.save()) == row
+
+
+def test_all_methods_are_given_the_same_depth(tmp_path: Path) -> None:
+    clip, *_, tube = rows(tmp_path)
+    assert clip.shared_settings() == {
+        "fusion.enabled": False,
+        "depth.backend": f"files:{tmp_path / 'data' / 'depths'}",
+        "depth.anchor": "near-far",
+        "depth.near_far_mm": (10, 90),
+    }
+    assert tube.shared_settings()["depth.backend"] == f"files:{tube.source}"
+    assert tube.shared_settings()["depth.anchor"] == "auto"
+
+
+def test_a_preset_does_not_take_the_shared_depth_away(tmp_path: Path) -> None:
+    clip = rows(tmp_path)[0]
+    config = Config.load("paper", settings=clip.shared_settings())
+    assert config.depth.backend.startswith("files:")
+    assert config.depth.anchor == "near-far"
+    assert config.smoothing.method == "wema"
+
+
+def test_a_phantoms_seed_is_moved(tmp_path: Path) -> None:
+    tube = read_plan(written(tmp_path)).sequence[1]
+    assert tube.phantom is not None
+    spec = spec_of(tube.phantom, 3)
+    assert (spec.seed, spec.scene, spec.frames, len(spec.events)) == (7, "tube", 5, 1)
+
+
+def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path) -> None:
+    plan = read_plan(written(tmp_path))
+    found, missing = found_sequences(plan, tmp_path)
+    assert [sequence.name for sequence in found] == ["tube"]
+    assert missing == [f"clips/c*: nothing like that in {tmp_path}"]
+    assert "--data" in found_sequences(plan, None)[1][0]
+    alone = plan.model_copy(update={"sequence": plan.sequence[:1]})
+    with pytest.raises(InputError, match=r"no sequence of the plan 'small' is there: clips/c\*"):
+        found_sequences(alone, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "ours"', 'name = "ours"\nsettings = { "odometry.hubber" = 2 }', "did you mean 'odometry.huber'"),
+        ('name = "ours"', 'name = "theirs"', "two methods have the name 'theirs'"),
+        ('name = "ours"', 'name = "ours"\nuse = "import"', "belong together"),
+        ('scene = "tube"', 'scene = "nose"', "scene"),
+        ('path = "clips/c*"', "", "either a path or a phantom"),
+        ('title = "small"', 'titel = "small"', "titel"),
+        ("seeds = [0, 3]", "seeds = [0, 3", "cannot read the plan"),
+        ('title = "small"', 'title = "small"\nmethod_sets = ["all"]', "unknown set of methods 'all': choose from abl"),
+    ],
+)
+def test_bad_plans_are_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=message) as caught:
+        read_plan(written(tmp_path, SMALL.replace(old, new, 1)))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_plan_names_those_that_come_along(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="scared-c"):
+        read_plan(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("name", shipped_plans())
+def test_plans_that_come_along_name_methods_that_exist(name: str, tmp_path: Path) -> None:
+    plan: Plan = read_plan(name)
+    assert plan.description.endswith(".")
+    for method in plan.method:
+        create_method(method, tmp_path)
+
+
+def test_the_plans_that_were_promised_come_along() -> None:
+    assert {"scared", "scared-c", "hamlyn", "c3vd-rgbd", "c3vd-mono", "phantom"} <= set(shipped_plans())
+    clips = {sequence.path.rstrip("*") for sequence in read_plan("c3vd-rgbd").sequence}
+    assert len(clips) == 10
+    assert len(read_plan("c3vd-mono").sequence) == 8

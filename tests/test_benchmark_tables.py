@@ -1,0 +1,338 @@
+"""The tables of a small made-up benchmark: every cell where it belongs, failures said, the paper's rows as printed."""
+
+from __future__ import annotations
+
+import csv
+import math
+import random
+from dataclasses import asdict, fields, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scopemap.benchmark.published import PublishedTable, published_rows
+from scopemap.benchmark.result import RunResult
+from scopemap.benchmark.sections import OVERVIEW, SECTIONS
+from scopemap.benchmark.summary import over_seeds, summarise
+from scopemap.benchmark.table import Table, Value
+from scopemap.benchmark.tables import TIMING_COLUMNS, benchmark_tables, write_tables
+from scopemap.camera import PinholeCamera
+from scopemap.errors import InputError
+from scopemap.evaluation.consistency import ConsistencyMeter
+from scopemap.evaluation.depth import DepthReport
+from scopemap.evaluation.depth_sequence import scale_jitter
+from scopemap.evaluation.paper import PaperReport
+from scopemap.evaluation.poses import PoseReport
+from scopemap.evaluation.surface import DistanceSummary, compare_surfaces, surface_figures
+
+NAN = float("nan")
+FACTS = {"machine": "Linux x86_64, 2 cores", "commit": "abc1234", "versions": {"scopemap": "0.1.0", "numpy": "2.0"}}
+PUBLISHED: tuple[PublishedTable, ...] = ("table1_pose_scared", "table2_methods_scared", "table3_ablation_scared")
+
+
+def run(sequence: str, method: str, ate_mm: float, **changes: Any) -> RunResult:
+    """A finished run; `tracked`, `tlr`, `align`, `ms`, `seed` may be changed."""
+    poses = {"frames": 10, "tracked": changes.get("tracked", 10), "align": changes.get("align", "sim3"), "scale": 2.0}
+    poses |= {"ate_rmse_mm": ate_mm, "tlr": changes.get("tlr", 1.0), "rotation_unaligned_mean_deg": 2 * ate_mm}
+    poses |= {"rotation_unaligned_max_deg": 3 * ate_mm, "rpe_10_mm": NAN, "frames_until_loss": poses["tracked"]}
+    names = [field.name for field in fields(PaperReport) if not field.name.endswith(("_axes_mm", "_axes_rad", "_deg"))]
+    paper = {name: ate_mm * place for place, name in enumerate(names, start=1)}
+    timing = {"ms_per_frame": changes.get("ms", 50.0), "seconds_read": 2.0, "seconds_total": 9.0}
+    figures = {"poses": poses, "paper": paper}
+    return RunResult(sequence, method, changes.get("seed", 0), figures=figures, timing=timing, facts=FACTS)
+
+
+def died(sequence: str, method: str, error: str = "MemoryError: 3 | 4", seed: int = 0) -> RunResult:
+    return RunResult(sequence, method, seed, "failed", error, facts=FACTS)
+
+
+RESULTS = [run("colon", "ours", 0.5, tlr=0.75), run("colon", "Park", 1.5, tlr=1.125), died("colon", "ICP")]
+
+
+def tables(results: list[RunResult], *, paper_units: bool = False) -> dict[str, Table]:
+    return {table.name: table for table in benchmark_tables(results, paper_units=paper_units)}
+
+
+def cells(table: Table, **texts: str) -> list[dict[str, str]]:
+    """The rows, as printed in Markdown, by column; those of which the texts are so."""
+    lines = [line[2:-2].split(" | ") for line in table.markdown().splitlines()]
+    heads = [f"{column.title} {column.unit}".strip() for column in table.columns]
+    rows = [dict(zip(heads, line, strict=True)) for line in lines[2:]]
+    return [row for row in rows if all(row[head] == text for head, text in texts.items())]
+
+
+# ---- overview
+
+
+def test_overview_to_the_letter() -> None:
+    assert tables(RESULTS)["overview"].markdown() == (
+        "| sequence | method | runs | frames tracked | alignment | scale | ATE RMSE, mm ↓ | rotation mean, deg ↓ | "
+        "rotation max, deg ↓ | RPE 10 frames, mm ↓ | RPE 10 frames, deg ↓ | TLR →1 | mesh accuracy, mm ↓ | "
+        "mesh coverage, % ↑ | time per frame, ms ↓ | tracking per frame, ms ↓ | peak memory, MB ↓ |\n"
+        "| --- | --- | --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | "
+        "---: |\n"
+        "| colon | ours | 1 | 10 of 10 | sim3 | 2.000 | **0.500** | **1.00** | **1.50** |  |  | 0.750 |  |  | **50** "
+        "|  |  |\n"
+        "| colon | Park | 1 | 10 of 10 | sim3 | 2.000 | 1.500 | 3.00 | 4.50 |  |  | **1.125** |  |  | **50** |  |  |\n"
+        "| colon | ICP | 0 of 1 |  |  | failed: MemoryError: 3 \\| 4 |  |  |  |  |  |  |  |  |  |  |  |\n"
+    )
+
+
+def test_a_long_error_is_cut_and_stays_one_line() -> None:
+    table = tables([*RESULTS, died("colon", "SB", "RuntimeError:\n" + "x" * 500)])["overview"]
+    said = table.rows[3][5]
+    assert isinstance(said, str)
+    assert said.startswith("failed: RuntimeError: xxx")
+    assert len(said) < 100
+    assert len(table.markdown().splitlines()) == 6
+
+
+def test_who_loses_frames_does_not_compete() -> None:
+    table = tables([run("colon", "ours", 2.0), run("colon", "Park", 3.0), run("colon", "SB", 0.1, tracked=8)])[
+        "overview"
+    ]
+    assert [row["ATE RMSE mm"] for row in cells(table)] == ["**2.000**", "3.000", "0.100"]
+
+
+def test_a_trajectory_that_ends_early_has_lost_the_rest() -> None:
+    short = run("colon", "SB", 0.1)
+    short.figures["poses"].update(frames=5, tracked=5)
+    table = tables([run("colon", "ours", 2.0), run("colon", "Park", 3.0), short])["overview"]
+    assert [row["frames tracked"] for row in cells(table)] == ["10 of 10", "10 of 10", "5 of 10"]
+    assert [row["ATE RMSE mm"] for row in cells(table)] == ["**2.000**", "3.000", "0.100"]
+
+
+def test_values_of_different_alignments_do_not_compete() -> None:
+    mixed = [run("colon", "ours", 2.0), run("colon", "Park", 3.0), run("colon", "SB", 0.1, align="origin")]
+    assert [row["ATE RMSE mm"] for row in cells(tables(mixed)["overview"])] == ["**2.000**", "3.000", "0.100"]
+
+
+def test_sequences_have_their_own_best() -> None:
+    results = [run("a", "ours", 2.0), run("a", "Park", 3.0), run("b", "ours", 5.0), run("b", "Park", 4.0)]
+    assert [row["ATE RMSE mm"] for row in cells(tables(results)["overview"])] == [
+        "**2.000**",
+        "3.000",
+        "5.000",
+        "**4.000**",
+    ]
+
+
+# ---- seeds
+
+
+def test_two_seeds_give_the_mean_and_three_the_median() -> None:
+    assert over_seeds([1.0, 2.0]) == Value(1.5, 0.5)
+    assert over_seeds([1.0, 9.0, 2.0]) == Value(2.0, 4.0)
+    assert over_seeds([NAN, 3.0]).mean == 3.0
+    assert math.isnan(over_seeds([NAN, 3.0]).spread)
+    assert math.isnan(over_seeds([]).mean)
+
+
+def test_seeds_are_one_row_with_their_spread() -> None:
+    results = [run("colon", "ours", ate, seed=seed) for seed, ate in enumerate((1.0, 9.0, 2.0))]
+    (row,) = cells(tables(results)["overview"])
+    assert row["runs"] == "3"
+    assert row["frames tracked"] == "30 of 30"
+    assert row["ATE RMSE mm"] == "2.000 ± 4.000"
+    assert row["time per frame ms"] == "50"
+
+
+def test_a_plans_seeds_are_one_sequence() -> None:
+    results = [run("colon", "ours", 1.0)] + [run(f"colon, seed {seed}", "ours", 2.0, seed=seed) for seed in (1, 2)]
+    (row,) = cells(tables(results)["overview"])
+    assert (row["sequence"], row["runs"], row["ATE RMSE mm"]) == ("colon", "3", "2.000 ± 0.500")
+
+
+def test_a_method_that_died_for_one_seed_says_so_and_does_not_compete() -> None:
+    results = [run("colon", "ours", 1.0), died("colon", "ours", seed=1)]
+    results += [run("colon", "Park", ate, seed=seed) for seed, ate in enumerate((5.0, 6.0))]
+    rows = cells(tables(results)["overview"])
+    assert [row["runs"] for row in rows] == ["1 of 2", "2"]
+    assert rows[0]["ATE RMSE mm"] == "1.000"
+
+
+# ---- the paper's tables
+
+
+@pytest.mark.parametrize(("name", "file"), [*zip(("table1", "table2", "table3"), PUBLISHED, strict=True)])
+def test_published_rows_are_the_files(name: str, file: str) -> None:
+    text = (resources.files("scopemap.benchmark") / "published" / f"{file}.csv").read_text()
+    table = tables(RESULTS, paper_units=True)[name]
+    printed = [row for row in cells(table) if row["source"] == "published"]
+    expected = list(csv.DictReader(text.splitlines()))
+    assert len(printed) == len(expected) > 0
+    heads = {"T_avg_mm": "T_avg mm", "R_avg": "R_avg rad", "RMSE_mm": "RMSE mm", "T_fin_mm": "T_fin mm", "TLR": "TLR"}
+    heads |= {
+        "R_fin": "R_fin rad",
+        "T_max_mm": "T_max mm",
+        "R_max": "R_max rad",
+        "RPE_mm": "RPE interval not stated mm",
+    }
+    heads |= {"T_below_avg_percent": "T<T_avg %", "R_below_avg_percent": "R<R_avg %"}
+    spreads = {"T_avg_mm": "T_avg_std", "R_avg": "R_avg_std", "RPE_mm": "RPE_std"}
+    for row, want in zip(printed, expected, strict=True):
+        for column in set(want) & set(heads):
+            spread = want.get(spreads.get(column, ""))
+            mean, *std = row[heads[column]].split(" ± ")
+            assert float(mean) == pytest.approx(float(want[column]), abs=5e-4)
+            assert [float(text) for text in std] == pytest.approx([] if spread is None else [float(spread)], abs=5e-4)
+        assert row["alignment"] == "not stated"
+
+
+def test_published_angles_are_radians_printed_as_degrees() -> None:
+    degrees, radians = (tables(RESULTS, paper_units=units)["table1"] for units in (False, True))
+    worst = {"sequence": "S4", "framework": "BodySLAM"}
+    assert cells(radians, **worst)[0]["R_max rad"] == "3.142"
+    assert cells(degrees, **worst)[0]["R_max deg"] == "180.023"
+    assert cells(radians, framework="ours")[0]["R_avg rad"] == "**1.500 ± 2.000**"
+    assert cells(degrees, framework="ours")[0]["R_avg deg"] == f"**{math.degrees(1.5):.3f} ± {math.degrees(2):.3f}**"
+    assert "radians" in radians.caption
+    assert "degrees" in degrees.caption
+
+
+def test_the_paper_means_the_norm_by_t_avg() -> None:
+    rows = published_rows("table1_pose_scared")
+    assert len(rows) == 20
+    for row in rows:
+        assert row.figure("rmse_mm") == pytest.approx(
+            math.hypot(row.figure("t_avg_mm"), row.figure("t_std_mm")), abs=2e-3
+        )
+    assert math.isnan(rows[0].figure("tlr"))
+
+
+def test_published_rows_are_never_the_best_and_their_rpe_stands_apart() -> None:
+    table = tables([run("S1", "ours", 500.0), run("S1", "Park", 600.0)])["table1"]
+    assert {row for row, _ in table.marks} == {0}
+    (published,) = cells(table, framework="Proposed", sequence="S1")
+    assert published["RPE interval not stated mm"] == "6.220 ± 3.533"
+    assert published["RPE 1 frame mm"] == published["RPE 10 mm path mm"] == ""
+    assert "no comparison" in table.caption
+
+
+def test_table_2_averages_over_sequences_and_only_whole_rows_compete() -> None:
+    results = [run("a", "ours", 2.0), run("b", "ours", 4.0), run("a", "Park", 6.0), run("b", "Park", 8.0)]
+    results += [run("a", "ICP", 0.1), died("b", "ICP"), run("b", "SB", 0.2)]
+    rows = cells(tables(results)["table2"], source="measured")
+    assert [row["sequences"] for row in rows] == ["2 of 2", "2 of 2", "1 of 2", "1 of 2"]
+    assert [row["T_avg mm"] for row in rows] == ["**3.000**", "7.000", "0.100", "0.200"]
+    assert [row["frames tracked"] for row in rows] == ["20 of 20", "20 of 20", "10 of 10", "10 of 10"]
+    assert tables(results)["table2"].csv().splitlines()[1].startswith("ours,measured,2 of 2,20 of 20,sim3,3,")
+
+
+def test_without_the_papers_figures_there_are_no_tables_1_to_3() -> None:
+    assert [table.name for table in benchmark_tables([died("colon", "ours")])] == ["overview", "time"]
+
+
+# ---- the other groups
+
+
+def test_every_column_names_a_figure_that_is_measured() -> None:
+    plane = np.stack([*np.meshgrid(np.arange(5.0), np.arange(5.0)), np.zeros((5, 5))], axis=-1).reshape(-1, 3)
+    surface = surface_figures(compare_surfaces(plane, plane)) | {"normal_consistency": 1.0}
+    surface |= DistanceSummary.of(np.ones(3)).figures("accuracy_icp")
+    measured: dict[str, Any] = {
+        "poses": {field.name: 0 for field in fields(PoseReport)},
+        "paper": {field.name: 0 for field in fields(PaperReport)},
+        "depth": {field.name: 0 for field in fields(DepthReport)} | {"jitter": asdict(scale_jitter(np.ones(3)))},
+        "consistency": asdict(ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report()) | {"flow": "dis"},
+        "surface": surface,
+    }
+    names = [(f.group, f.key) for section in (OVERVIEW, *SECTIONS) for f in section.figures if f.group != "timing"]
+    names += [section.word[1:] for section in SECTIONS if section.word[1]]
+    for group, key in names:
+        found = measured[group]
+        for part in key.split("."):
+            assert part in found, f"{group}: {key}"
+            found = found[part]
+
+
+def test_figures_of_parts_and_words_find_their_columns() -> None:
+    figures = [{"consistency": {"opw": {"mean_mm": change_mm}, "flow": "dis"}} for change_mm in (0.5, 0.25)]
+    results = [RunResult("a", name, figures=found) for name, found in zip(("x", "y"), figures, strict=True)]
+    table = tables(results)["consistency"]
+    assert [column.title for column in table.columns] == ["sequence", "method", "runs", "flow", "OPW"]
+    assert [row["flow"] for row in cells(table)] == ["dis", "dis"]
+    assert [row["OPW mm"] for row in cells(table)] == ["0.500", "**0.250**"]
+
+
+def test_a_protocols_figures_stand_in_its_table_only() -> None:
+    own = replace(RESULTS[0], figures=RESULTS[0].figures | {"af": {"af_ate_mean_mm": 77.125, "af_windows": 58.0}})
+    found = tables([own, *RESULTS[1:]])
+    assert found["protocol-af"].markdown().splitlines()[2:] == [
+        "| colon | frames tracked |  | 10 of 10 | 10 of 10 | failed |",
+        "| colon | af ate mean | mm | 77.125 |  |  |",
+        "| colon | af windows |  | 58 |  |  |",
+    ]
+    assert [name for name, table in found.items() if "77.1" in table.csv()] == ["protocol-af"]
+
+
+def test_stages_are_milliseconds_per_frame() -> None:
+    (row,) = cells(tables(RESULTS)["time"], method="ours")
+    assert row["read ms"] == "200.0"
+    assert row["whole run s"] == "9.0"
+
+
+# ---- files
+
+
+def test_the_same_results_give_the_same_tables_but_for_time(tmp_path: Path) -> None:
+    resumed = []
+    for place, result in enumerate(RESULTS):
+        (tmp_path / str(place)).mkdir()
+        # NaN becomes null in the file; the clock of another day says something else.
+        replace(result, timing={name: 3.1 * s for name, s in result.timing.items()}).save(tmp_path / str(place))
+        resumed.append(RunResult.load(tmp_path / str(place)))
+    before, after = tables(RESULTS), tables(resumed)
+    assert list(before) == list(after)
+    for name in set(before) - {"time"}:
+        assert before[name].without_timing().markdown() == after[name].without_timing().markdown()
+        assert before[name].without_timing().csv() == after[name].without_timing().csv()
+    timing = [column.title for column in before["overview"].columns if column.timing]
+    assert tuple(timing) == TIMING_COLUMNS == tuple(column.title for column in before["overview"].columns[-3:])
+    assert before["overview"].markdown() != after["overview"].markdown()
+
+
+def test_files_hold_what_the_tables_say(tmp_path: Path) -> None:
+    files = write_tables(RESULTS, tmp_path, title="Colon_", notes=["hamlyn: *not* there"])
+    names = [table.name for table in benchmark_tables(RESULTS)]
+    expected = [f"tables/{name}.{ending}" for name in names for ending in ("md", "csv", "tex")]
+    assert [file.relative_to(tmp_path).as_posix() for file in files] == ["results.md", *expected]
+    text = files[0].read_text()
+    assert text.startswith(
+        "# Colon\\_\n\n- machine: Linux x86_64, 2 cores\n- commit: abc1234\n- versions: scopemap 0.1.0, numpy 2.0\n"
+        "- note: hamlyn: \\*not\\* there\n\n## Overview\n\n| sequence |"
+    )
+    for name, table in tables(RESULTS).items():
+        assert table.markdown() in text
+        assert (tmp_path / f"tables/{name}.csv").read_text() == table.csv()
+        assert (tmp_path / f"tables/{name}.tex").read_text() == table.latex()
+        assert (tmp_path / f"tables/{name}.md").read_text().startswith("# ")
+    bytes_before = [file.read_bytes() for file in files]
+    write_tables(RESULTS, tmp_path, title="Colon_", notes=["hamlyn: *not* there"])
+    assert [file.read_bytes() for file in files] == bytes_before
+
+
+def test_every_form_of_every_table_has_a_cell_per_column() -> None:
+    for table in benchmark_tables(RESULTS):
+        rows = [line for line in table.latex().splitlines() if line.endswith("\\\\")]
+        assert {row.replace("\\&", "").count("&") + 1 for row in rows} == {len(table.columns)}
+        assert len({len(row) for row in csv.reader(table.csv().splitlines())}) == 1
+        assert table.latex().count("{") == table.latex().count("}")
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write tables"):
+        write_tables(RESULTS, tmp_path / "file")
+
+
+def test_rows_keep_the_order_of_the_plan_and_seeds_theirs() -> None:
+    results = [run("b", "z", 1.0, seed=seed) for seed in range(3)] + [run("a", "y", 1.0), run("b", "y", 1.0)]
+    seeds = results[:3]
+    random.Random(0).shuffle(seeds)
+    found = summarise([*seeds, *results[3:]])
+    assert [(summary.sequence, summary.method) for summary in found] == [("b", "z"), ("b", "y"), ("a", "y")]
+    assert [one.seed for one in found[0].runs] == [0, 1, 2]

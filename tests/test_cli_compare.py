@@ -1,0 +1,111 @@
+"""`scopemap compare` and `scopemap bench`: rows from anywhere, tables and figures, plans on the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sample_trajectories import as_trajectory, vector_a, write_c3vd, write_run
+from tiny_phantom import write_tiny
+from typer.testing import CliRunner
+
+from scopemap import Config, open_sequence, reconstruct
+from scopemap.benchmark.result import RunResult
+from scopemap.cli import app
+from scopemap.errors import InputError
+from scopemap.trajectory import write_kitti
+
+
+def run(*arguments: object, code: int = 0) -> object:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, (result.output, result.exception)
+    return result
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A run, a foreign file of the true path, and the truth."""
+    estimated, reference = vector_a()
+    write_kitti(tmp_path / "theirs.txt", as_trajectory(reference))
+    run_folder = write_run(tmp_path / "ours", as_trajectory(estimated))
+    return run_folder, tmp_path / "theirs.txt", write_c3vd(tmp_path / "truth", reference) / "pose.txt"
+
+
+def test_runs_and_foreign_files_stand_side_by_side(places: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    ours, theirs, truth = places
+    result = run("compare", ours, theirs, "--truth", truth, "--out", tmp_path / "out")
+    assert "0.309" in result.stdout
+    assert "theirs.txt" in result.stdout
+    rows = list(csv.DictReader((tmp_path / "out/tables/overview.csv").read_text().splitlines()))
+    assert [row["method"] for row in rows] == ["ours", "theirs.txt"]
+    assert float(rows[0]["ATE RMSE [mm]"]) == pytest.approx(0.308821, abs=1e-6)
+    assert float(rows[1]["ATE RMSE [mm]"]) == pytest.approx(0, abs=1e-6)
+    figures = {file.name for file in (tmp_path / "out/figures").iterdir()}
+    assert {"ate.png", "frames_until_loss.png"} <= figures
+
+
+def test_names_alignment_and_json(places: tuple[Path, Path, Path]) -> None:
+    ours, theirs, truth = places
+    given = ("compare", ours, theirs, "--truth", truth, "--names", "A, B", "--align", "se3", "--json")
+    rows = json.loads(run(*given).stdout)
+    assert [row["method"] for row in rows] == ["A", "B"]
+    assert rows[0]["figures"]["poses"]["align"] == "se3"
+    assert rows[0]["figures"]["poses"]["ate_rmse_mm"] == pytest.approx(5.585285, abs=1e-5)
+    assert run("compare", ours, "--truth", truth, "--quiet").stdout == ""
+
+
+def test_a_benchmarks_run_brings_its_figures(tmp_path: Path) -> None:
+    for name, ate in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        RunResult("clip", name, figures={"poses": {"ate_rmse_mm": ate, "align": "sim3"}}).save(tmp_path / name)
+    output = run("compare", tmp_path / "a", tmp_path / "b").stdout
+    assert "**1.000**" in output
+    assert "2.000" in output
+
+
+def test_refusals_of_compare(places: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    ours, theirs, truth = places
+    for arguments, message in (
+        ((ours,), "name the true poses by --truth"),
+        ((tmp_path / "none", "--truth", truth), "no such file or folder"),
+        ((ours, theirs, "--truth", truth, "--names", "A"), "1 names were given"),
+        ((ours, "--truth", truth, "--out", theirs), "cannot write"),
+    ):
+        error = run("compare", *arguments, code=1).exception
+        assert isinstance(error, InputError)
+        assert message in str(error)
+
+
+def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -> None:
+    truth = write_tiny(tmp_path / "phantom", frames=6)
+    light = {"networks.flow": "dis", "networks.perceptual": "structure", "fusion.voxel_mm": 2.0, "fusion.min_weight": 0}
+    for name, changes in {"mapis": {}, "plain": {"mapis.frame_scale": "none", "mapis.blend": "none"}}.items():
+        config = Config.load(settings=light | changes)
+        reconstruct(open_sequence(truth), config, out=tmp_path / name)
+    out = tmp_path / "out"
+    run("compare", tmp_path / "mapis", tmp_path / "plain", "--truth", truth, "--consistency", "--out", out)
+    drawn = {file.name for file in (out / "figures").iterdir()}
+    assert drawn == {
+        *("ate.png", "frames_until_loss.png", "orb_bars.png", "orb_pairs_phantom.png", "orb_points_phantom.png"),
+        *("depth_change_phantom.png", "mesh_phantom_mapis.png", "mesh_phantom_plain.png"),
+    }
+    consistency = list(csv.DictReader((out / "tables/consistency.csv").read_text().splitlines()))
+    assert [row["method"] for row in consistency] == ["mapis", "plain"]
+    assert all(np.isfinite(float(row["TAE, true poses [%]"])) for row in consistency)
+    assert "## Consistency in time" in (out / "results.md").read_text()
+
+
+def test_plans_that_come_along_are_listed() -> None:
+    output = run("bench").stdout
+    assert "c3vd-rgbd: C3VD, ten clips, true depth, 8 methods" in output
+    assert "scared-c" in output
+
+
+def test_a_plan_needs_a_folder_and_its_data(tmp_path: Path) -> None:
+    assert "--out" in run("bench", "scared", code=2).output
+    error = run("bench", "scared", "--out", tmp_path / "out", "--data", tmp_path, code=1).exception
+    assert isinstance(error, InputError)
+    assert "nothing like that in" in str(error)

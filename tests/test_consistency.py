@@ -1,0 +1,361 @@
+"""Consistency in time: planes seen by moving cameras, flicker of known size, masks, and real truth."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose, see, true_flow
+
+from scopemap.camera import PinholeCamera
+from scopemap.datasets import open_sequence
+from scopemap.errors import SettingsError
+from scopemap.evaluation.consistency import ConsistencyMeter, ConsistencyReport, DepthFrame
+from scopemap.evaluation.depth_change import alignment_errors, depth_change, looks_alike, mean_change, projected_depth
+from scopemap.evaluation.image_link import ImageLink, ImageLinker
+from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
+
+STILL = [pose()] * 4
+ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]
+FORWARD = [pose(at_mm=(0.0, 0.0, 2.0 * k)) for k in range(3)]
+TILTED_ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0), turn_rad=(0.0, 0.4, 0.0)) for k in range(3)]
+WANDERING = [pose(at_mm=(k, -k, 0.5 * k), turn_rad=(0.02 * k, 0.03 * k, -0.05 * k)) for k in range(3)]
+
+
+def links(views: list[View], flow_sign: float = 1.0) -> list[ImageLink | None]:
+    linker = ImageLinker(CAMERA)
+    flows = [None, *(flow_sign * true_flow(view, before) for before, view in itertools.pairwise(views))]
+    return [linker.link(view.rgb, EVERYWHERE, flow) for view, flow in zip(views, flows, strict=True)]
+
+
+def measure(
+    poses: list[np.ndarray],
+    factors: list[float] | None = None,
+    told_poses: list[np.ndarray] | None = None,
+    flow_sign: float = 1.0,
+) -> ConsistencyReport:
+    """Measure exact depth, times a factor per frame, with the true poses as reference or those that are told."""
+    views = [see(T) for T in poses]
+    meter = ConsistencyMeter(CAMERA)
+    told, factors = told_poses or poses, factors or [1.0] * len(poses)
+    for view, T, factor, link in zip(views, told, factors, links(views, flow_sign), strict=True):
+        depth_mm = np.float32(factor) * view.depth_mm
+        meter.add(DepthFrame(depth_mm, EVERYWHERE, T_reference_camera=T, true_depth_mm=view.depth_mm), link)
+    return meter.report()
+
+
+def same(a: ConsistencyReport, b: ConsistencyReport) -> bool:
+    return repr(a) == repr(b)
+
+
+# ---- exact depth
+
+
+def test_identical_frames_differ_by_nothing() -> None:
+    report = measure(STILL)
+    for change in (report.same_pixel, report.along_flow, report.opw, report.opw_reference):
+        assert (change.pairs, change.mean_mm, change.relative, change.rtc) == (3, 0, 0, 1)
+    assert (report.tae_reference.pairs, report.tae_reference.percent) == (3, pytest.approx(0, abs=1e-4))
+    assert (report.jitter.log_std, report.jitter.log_step) == (0, 0)
+    assert report.orb_reference.pairs == 3
+    assert report.orb_reference.matches > 300
+    assert (report.orb_reference.mean_mm, report.orb_camera.mean_mm) == (0, 0)
+
+
+def test_exact_depth_of_a_plane_passed_sideways_is_consistent() -> None:
+    report = measure(ASIDE)
+    assert report.tae_reference.percent < 1e-3
+    assert report.opw.mean_mm < 1e-4
+    assert report.orb_reference.median_mm < 1e-3
+    assert report.orb_camera.median_mm == pytest.approx(SIX_PIXELS_MM, rel=1e-3)
+
+
+def test_approach_is_change_of_depth_until_the_poses_explain_it() -> None:
+    report = measure(FORWARD)
+    for change in (report.same_pixel, report.along_flow, report.opw):
+        assert change.mean_mm == pytest.approx(2, rel=1e-4)
+        assert change.relative == pytest.approx((2 / 48 + 2 / 46) / 2, rel=1e-4)
+        assert change.rtc == 0
+    assert report.opw_reference.mean_mm < 1e-3
+    assert report.opw_reference.rtc == 1
+    assert report.tae_reference.percent < 1e-3
+    # Matches lie on whole pixels, a third of a millimetre wide; the approach is 2 mm.
+    assert report.orb_reference.median_mm < 0.25
+    assert report.orb_camera.median_mm > 1.8
+
+
+@pytest.mark.parametrize("poses", [TILTED_ASIDE, WANDERING])
+def test_exact_depth_of_a_tilted_plane_is_consistent_up_to_the_rounding_to_pixels(poses: list[np.ndarray]) -> None:
+    report = measure(poses)
+    assert report.tae_reference.percent < 0.2
+    assert report.opw_reference.relative < 1e-3
+    assert report.opw_reference.rtc > 0.999
+    assert report.orb_reference.relative_median < 5e-3
+
+
+def test_transposed_poses_are_found_out() -> None:
+    rows_for_columns = [se3(T[:3, :3].T, T[:3, 3]) for T in WANDERING]
+    told = [inverse(T) for T in WANDERING]
+    for wrong in (rows_for_columns, told):
+        report = measure(WANDERING, told_poses=wrong)
+        assert report.tae_reference.percent > 1
+        assert report.opw_reference.relative > 1e-2
+        assert report.orb_reference.relative_median > 2e-2
+
+
+def test_flow_of_the_wrong_sign_is_found_out() -> None:
+    # Along its own x axis: no point changes its depth, and every pixel's depth changes.
+    turned = TILTED_ASIDE[0][:3, :3]
+    poses = [se3(turned, turned @ T[:3, 3]) for T in ASIDE]
+    right, wrong = measure(poses), measure(poses, flow_sign=-1.0)
+    assert right.along_flow.mean_mm < 1e-2
+    assert wrong.along_flow.mean_mm > 1
+    # OPW looks at the pictures too: hardly a pixel finds its colour at the wrong place.
+    views = [see(T) for T in poses]
+    shares = [np.mean(links(views, sign)[1].alike) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
+    assert shares[0] > 0.95
+    assert shares[1] < 0.3
+
+
+# ---- flicker
+
+
+@pytest.mark.parametrize("e", [0.004, 0.006, 0.05])
+def test_flicker_of_a_still_camera_has_its_closed_forms(e: float) -> None:
+    report = measure(STILL, [1 + e, 1 - e, 1 + e, 1 - e])
+    step = np.log((1 + e) / (1 - e))
+    assert report.jitter.log_std == pytest.approx(step / 2, rel=1e-4)
+    assert report.jitter.log_step == pytest.approx(step, rel=1e-4)
+    for change in (report.same_pixel, report.along_flow, report.opw, report.opw_reference):
+        assert change.mean_mm == pytest.approx(2 * e * PLANE_MM, rel=1e-3)
+        # Two of the three pairs end on the lower value.
+        assert change.relative == pytest.approx((2 * 2 * e / (1 - e) + 2 * e / (1 + e)) / 3, rel=1e-3)
+        assert change.rtc == (1 if e < 0.005 else 0)
+    assert report.tae_reference.percent == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
+    linker = ImageLinker(CAMERA)
+    linker.link(see(STILL[0]).rgb, EVERYWHERE)
+    link = linker.link(see(STILL[0]).rgb, EVERYWHERE)
+    assert link is not None
+    from_camera = np.linalg.norm(CAMERA.unproject(link.matches.current_px), axis=1)
+    assert report.orb_reference.mean_mm == pytest.approx(2 * e * PLANE_MM * from_camera.mean(), rel=1e-3)
+    assert report.orb_camera.relative_median == pytest.approx(2 * e * np.median(from_camera), rel=1e-3)
+
+
+def test_flicker_raises_every_figure_of_a_moving_camera() -> None:
+    exact, flickering = measure(WANDERING), measure(WANDERING, [0.95, 1.05, 0.95])
+    assert flickering.tae_reference.percent > 8
+    assert flickering.opw_reference.mean_mm > exact.opw_reference.mean_mm + 4
+    assert flickering.orb_reference.median_mm > exact.orb_reference.median_mm + 4
+    assert flickering.opw_reference.rtc < 0.01
+
+
+# ---- scale, poses of the method's own
+
+
+def test_scale_serves_depth_and_estimated_poses_and_leaves_relative_figures() -> None:
+    views = [see(T) for T in WANDERING]
+    reports = []
+    for unit, scale in ((1.0, 1.0), (0.1, 1.0), (0.1, 10.0)):
+        meter = ConsistencyMeter(CAMERA, scale)
+        for view, link in zip(views, links(views), strict=True):
+            own_pose = se3(view.T_world_camera[:3, :3], unit * view.T_world_camera[:3, 3])
+            meter.add(DepthFrame(unit * view.depth_mm, EVERYWHERE, own_pose, view.T_world_camera), link)
+        reports.append(meter.report())
+    exact, tiny, restored = reports
+    assert restored.scale == 10
+    assert tiny.opw.mean_mm == pytest.approx(0.1 * exact.opw.mean_mm, rel=1e-4)
+    for name in ("mean_mm", "relative", "rtc"):
+        assert getattr(restored.opw_estimated, name) == pytest.approx(getattr(exact.opw_estimated, name), abs=1e-4)
+        assert getattr(restored.opw_reference, name) == pytest.approx(getattr(exact.opw_reference, name), abs=1e-4)
+    # Its own poses agree with its own depth at any scale; the reference's poses do not.
+    assert tiny.tae_estimated.percent == pytest.approx(exact.tae_estimated.percent, abs=1e-3)
+    assert tiny.tae_reference.percent > 5
+    assert restored.orb_estimated.median_mm == pytest.approx(exact.orb_reference.median_mm, abs=1e-3)
+
+
+def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> None:
+    frames = [DepthFrame(view.depth_mm, EVERYWHERE, view.T_world_camera) for view in map(see, ASIDE + ASIDE[:1])]
+    frames[1] = replace(frames[1], T_world_camera=None)
+    meter, linker = ConsistencyMeter(CAMERA), ImageLinker(CAMERA)
+    for frame, view in zip(frames, map(see, ASIDE + ASIDE[:1]), strict=True):
+        meter.add(frame, linker.link(view.rgb, EVERYWHERE))
+    report = meter.report()
+    assert (report.frames, report.pairs) == (4, 3)
+    assert (report.world_poses, report.tae_estimated.pairs, report.tae_reference.pairs) == ("estimated", 1, 0)
+    assert report.orb_world is report.orb_estimated
+    assert report.orb_estimated.pair_matches[:2] == (0, 0)
+    assert report.orb_estimated.pair_matches[2] > 50
+    assert report.orb_camera.pairs == 3
+    assert measure(ASIDE).world_poses == "reference"
+    # Without flow nothing along it is measured; without truth there is no jitter.
+    assert (report.opw.pairs, report.along_flow.pairs, report.same_pixel.pairs) == (0, 0, 3)
+    assert np.isnan([report.opw.mean_mm, report.jitter.log_std, report.tae_reference.percent]).all()
+
+
+def test_without_links_flow_and_features_are_silent_and_the_rest_speaks() -> None:
+    meter = ConsistencyMeter(CAMERA)
+    for T in FORWARD:
+        meter.add(DepthFrame(see(T).depth_mm, EVERYWHERE, T_reference_camera=T))
+    report = meter.report()
+    assert (report.orb_reference.matches, report.opw.pairs) == (0, 0)
+    assert report.orb_reference.pair_matches == (0, 0)
+    assert report.same_pixel.mean_mm == pytest.approx(2)
+    assert report.tae_reference.percent < 1e-3
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_fewer_than_two_frames_give_no_figures(frames: int) -> None:
+    meter = ConsistencyMeter(CAMERA)
+    for T in STILL[:frames]:
+        meter.add(DepthFrame(see(T).depth_mm, EVERYWHERE, T, T))
+    report = meter.report()
+    assert (report.frames, report.pairs, report.same_pixel.pairs, report.orb_camera.pairs) == (frames, 0, 0, 0)
+    assert np.isnan(report.same_pixel.mean_mm)
+
+
+# ---- masks and missing values
+
+
+def test_what_is_masked_unknown_or_impossible_does_not_count() -> None:
+    views = [see(T) for T in WANDERING]
+    valid = EVERYWHERE.copy()
+    valid[60:120, 90:150] = False
+    reports = []
+    for rubbish, mask in ((1.0, valid), (500.0, valid), (np.nan, EVERYWHERE), (0.0, EVERYWHERE), (-5.0, EVERYWHERE)):
+        meter = ConsistencyMeter(CAMERA)
+        for view, link in zip(views, links(views), strict=True):
+            depth_mm = np.where(valid, view.depth_mm, np.float32(rubbish))
+            meter.add(DepthFrame(depth_mm, mask, T_reference_camera=view.T_world_camera), link)
+        reports.append(meter.report())
+    assert all(same(report, reports[0]) for report in reports)
+    whole = measure(WANDERING)
+    assert reports[0].orb_reference.matches < whole.orb_reference.matches
+    assert reports[0].opw_reference.relative < 1e-3
+
+
+def test_flow_counts_only_where_it_is_trusted() -> None:
+    views = [see(T) for T in STILL[:2]]
+    nonsense = np.zeros((*EVERYWHERE.shape, 2), np.float32)
+    nonsense[:, 120:] = 40
+    depth_mm = np.tile(np.linspace(20, 60, CAMERA.width, dtype=np.float32), (CAMERA.height, 1))
+    changes = []
+    for trusted in (EVERYWHERE, np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)):
+        linker, meter = ImageLinker(CAMERA), ConsistencyMeter(CAMERA)
+        for view in views:
+            link = linker.link(view.rgb, EVERYWHERE, nonsense, trusted)
+            meter.add(DepthFrame(depth_mm, EVERYWHERE), link)
+        changes.append(meter.report().along_flow.mean_mm)
+    assert changes[0] > 1
+    assert changes[1] < 1e-5
+
+
+def test_images_must_have_the_same_colour_at_both_ends_of_the_flow() -> None:
+    grey = np.full((4, 5, 3), 100, np.uint8)
+    flow = np.zeros((4, 5, 2), np.float32)
+    # |difference| of k in three channels of 0..1 is sqrt(3) k / 255; exp(-50 x) > 0.01 up to k = 13.56.
+    assert looks_alike(grey, grey + np.uint8(13), flow).all()
+    assert not looks_alike(grey, grey + np.uint8(14), flow).any()
+    flow[0, 0] = (0, -251)
+    flow[1, 1] = (249, -249)
+    alike = looks_alike(grey, grey, flow)
+    assert not alike[0, 0]
+    assert np.count_nonzero(alike) == 19
+
+
+def test_a_link_counts_neither_masked_features_nor_distrusted_flow() -> None:
+    view = see(pose())
+    left = np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)
+    linker = ImageLinker(CAMERA)
+    assert linker.link(view.rgb, left) is None
+    link = linker.link(view.rgb, left, np.zeros((*left.shape, 2), np.float32), left)
+    assert link is not None
+    assert len(link.matches.current_px) > 50
+    assert link.matches.current_px[:, 0].max() < 120
+    assert np.array_equal(link.alike, left)
+
+
+# ---- the measures of one pair
+
+
+def test_change_of_two_maps_computed_by_hand() -> None:
+    change = depth_change(np.array([[11.0, 20.1, np.nan]]), np.array([[10.0, 20.0, 5.0]]))
+    assert (change.mean_mm, change.relative, change.rtc) == pytest.approx((0.55, (0.1 + 0.005) / 2, 0.5))
+    other = depth_change(np.array([[12.0]]), np.array([[10.0]]))
+    nothing = depth_change(np.array([[np.nan]]), np.array([[10.0]]))
+    mean = mean_change([change, nothing, other])
+    assert (mean.pairs, mean.mean_mm, mean.rtc) == (2, pytest.approx((0.55 + 2) / 2), 0.25)
+    assert depth_change(np.array([[1.01]]), np.array([[1.0]])).rtc == 0
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_tae_is_what_its_public_definition_says_pixel_by_pixel(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(9.0, 8.0, 5.3, 4.1, 11, 9)
+    maps = [rng.uniform(5, 60, (9, 11)).astype(np.float32) for _ in range(2)]
+    maps[0][rng.random((9, 11)) < 0.1] = np.nan
+    T = se3_exp(rng.normal(size=6) * [0.05, 0.05, 0.05, 4, 4, 8])
+    expected = [_tae_by_hand(maps[0], maps[1], camera, T), _tae_by_hand(maps[1], maps[0], camera, inverse(T))]
+    assert alignment_errors(maps[0], maps[1], camera, T) == pytest.approx(expected, rel=1e-4)
+
+
+def _tae_by_hand(depth_1: np.ndarray, depth_2: np.ndarray, camera: PinholeCamera, T_2_1: np.ndarray) -> float:
+    splat = np.zeros_like(depth_2)
+    for v, u in np.ndindex(depth_1.shape):
+        if not np.isnan(depth_1[v, u]):
+            point = T_2_1 @ [*(float(depth_1[v, u]) * np.linalg.inv(camera.matrix) @ [u, v, 1]), 1]
+            column, row = (int(np.round(x)) for x in (camera.matrix @ point[:3])[:2] / point[2])
+            if 0 <= row < camera.height and 0 <= column < camera.width:
+                splat[row, column] = point[2]
+    errors = [abs(a - b) / b for a, b in zip(splat.ravel(), depth_2.ravel(), strict=True) if a > 0 and b > 0]
+    return float(np.mean(errors))
+
+
+def test_points_behind_the_camera_and_views_that_do_not_meet_are_not_compared() -> None:
+    depth_mm = see(pose()).depth_mm
+    about = se3(so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+    assert np.isnan(projected_depth(depth_mm, CAMERA, about)).all()
+    assert np.isnan(alignment_errors(depth_mm, depth_mm, CAMERA, about)).all()
+
+
+def test_unusable_arguments_are_refused() -> None:
+    with pytest.raises(SettingsError, match="scale of depth is 0"):
+        ConsistencyMeter(CAMERA, 0.0)
+    with pytest.raises(ValueError, match=r"DepthFrame.depth_mm"):
+        ConsistencyMeter(CAMERA).add(DepthFrame(np.ones((3, 3)), EVERYWHERE))
+    linker = ImageLinker(CAMERA)
+    linker.link(see(pose()).rgb, EVERYWHERE)
+    with pytest.raises(ValueError, match="to_previous"):
+        linker.link(see(pose()).rgb, EVERYWHERE, np.zeros((3, 3, 2)))
+
+
+# ---- real truth
+
+
+@pytest.mark.real
+def test_true_depth_of_a_real_colon_is_consistent_and_flicker_shows(real_data: Path) -> None:
+    sequence = open_sequence(real_data / "endoscopy" / "c3vd" / "trans_t1_a")
+    linker = ImageLinker(sequence.camera)
+    meters = {flicker: ConsistencyMeter(sequence.camera) for flicker in (0.0, 0.02)}
+    for number, (frame, truth) in enumerate(sequence):
+        assert truth is not None
+        assert truth.depth_mm is not None
+        link = linker.link(frame.rgb, frame.valid)
+        for flicker, meter in meters.items():
+            depth_mm = truth.depth_mm * np.float32(1 + flicker * (-1) ** number)
+            meter.add(DepthFrame(depth_mm, frame.valid, None, truth.T_world_camera, truth.depth_mm), link)
+    exact, flickering = (meter.report() for meter in meters.values())
+    assert (exact.pairs, exact.orb_reference.pairs) == (9, 9)
+    # 0.29 % and 0.29 mm (a pixel is about that wide); the mean holds matches at the edges of folds.
+    assert exact.tae_reference.percent < 0.4
+    assert exact.orb_reference.median_mm < 0.4
+    assert exact.orb_reference.relative_median < 0.01
+    assert flickering.tae_reference.percent == pytest.approx(4.0, abs=0.3)
+    assert flickering.orb_reference.relative_median == pytest.approx(0.04, abs=0.01)
+    assert flickering.jitter.log_step == pytest.approx(np.log(1.02 / 0.98), rel=1e-3)
+    assert set(asdict(exact)) == set(asdict(flickering))

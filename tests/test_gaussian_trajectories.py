@@ -1,0 +1,147 @@
+"""`params.npz` of SplaTAM, EndoGSLAM and Endo-2DTAM: the path, which frame a column is, and nothing unpickled."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_layouts import assert_is, moving_camera, splatam_arrays, write_splatam
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.errors import InputError
+from scopemap.geometry.se3 import se3_exp
+from scopemap.trajectory import read_trajectory
+
+HELD_OUT = [frame for frame in range(100) if frame % 8 != 7]
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+@pytest.mark.parametrize(
+    ("kind", "config", "frames"),
+    [
+        ("endogslam", None, HELD_OUT),
+        ("splatam", None, list(range(100))),
+        ("auto", 'start=0, stride=1, train_or_test="train"', HELD_OUT),
+        ("auto", "start=0, stride=1", list(range(100))),
+        ("auto", "start=3, stride=2, train_or_test='all'", list(range(3, 100, 2))),
+        ("auto", "start=3, stride=2, train_or_test='train'", [f for f in range(3, 100) if (f - 3) % 8 != 7][::2]),
+        ("splatam", 'train_or_test="train"', list(range(100))),
+    ],
+)
+def test_gaussian_slam_is_inverted_and_numbered_by_its_split(
+    tmp_path: Path, unit: str, kind: str, config: str | None, frames: list[int]
+) -> None:
+    poses = moving_camera(30)
+    folder = write_splatam(tmp_path, splatam_arrays(poses, unit), config)
+    for path in (folder, folder / "params.npz"):
+        found = read_trajectory(path, kind=kind, unit=unit)
+        assert_is(found, poses, frames[:30], atol=1e-4)
+        assert f"world-to-camera inverted, {unit} (assumed)" in found.source
+        assert str(frames[2]) in found.source
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        None,
+        "stride=int(os.environ['STRIDE'])",
+        "stride=1), more=dict(stride=2",
+        "stride=0",
+        "train_or_test='test'",
+        "stride=1))) #",
+    ],
+)
+def test_gaussian_slam_of_an_unknown_split_asks_for_the_kind(tmp_path: Path, config: str | None) -> None:
+    folder = write_splatam(tmp_path, splatam_arrays(moving_camera()), config)
+    with pytest.raises(InputError, match=r"say kind 'endogslam' .* or 'splatam'"):
+        read_trajectory(folder)
+
+
+def test_config_of_a_run_is_read_but_never_run(tmp_path: Path) -> None:
+    trap = f"stride=1, trap=open({str(tmp_path / 'sprung')!r}, 'w')"
+    assert len(read_trajectory(write_splatam(tmp_path / "run", splatam_arrays(moving_camera()), trap))) == 20
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_untracked_tail_of_a_checkpoint_is_left_out(tmp_path: Path) -> None:
+    arrays = splatam_arrays(moving_camera(), seed=1)
+    arrays["cam_unnorm_rots"][..., 12:] = np.array([1, 0, 0, 0])[:, None]
+    arrays["cam_trans"][..., 12:] = 0
+    np.savez(tmp_path / "params11.npz", **arrays)
+    found = read_trajectory(tmp_path / "params11.npz", kind="endogslam")
+    assert_is(found, moving_camera()[:12], HELD_OUT[:12], atol=1e-4)
+
+
+class Trap:
+    """Unpickling it leaves a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str, str]]:
+        return open, (str(self.path), "w")
+
+
+def test_pickles_are_never_loaded(tmp_path: Path) -> None:
+    sprung = tmp_path / "sprung"
+    trap = np.array([Trap(sprung)], dtype=object)
+    arrays = splatam_arrays(moving_camera())
+    # Exposure settings, pickled beside the poses, do no harm; pickled poses are refused.
+    np.savez(tmp_path / "params.npz", **arrays, exp_list=trap)
+    assert len(read_trajectory(tmp_path / "params.npz", kind="splatam")) == 20
+    np.savez(tmp_path / "params.npz", **(arrays | {"cam_trans": trap}))
+    with pytest.raises(InputError, match="pickled objects, which are never loaded"):
+        read_trajectory(tmp_path / "params.npz", kind="splatam")
+    for name, protocol in (("test1.pkl", 4), ("odometry", 2), ("old.pickle", 0)):
+        (tmp_path / name).write_bytes(pickle.dumps(Trap(sprung), protocol=protocol))
+        for kind in ("auto", "endo-depth"):
+            with pytest.raises(InputError, match="is a Python pickle, which may run any code"):
+                read_trajectory(tmp_path / name, kind=kind)
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"cam_trans": np.zeros((1, 3, 4))}, r"found \(1, 4, 20\) and \(1, 3, 4\)"),
+        ({"cam_unnorm_rots": np.zeros((4, 20))}, r"found \(4, 20\)"),
+        ({"cam_unnorm_rots": np.ones((1, 4, 20)) * (np.arange(20) != 5)}, "column 5: the quaternion has length nan"),
+        ({"cam_trans": np.where(np.arange(20) == 6, np.nan, 1.0) * np.ones((1, 3, 1))}, "column 6: a pose holds NaN"),
+        ({"w2c": se3_exp(np.ones(6))}, "w2c is not the identity"),
+    ],
+)
+def test_bad_gaussian_slam_files_are_refused(tmp_path: Path, changed: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_trajectory(write_splatam(tmp_path, splatam_arrays(moving_camera()) | changed), kind="splatam")
+
+
+def test_other_and_damaged_npz_files_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", poses=np.eye(4))
+    with pytest.raises(InputError, match="holds no cam_unnorm_rots and no cam_trans"):
+        read_trajectory(tmp_path / "other.npz", kind="splatam")
+    (tmp_path / "text.npz").write_text("not a zip")
+    np.save(tmp_path / "one.npy", np.eye(4))
+    for name in ("text.npz", "one.npy"):
+        with pytest.raises(InputError, match="arrays are damaged"):
+            read_trajectory(tmp_path / name, kind="splatam")
+
+
+@given(count=st.integers(2, 60), factors=st.lists(st.floats(0.01, 100), min_size=60, max_size=60), data=st.data())
+@settings(max_examples=25, deadline=None)
+def test_length_and_sign_of_a_quaternion_mean_nothing(
+    tmp_path_factory: pytest.TempPathFactory, count: int, factors: list[float], data: st.DataObject
+) -> None:
+    signs = data.draw(st.lists(st.sampled_from([-1.0, 1.0]), min_size=count, max_size=count))
+    folder = tmp_path_factory.mktemp("run")
+    arrays = splatam_arrays(moving_camera(count))
+    plain = read_trajectory(write_splatam(folder, arrays), kind="endogslam")
+    arrays["cam_unnorm_rots"] = arrays["cam_unnorm_rots"] * np.array(factors[:count]) * np.array(signs)
+    found = read_trajectory(write_splatam(folder, arrays), kind="endogslam")
+    np.testing.assert_allclose(found.T_world_camera, plain.T_world_camera, atol=1e-4)
+    # Every frame up to the last is either there or one of the held out.
+    missing = sorted(set(range(found.indices[-1])) - set(found.indices.tolist()))
+    assert missing == list(range(7, found.indices[-1], 8))

@@ -1,0 +1,178 @@
+"""ORB displacement: which points match, where they are lifted to, and how far apart they then lie."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import plane_scene as scene
+import pytest
+from plane_scene import CAMERA, EVERYWHERE, SIX_PIXELS_MM, View, pose, see, true_flow
+
+from scopemap.evaluation.orb import (
+    DisplacementSummary,
+    Matches,
+    OrbFeatures,
+    displacements,
+    match_features,
+    orb_features,
+)
+from scopemap.geometry.se3 import inverse
+
+START = see(pose())
+ASIDE = see(pose(at_mm=(SIX_PIXELS_MM, 0.0, 0.0)))
+
+
+def matched(previous: View, current: View) -> Matches:
+    return match_features(orb_features(previous.rgb), orb_features(current.rgb), CAMERA)
+
+
+def exact_matches(previous: View, current: View) -> Matches:
+    """Pixels of `current` on a grid, and where exactly they are in `previous`."""
+    v, u = np.mgrid[20:160:20, 20:220:20]
+    current_px = np.stack([u.ravel(), v.ravel()], -1)
+    return Matches(current_px + true_flow(current, previous)[v.ravel(), u.ravel()], current_px.astype(float))
+
+
+def test_a_camera_that_moves_six_pixels_aside_moves_its_matches_by_six_pixels() -> None:
+    matches = matched(START, ASIDE)
+    assert len(matches.current_px) > 100
+    shift = matches.current_px - matches.previous_px
+    assert np.median(shift, axis=0) == pytest.approx([-6, 0])
+    assert np.quantile(np.abs(shift - [-6, 0]), 0.9) < 1
+
+
+def test_exact_depth_and_poses_put_matches_onto_each_other() -> None:
+    found = displacements(
+        matched(START, ASIDE), START.depth_mm, ASIDE.depth_mm, CAMERA, (START.T_world_camera, ASIDE.T_world_camera)
+    )
+    assert np.median(found.displacement_mm) < 1e-3
+    # A pixel is a third of a millimetre here.
+    assert np.mean(found.displacement_mm) < 0.15
+    assert found.relative == pytest.approx(found.displacement_mm / 50, rel=1e-6)
+
+
+@pytest.mark.parametrize("turn_rad", [(0.0, 0.0, 0.0), (0.05, -0.1, 0.2)])
+def test_exact_matches_lift_to_one_point_of_the_plane(turn_rad: tuple[float, ...]) -> None:
+    view = see(pose(at_mm=(3.0, -2.0, 4.0), turn_rad=turn_rad))
+    poses = (START.T_world_camera, view.T_world_camera)
+    found = displacements(exact_matches(START, view), START.depth_mm, view.depth_mm, CAMERA, poses)
+    assert len(found.displacement_mm) > 50
+    assert found.displacement_mm.max() < 2e-3
+    assert found.current_mm[:, 2] == pytest.approx(scene.PLANE_MM, abs=1e-3)
+
+
+def test_without_poses_the_displacement_is_the_camera_s_motion() -> None:
+    matches = exact_matches(START, ASIDE)
+    found = displacements(matches, START.depth_mm, ASIDE.depth_mm, CAMERA)
+    assert found.displacement_mm == pytest.approx(SIX_PIXELS_MM, abs=1e-3)
+
+
+def test_poses_the_wrong_way_round_double_the_motion_instead_of_removing_it() -> None:
+    poses = (inverse(START.T_world_camera), inverse(ASIDE.T_world_camera))
+    found = displacements(exact_matches(START, ASIDE), START.depth_mm, ASIDE.depth_mm, CAMERA, poses)
+    assert found.displacement_mm == pytest.approx(2 * SIX_PIXELS_MM, abs=1e-3)
+
+
+def test_depth_that_is_one_percent_off_moves_points_by_one_percent_of_their_distance() -> None:
+    matches = exact_matches(START, START)
+    found = displacements(matches, START.depth_mm, 1.01 * START.depth_mm, CAMERA)
+    from_camera_mm = scene.PLANE_MM * np.linalg.norm(CAMERA.unproject(matches.current_px), axis=1)
+    assert found.displacement_mm == pytest.approx(0.01 * from_camera_mm, rel=1e-4)
+    assert found.depth_mm == pytest.approx(1.005 * scene.PLANE_MM)
+
+
+def test_matches_without_depth_at_both_ends_are_left_out() -> None:
+    matches = Matches(
+        np.array([[10.0, 10.0], [20.4, 20.4], [30.0, 30.0]]), np.array([[12.0, 10.0], [22.0, 20.0], [-3.0, 30.0]])
+    )
+    holes = START.depth_mm.copy()
+    holes[10, 10] = np.nan
+    found = displacements(matches, holes, START.depth_mm, CAMERA)
+    # The first starts in the hole, the last ends outside the image.
+    assert len(found.displacement_mm) == 1
+    assert found.current_mm[0] == pytest.approx(50 * CAMERA.unproject(np.array([22.0, 20.0])))
+
+
+def test_matching_is_the_same_every_time() -> None:
+    first, second = matched(START, ASIDE), matched(START, ASIDE)
+    assert np.array_equal(first.current_px, second.current_px)
+    assert np.array_equal(first.previous_px, second.previous_px)
+
+
+def test_every_match_is_mutual_and_clear_as_opencv_s_own_matcher_finds_it() -> None:
+    a, b = orb_features(START.rgb), orb_features(ASIDE.rgb)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    forth = {
+        m.queryIdx: m.trainIdx
+        for m, n in matcher.knnMatch(a.descriptors, b.descriptors, 2)
+        if m.distance < 0.8 * n.distance
+    }
+    back = {
+        m.queryIdx: m.trainIdx
+        for m, n in matcher.knnMatch(b.descriptors, a.descriptors, 2)
+        if m.distance < 0.8 * n.distance
+    }
+    mutual = {(*a.pixels[i], *b.pixels[j]) for i, j in forth.items() if back.get(j) == i}
+    matches = match_features(a, b, CAMERA)
+    rows = {tuple(row) for row in np.hstack([matches.previous_px, matches.current_px])}
+    assert rows <= mutual
+    assert len(rows) > 0.9 * len(mutual)
+
+
+def test_what_does_not_move_as_the_scene_is_no_match() -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-15, 15, (200, 2)), rng.uniform(35, 70, 200)])
+    previous_px, current_px = CAMERA.project(points), CAMERA.project(points - [2, 0, 0])
+    # The camera moves along x: no point of a rigid scene moves along y.
+    current_px[:40, 1] += rng.choice([-12, -6, 6, 12], 40)
+    descriptors = rng.integers(0, 256, (200, 32), dtype=np.uint8)
+    matches = match_features(OrbFeatures(previous_px, descriptors), OrbFeatures(current_px, descriptors), CAMERA)
+    assert np.abs(matches.current_px - matches.previous_px)[:, 1].max() < 1
+    assert len(matches.current_px) == 160
+
+
+def test_no_feature_lies_where_nothing_is_valid() -> None:
+    valid = EVERYWHERE.copy()
+    valid[:, 100:] = False
+    pixels = orb_features(START.rgb, valid).pixels
+    assert len(pixels) > 20
+    assert pixels[:, 0].max() < 100
+
+
+def test_images_without_texture_have_no_features_and_no_matches() -> None:
+    blank = orb_features(np.full_like(START.rgb, 90))
+    assert blank.pixels.shape == (0, 2)
+    assert len(match_features(blank, orb_features(START.rgb), CAMERA).current_px) == 0
+    nothing = displacements(match_features(blank, blank, CAMERA), START.depth_mm, START.depth_mm, CAMERA)
+    assert nothing.displacement_mm.shape == (0,)
+
+
+def test_fewer_than_eight_features_match_nothing() -> None:
+    features = orb_features(START.rgb)
+    few = OrbFeatures(features.pixels[:7], features.descriptors[:7])
+    assert len(match_features(few, few, CAMERA).current_px) == 0
+
+
+def test_smooth_tissue_has_features_too() -> None:
+    faint = cv2.GaussianBlur(START.rgb, (0, 0), 1.0) // 4 + 90
+    assert len(orb_features(faint).pixels) > 100
+    assert len(cv2.ORB.create(1000).detect(cv2.cvtColor(faint, cv2.COLOR_RGB2GRAY))) < 30
+
+
+def test_sequence_statistics_pool_matches_and_keep_the_place_of_empty_pairs() -> None:
+    rows = [np.array([1.0, 3.0]), np.empty(0), np.array([8.0])]
+    summary = DisplacementSummary.of(rows, [row / 10 for row in rows])
+    assert (summary.pairs, summary.matches, summary.mean_mm, summary.median_mm) == (2, 3, 4, 3)
+    assert summary.std_mm == pytest.approx(np.sqrt(26 / 3))
+    assert (summary.relative_mean, summary.relative_median) == pytest.approx((0.4, 0.3))
+    assert summary.pair_matches == (2, 0, 1)
+    assert summary.pair_mean_mm == pytest.approx((2, np.nan, 8), nan_ok=True)
+    assert summary.pair_median_mm == pytest.approx((2, np.nan, 8), nan_ok=True)
+    assert np.isnan(DisplacementSummary.of([], []).mean_mm)
+
+
+def test_sizes_must_agree() -> None:
+    with pytest.raises(ValueError, match="depth_current_mm"):
+        displacements(exact_matches(START, START), START.depth_mm, START.depth_mm[:5], CAMERA)
+    with pytest.raises(ValueError, match="rgb"):
+        orb_features(START.rgb[..., 0])

@@ -1,0 +1,144 @@
+"""ICP: known motions come back, outliers and missing halves do not pull, free directions stay still."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from scopemap.errors import AlignmentError
+from scopemap.evaluation.registration import refine
+from scopemap.evaluation.surface import surface_points
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp, transform
+
+
+def landscape(side: int = 45, step_mm: float = 1.0) -> trimesh.Trimesh:
+    """Hills without a symmetry: every motion of it shows."""
+    u, v = np.meshgrid(np.arange(side) * step_mm, np.arange(side) * step_mm, indexing="ij")
+    height = 4 * np.sin(0.21 * u) * np.cos(0.16 * v) + 2 * np.sin(0.31 * v + 0.05 * u) + 0.05 * u
+    a = np.arange(side * side).reshape(side, side)
+    lower = np.stack([a[:-1, :-1], a[1:, :-1], a[:-1, 1:]], -1).reshape(-1, 3)
+    upper = np.stack([a[1:, :-1], a[1:, 1:], a[:-1, 1:]], -1).reshape(-1, 3)
+    return trimesh.Trimesh(np.stack([u, v, height], -1).reshape(-1, 3), np.concatenate([lower, upper]), process=False)
+
+
+def small_motion(rng: np.random.Generator, angle_rad: float = 0.06, way_mm: float = 1.5) -> np.ndarray:
+    return se3(so3_exp(rng.uniform(-angle_rad, angle_rad, 3)), rng.uniform(-way_mm, way_mm, 3))
+
+
+def left_over(found_R: np.ndarray, found_t: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
+    """How far the found motion takes the landscape's middle beside where it should be, mm, and its turn, rad."""
+    middle = np.array([22.0, 22.0, 0.0])
+    offset = found_R @ middle + found_t - transform(wanted, middle)
+    return float(np.linalg.norm(offset)), float(rotation_angle_rad(found_R @ wanted[:3, :3].T))
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_known_motion_is_undone(seed: int) -> None:
+    truth = landscape()
+    T = small_motion(np.random.default_rng(seed))
+    result = refine(truth.copy().apply_transform(T), truth)
+    assert result.similarity.scale == 1
+    off_mm, turned_rad = left_over(result.similarity.R, result.similarity.t, inverse(T))
+    assert off_mm < 0.05
+    assert turned_rad < 2e-3
+    assert result.rms_after_mm < 0.02 < result.rms_before_mm
+    assert result.converged
+
+
+def test_it_finds_what_another_icp_finds_on_bare_points() -> None:
+    # Where each point has its twin both must find the same motion; the referee is point to point.
+    points = surface_points(landscape())[:4000]
+    T = small_motion(np.random.default_rng(5), angle_rad=0.005, way_mm=0.1)
+    ours = refine(transform(T, points), points, keep=1.0)
+    theirs, _, _ = trimesh.registration.icp(
+        transform(T, points), points, max_iterations=200, threshold=1e-12, scale=False, reflection=False
+    )
+    off_mm, turned_rad = left_over(ours.similarity.R, ours.similarity.t, theirs)
+    assert off_mm < 0.01
+    assert turned_rad < 1e-3
+
+
+def test_the_motion_does_not_depend_on_where_the_world_begins() -> None:
+    truth, T = landscape(), small_motion(np.random.default_rng(8))
+    W = se3(Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix(), np.array([300.0, -200, 100]))
+    moved = truth.copy().apply_transform(T)
+    here = refine(moved, truth)
+    there = refine(moved.copy().apply_transform(W), truth.copy().apply_transform(W))
+    assert there.rms_after_mm == pytest.approx(here.rms_after_mm, abs=1e-3)
+    expected = W @ se3(here.similarity.R, here.similarity.t) @ inverse(W)
+    middle = transform(W, np.array([22.0, 22.0, 0.0]))
+    np.testing.assert_allclose(there.similarity.transform_points(middle), transform(expected, middle), atol=5e-3)
+
+
+def test_outliers_and_a_missing_half_do_not_pull() -> None:
+    rng, truth = np.random.default_rng(2), landscape()
+    T = small_motion(rng)
+    half = surface_points(part_left_of(truth, 24.0))[:4000]
+    floating = rng.uniform([0, 0, 12], [45, 45, 40], size=(600, 3))
+    predicted = transform(T, np.concatenate([half + rng.normal(scale=0.1, size=half.shape), floating]))
+    trimmed, greedy = refine(predicted, truth), refine(predicted, truth, keep=1.0)
+    off_mm, turned_rad = left_over(trimmed.similarity.R, trimmed.similarity.t, inverse(T))
+    assert off_mm < 0.2
+    assert turned_rad < 0.01
+    assert left_over(greedy.similarity.R, greedy.similarity.t, inverse(T))[0] > 5 * off_mm
+
+
+def part_left_of(mesh: trimesh.Trimesh, x_mm: float) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[mesh.triangles_center[:, 0] < x_mm], process=False)
+
+
+def test_a_plane_is_lifted_and_tilted_but_not_slid() -> None:
+    plate = trimesh.creation.box(extents=(60, 60, 1e-6))
+    small = trimesh.creation.box(extents=(20, 20, 1e-6))
+    T = se3(so3_exp(np.array([0.03, -0.02, 0.0])), np.array([3.0, -2.0, 1.5]))
+    result = refine(small.apply_transform(T), plate)
+    centre = result.similarity.transform_points(T[:3, 3])
+    np.testing.assert_allclose(centre, [3.0, -2.0, 0.0], atol=0.05)
+    assert np.linalg.norm(result.similarity.R @ T[:3, 2] - [0, 0, 1]) < 1e-4
+    assert result.rms_before_mm > 1
+    assert result.rms_after_mm < 1e-3
+
+
+def test_scale_is_found_only_if_asked_for() -> None:
+    truth = landscape()
+    larger = truth.copy()
+    larger.vertices = 1.03 * (truth.vertices - truth.centroid) + truth.centroid
+    assert refine(larger, truth).similarity.scale == 1
+    found = refine(larger, truth, with_scale=True, keep=0.9)
+    assert found.similarity.scale == pytest.approx(1 / 1.03, rel=2e-3)
+    assert found.rms_after_mm < 0.1 * refine(larger, truth, keep=0.9).rms_after_mm
+
+
+def test_a_perfect_prediction_stays_and_the_same_input_gives_the_same_answer() -> None:
+    truth = landscape()
+    # Other samples of the same surface: what their spacing suggests would only take it away from the truth.
+    still = refine(surface_points(truth, seed=7), truth)
+    assert still.rms_after_mm <= still.rms_before_mm < 1e-9
+    np.testing.assert_array_equal(still.similarity.R, np.eye(3))
+    np.testing.assert_array_equal(still.similarity.t, np.zeros(3))
+    moved = truth.copy().apply_transform(small_motion(np.random.default_rng(1)))
+    first, second = refine(moved, truth), refine(moved, truth)
+    np.testing.assert_array_equal(first.similarity.t, second.similarity.t)
+    assert first.rms_after_mm == second.rms_after_mm
+
+
+def test_it_says_when_it_was_stopped() -> None:
+    truth = landscape()
+    stopped = refine(truth.copy().apply_transform(small_motion(np.random.default_rng(3))), truth, max_iterations=1)
+    assert (stopped.iterations, stopped.converged) == (1, False)
+    assert stopped.rms_after_mm < stopped.rms_before_mm
+
+
+def test_what_cannot_be_fitted_is_refused() -> None:
+    truth = landscape()
+    with pytest.raises(AlignmentError, match=r"9 and \d+ points, at least 10"):
+        refine(truth.vertices[:9], truth)
+    with pytest.raises(ValueError, match="keep"):
+        refine(truth, truth, keep=0.0)
+    with pytest.raises(ValueError, match="no area"):
+        refine(trimesh.Trimesh(), truth)
