@@ -6,8 +6,13 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
+
+# Networks share the cores with the tracker. Threads that wait for each other must sleep then: spinning, torch's were
+# seen to take seventeen times as long for a flow while something else ran. Read when the network library is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from scopemap.config import Config
