@@ -55,10 +55,15 @@ class Entry(BaseModel):
         return _below(self.data, self.sequence.path)
 
     @property
+    def flows(self) -> Path:
+        """Where flow is kept for all methods; a sequence that the plan describes otherwise has another place."""
+        return self.out / "flows" / f"{folder_name(self.label)}-{_digest([self.sequence.model_dump(mode='json')])[:8]}"
+
+    @property
     def key(self) -> str:
         """Fingerprint of all that decides the figures; a run with another key is not this one."""
         described = self.model_dump(mode="json", exclude={"out", "data"})
-        return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16]
+        return _digest(described)[:16]
 
     def open(self) -> Sequence:
         """Open the sequence; raises as `open_sequence`."""
@@ -128,6 +133,10 @@ def render_phantom(entry: Entry) -> None:
     spec = spec_of(entry.sequence.phantom, entry.seed, entry.data)
     if not is_rendered(entry.source, spec):
         write_phantom(spec, entry.source)
+
+
+def _digest(tree: Any) -> str:
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
 
 
 def _depends_on_seed(sequence: SequencePlan, method: MethodPlan) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scopemap.benchmark.flow_store import FlowStore
 from scopemap.benchmark.plan import ProtocolPlan
 from scopemap.config import MaskSettings
 from scopemap.datasets import Sequence, open_sequence
@@ -23,7 +24,7 @@ from scopemap.evaluation.paper import paper_report
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
 from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
-from scopemap.flow import create_flow, pair_flow
+from scopemap.flow import create_flow
 from scopemap.geometry.align import AlignMode, Similarity
 from scopemap.masking import Masker
 from scopemap.reconstruction import DepthReader
@@ -31,15 +32,21 @@ from scopemap.trajectory import Trajectory, read_trajectory
 
 Figures = dict[str, dict[str, Any]]
 _RAFT_ITERATIONS = 12
-_CONSISTENCY_PX = 1.0
 _MOST_VIEWS = 40
 
 
-def score(folder: Path, sequence: Sequence, protocol: ProtocolPlan, align: AlignMode | None = None) -> Figures:
+def score(
+    folder: Path,
+    sequence: Sequence,
+    protocol: ProtocolPlan,
+    align: AlignMode | None = None,
+    flows: Path | None = None,
+) -> Figures:
     """Return all figures that the truth of a sequence gives for a run's folder, by group.
 
-    `align` takes the place of the protocol's. Groups without a truth are left out. A trajectory that cannot be aligned
-    (too few frames tracked) has "poses" with what can be said without.
+    `align` takes the place of the protocol's; `flows` is a folder in which flow is kept for the next method. Groups
+    without a truth are left out. A trajectory that cannot be aligned (too few frames tracked) has "poses" with what can
+    be said without.
     """
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
@@ -51,7 +58,7 @@ def score(folder: Path, sequence: Sequence, protocol: ProtocolPlan, align: Align
         if protocol.depth:
             figures |= _depth(depth, sequence, protocol)
         if protocol.consistency:
-            figures |= _consistency(depth, sequence, estimate, protocol)
+            figures |= _consistency(depth, sequence, estimate, protocol, flows)
     return figures
 
 
@@ -180,19 +187,26 @@ def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Fi
     return {"depth": {"scaling": report.scaling, **asdict(report.mean), "jitter": asdict(report.jitter)}}
 
 
-def _consistency(depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan) -> Figures:
+def _consistency(
+    depth: DepthReader,
+    sequence: Sequence,
+    estimate: Trajectory,
+    protocol: ProtocolPlan,
+    flows: Path | None = None,
+) -> Figures:
     """Measure depth over time; where depth has a truth it is brought to its scale first, one factor for all frames."""
     scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     linker, meter = ImageLinker(camera), ConsistencyMeter(camera, scale)
-    flow, masker = create_flow(protocol.flow, _RAFT_ITERATIONS, "auto"), Masker(MaskSettings())
+    estimator, masker = create_flow(protocol.flow, _RAFT_ITERATIONS, "auto"), Masker(MaskSettings())
+    flow = FlowStore(estimator, None if flows is None else flows / estimator.name)
     poses = dict(zip(estimate.indices.tolist(), range(len(estimate)), strict=True))
     before: np.ndarray | None = None
     for frame, truth in sequence:
         # Highlights move with the lamp, and what lies outside the field of view is no tissue: the same mask for all.
         valid = masker(frame).valid
-        found = None if before is None else pair_flow(flow, before, frame.rgb, _CONSISTENCY_PX)
-        link = linker.link(frame.rgb, valid, *((found.to_previous, found.consistent) if found else (None, None)))
+        found = (None, None) if before is None else flow.to_previous(frame.index, before, frame.rgb)
+        link = linker.link(frame.rgb, valid, *found)
         before = frame.rgb
         depth_mm = depth.read(frame.index)
         row = poses.get(frame.index)

@@ -39,7 +39,7 @@ def run_entry(entry: Entry) -> RunResult:
         task = Task(sequence, entry.shared_settings(), entry.seed, entry.sequence.name)
         timing = method.run(task, entry.folder / RUN)
         memory_mb = peak_memory_mb()
-        figures = score(entry.folder / RUN, sequence, entry.protocol, entry.sequence.align)
+        figures = score(entry.folder / RUN, sequence, entry.protocol, entry.sequence.align, entry.flows)
     except ScopemapError as error:
         return failed(entry, str(error))
     return RunResult(

@@ -1,0 +1,45 @@
+"""Flow kept on disk: estimated once, the same for every method, whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.benchmark.flow_store import FlowStore
+from scopemap.flow import DisFlow
+
+
+class Counting(DisFlow):
+    """DIS that counts how often it is asked."""
+
+    asked = 0
+
+    def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
+        type(self).asked += 1
+        return super().estimate(rgb_from, rgb_to)
+
+
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    noise = np.random.default_rng(0).integers(0, 255, (70, 90, 3)).astype(np.uint8)
+    picture = np.kron(noise[:14, :18], np.ones((5, 5, 1), np.uint8))
+    return picture, np.roll(picture, 2, axis=1)
+
+
+def test_what_is_read_back_is_what_was_first_returned(tmp_path: Path) -> None:
+    Counting.asked = 0
+    first = FlowStore(Counting(), tmp_path / "dis").to_previous(7, *pair())
+    once = Counting.asked
+    again = FlowStore(Counting(), tmp_path / "dis").to_previous(7, *pair())
+    assert (once, Counting.asked) == (2, 2)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype
+    assert np.median(first[0][..., 0][first[1]]) < -1.5
+    assert [file.name for file in (tmp_path / "dis").iterdir()] == ["000007.npz"]
+
+
+def test_without_a_folder_nothing_is_kept_and_nothing_changes(tmp_path: Path) -> None:
+    kept = FlowStore(DisFlow(), tmp_path).to_previous(1, *pair())
+    passing = FlowStore(DisFlow()).to_previous(1, *pair())
+    np.testing.assert_array_equal(kept[0], passing[0])
