@@ -27,7 +27,7 @@ class FlowStore:
     def to_previous(
         self, index: int, rgb_previous: np.ndarray, rgb_current: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return flow (H, W, 2) float32 px from frame `index` to the one before, and (H, W) bool where it is trusted."""
+        """Return flow (H, W, 2) float32 px from frame `index` to the one before, and (H, W) bool: where to trust it."""
         file = None if self._folder is None else self._folder / f"{index:06d}.npz"
         if file is not None and file.is_file():
             with np.load(file) as kept:

@@ -3,9 +3,9 @@
 Recasens, Lamarca, Facil, Montiel and Civera, "Endo-Depth-and-Motion: reconstruction and tracking in endoscopic videos
 using depth networks and photometric constraints", RA-L 2021, arXiv 2103.16525. No code of that project was used.
 
-From the paper: pseudo-RGBD keyframes; every frame is aligned to a keyframe by its photometric residual, lifted with
-the keyframe's depth; image pyramid and robust error; Gauss-Newton. As METHOD (arXiv 2508.11282, which grew out of it)
-compares with it: rotation before the whole motion, a keyframe every 2 frames, two scales.
+Its abstract: pseudo-RGBD frames, tracked by photometric residuals. METHOD (arXiv 2508.11282 read closely, which grew
+out of it) adds: the residual is lifted with the keyframe's depth, Gauss-Newton, rotation before the whole motion, and
+a keyframe every 2 frames. It was measured elsewhere with two scales and a robust error, which are followed here.
 
 Ours to choose, where neither gives a value: Huber's threshold (1.345 robust standard deviations, the usual one for 95 %
 efficiency), the start of each alignment (no motion against the keyframe), the steps per scale (at most 30), and a

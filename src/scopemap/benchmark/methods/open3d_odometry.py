@@ -111,7 +111,8 @@ class Open3dTracker:
     """A `FrameTracker` that aligns each frame to the last tracked one by an odometry of Open3D.
 
     Masked pixels and those of unknown depth have depth 0, which Open3D leaves out. A lost frame is no reference: the
-    next one is aligned to the one before it. Nothing is random: the same frames give the same poses.
+    next one is aligned to the one before it. Nothing is random, but Open3D's threads sum
+    in any order: two runs agree to rounding, not to the last bit.
 
     method : a key of `OPEN3D_METHODS`. Raises `SettingsError` where Open3D cannot be imported.
     """
