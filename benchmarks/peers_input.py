@@ -1,0 +1,80 @@
+"""The baselines on the input that figures of theirs measured elsewhere were made with, to see that they agree.
+
+    python benchmarks/peers_input.py --data FOLDER [--frames N]
+
+FOLDER is the real data's (README, "Real data"). Input: cecum_t1_a rectified to 337x270 px with the camera below, no
+mask, depth = 15.6 / (disparity / 255 + 0.156) mm. Printed: ATE after Sim(3), TLR, rotation since the first frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap import open_sequence, read_trajectory
+from scopemap.benchmark.methods.endo_depth_and_motion import create_endo_depth_and_motion
+from scopemap.benchmark.methods.open3d_odometry import OPEN3D_METHODS
+from scopemap.benchmark.methods.timed import TimedTracker
+from scopemap.camera import PinholeCamera
+from scopemap.depth.files import depth_files
+from scopemap.evaluation.poses import match, pose_report
+from scopemap.frame import Frame
+from scopemap.odometry import FrameTracker
+from scopemap.rectification import Rectifier
+from scopemap.trajectory import Trajectory
+
+CAMERA = PinholeCamera(200.58, 200.47, 167.0, 136.7, 337, 270)
+
+
+def frames(clip: Path, count: int | None) -> Iterator[Frame]:
+    """Yield the frames with their depth."""
+    source = open_sequence(clip).source
+    rectifier = Rectifier(source.camera, CAMERA)
+    files = depth_files(clip.with_name(clip.name + "_depth_anything"))
+    everywhere = np.ones((CAMERA.height, CAMERA.width), dtype=bool)
+    for item in source.frames(slice(count)):
+        disparity = rectifier.smooth(cv2.imread(str(files[item.index]), cv2.IMREAD_GRAYSCALE).astype(np.float32))
+        depth_mm = (15.6 / (disparity / 255 + 0.156)).astype(np.float32)
+        yield Frame(item.index, item.time_s, rectifier.image(item.rgb), CAMERA, everywhere, depth_mm)
+
+
+def tracked(clip: Path, count: int | None, tracker: FrameTracker) -> Trajectory:
+    """Return the camera's path by one odometry."""
+    rows = []
+    for frame in frames(clip, count):
+        track = tracker.track(frame)
+        if track.status != "lost" and tracker.wants_keyframe():
+            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=False)
+        rows.append((frame.index, frame.time_s, track.T_world_camera, track.status))
+    indices, times_s, poses, status = zip(*rows, strict=True)
+    return Trajectory(np.array(indices), np.array(times_s), np.stack(poses), np.array(status))
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--frames", type=int)
+    options = parser.parse_args()
+    clip = options.data / "endoscopy/c3vd/cecum_t1_a"
+    methods: dict[str, Callable[[], FrameTracker]] = {
+        "Endo-Depth-and-Motion": create_endo_depth_and_motion,
+        **OPEN3D_METHODS,
+    }
+    print("| method | ATE | TLR | rotation mean / max | tracking ms |\n|---|---|---|---|---|", flush=True)
+    for name, create in methods.items():
+        tracker = TimedTracker(create())
+        path = tracked(clip, options.frames, tracker)
+        report = pose_report(match(path, read_trajectory(clip), "sim3"))
+        rotation = f"{report.rotation_unaligned_mean_deg:.1f} / {report.rotation_unaligned_max_deg:.1f}"
+        ms = 1e3 * tracker.seconds / len(path)
+        print(f"| {name} | {report.ate_rmse_mm:.2f} | {report.tlr:.2f} | {rotation} | {ms:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
