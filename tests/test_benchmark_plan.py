@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from sample_trajectories import write_c3vd
 
-from scopemap.benchmark.entry import Entry, entries_of
+from scopemap.benchmark.entry import Entry, entries_of, render_phantom
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
 from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
+from scopemap.trajectory import read_poses
 
 SMALL = """
 title = "small"
@@ -44,10 +47,14 @@ def written(folder: Path, text: str = SMALL) -> Path:
 
 
 def rows(folder: Path) -> list[Entry]:
+    return rows_of(SMALL, folder)
+
+
+def rows_of(text: str, folder: Path) -> list[Entry]:
     data = folder / "data"
     for name in ("c10", "c2"):
         (data / "clips" / name).mkdir(parents=True)
-    plan = read_plan(written(folder))
+    plan = read_plan(written(folder, text))
     sequences, missing = found_sequences(plan, data)
     assert missing == []
     return list(entries_of(plan, sequences, data, folder / "out"))
@@ -150,3 +157,17 @@ def test_the_plans_that_were_promised_come_along() -> None:
     clips = {sequence.path.rstrip("*") for sequence in read_plan("c3vd-rgbd").sequence}
     assert len(clips) == 10
     assert len(read_plan("c3vd-mono").sequence) == 8
+
+
+def test_a_phantom_along_a_path_from_a_file_is_rendered_once_for_all_methods(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = [0.0, 1.0, 2.0]
+    write_c3vd(tmp_path / "data", poses)
+    old = 'scene = "tube", frames = 5, seed = 4, width = 64, height = 48, events = "black:2-3"'
+    new = 'scene = "colon", frames = 3, width = 64, height = 48, path_file = "pose.txt"'
+    *_, entry, _ = [row for row in rows_of(SMALL.replace(old, new), tmp_path) if row.method.name == "ours"]
+    render_phantom(entry)
+    first = (entry.source / "mesh_truth.ply").stat().st_mtime_ns
+    render_phantom(entry)
+    assert (entry.source / "mesh_truth.ply").stat().st_mtime_ns == first
+    np.testing.assert_allclose(read_poses(entry.source / "pose.txt")[:, :3, 3].std(axis=0).max(), np.std([0, 1, 2]))

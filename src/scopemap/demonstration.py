@@ -159,12 +159,12 @@ def draw(demonstration: Demonstration, folder: Path) -> list[Path]:
 
 
 def is_rendered(folder: Path, spec: PhantomSpec) -> bool:
-    """Whether an earlier demonstration left this very phantom; its mesh is what is written last."""
+    """Whether `folder` holds this very phantom, whole; its mesh is what is written last."""
     try:
         description = json.loads((folder / "phantom.json").read_text())
     except (OSError, ValueError):
         return False
-    wanted = json.loads(json.dumps(asdict(spec)))
+    wanted = json.loads(json.dumps(asdict(spec), default=str))
     same = description.get("spec") == wanted and description.get("made_by") == f"scopemap {version('scopemap')}"
     return same and (folder / "mesh_truth.ply").is_file()
 
