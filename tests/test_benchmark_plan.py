@@ -11,6 +11,7 @@ from sample_trajectories import write_c3vd
 from scopemap.benchmark.entry import Entry, entries_of, render_phantom
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
+from scopemap.benchmark.runner import run_plan
 from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
 from scopemap.trajectory import read_poses
@@ -131,6 +132,14 @@ def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path
         ('title = "small"', 'titel = "small"', "titel"),
         ("seeds = [0, 3]", "seeds = [0, 3", "cannot read the plan"),
         ('title = "small"', 'title = "small"\nmethod_sets = ["all"]', "unknown set of methods 'all': choose from abl"),
+        (
+            'title = "small"',
+            'title = "small"\nprotocol = { protocols = ["EVO"] }',
+            "unknown protocol 'EVO'",
+        ),
+        ('title = "small"', 'title = "small"\nprotocol = { flow = "raft" }', "unknown flow 'raft'"),
+        ('path = "clips/c*"', 'path = "clips/c*"\ndataset = "c4vd"', "unknown data set 'c4vd'"),
+        ("seeds = [0, 3]", "seeds = []", "seeds"),
     ],
 )
 def test_bad_plans_are_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
@@ -171,3 +180,41 @@ def test_a_phantom_along_a_path_from_a_file_is_rendered_once_for_all_methods(tmp
     render_phantom(entry)
     assert (entry.source / "mesh_truth.ply").stat().st_mtime_ns == first
     np.testing.assert_allclose(read_poses(entry.source / "pose.txt")[:, :3, 3].std(axis=0).max(), np.std([0, 1, 2]))
+
+
+def test_a_changed_file_that_the_plan_names_is_another_run(tmp_path: Path) -> None:
+    theirs = next(row for row in rows(tmp_path) if row.method.name == "theirs" and row.sequence.name == "clips/c2")
+    file = tmp_path / "data" / "theirs" / "clips" / "c2-0.txt"
+    keys = [theirs.key]
+    for content in ("one", "other"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(content)
+        keys.append(theirs.key)
+    assert len(set(keys)) == 3
+
+
+def test_two_sequences_of_one_name_or_an_unknown_method_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    (tmp_path / "clips" / "c1").mkdir(parents=True)
+    twice = SMALL.replace("[[method]]", '[[sequence]]\npath = "clips/c1"\n\n[[method]]', 1)
+    with pytest.raises(SettingsError, match="two sequences that are called 'clips/c1'"):
+        run_plan(read_plan(written(tmp_path, twice)), tmp_path / "out", data=tmp_path)
+    unknown = SMALL.replace('name = "ours"', 'name = "ours"\nuse = "slam"')
+    with pytest.raises(SettingsError, match="unknown method 'slam': choose one of scopemap, import"):
+        run_plan(read_plan(written(tmp_path, unknown)), tmp_path / "out", data=tmp_path)
+
+
+def test_a_pattern_finds_only_what_the_named_reader_knows_and_a_name_goes_before(tmp_path: Path) -> None:
+    write_c3vd(tmp_path / "clip_a", np.tile(np.eye(4), (1, 1, 1)))
+    (tmp_path / "clip_a" / "0000_color.png").write_bytes(b"")
+    (tmp_path / "clip_a_depth").mkdir()
+    (tmp_path / "clip_a.zip").write_bytes(b"")
+    (tmp_path / "clip[1]").mkdir()
+    plan = read_plan(written(tmp_path))
+    for changes, names in (
+        ({"path": "clip_a*", "dataset": "c3vd"}, ["clip_a"]),
+        ({"path": "clip_a*", "name": "mono"}, ["mono clip_a", "mono clip_a_depth"]),
+        ({"path": "clip[1]"}, ["clip[1]"]),
+    ):
+        sequence = plan.sequence[0].model_copy(update={"dataset": None, "name": ""} | changes)
+        found, _ = found_sequences(plan.model_copy(update={"sequence": (sequence,)}), tmp_path)
+        assert [item.name for item in found] == names

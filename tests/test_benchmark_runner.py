@@ -101,12 +101,18 @@ def test_what_is_done_is_not_done_again(
     assert figures(again.results) == figures(done[0].results)
 
 
-def test_a_failed_row_is_run_again_when_asked(plan: Plan, done: tuple[Benchmark, Path], tmp_path: Path) -> None:
+def test_a_failed_row_is_run_again_when_asked_or_when_its_file_has_come(
+    plan: Plan, done: tuple[Benchmark, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     alone = plan.model_copy(update={"method": plan.method[2:]})
-    first = run_plan(alone, tmp_path, data=tmp_path).results
-    truth = done[1] / "phantoms" / "colon" / "pose.txt"
-    (tmp_path / "colon.txt").write_bytes(truth.read_bytes())
-    assert run_plan(alone, tmp_path, data=tmp_path).results == first
+    missing = run_plan(alone, tmp_path, data=tmp_path).results
+    assert run_plan(alone, tmp_path, data=tmp_path).results == missing
+    (tmp_path / "colon.txt").write_bytes((done[1] / "phantoms" / "colon" / "pose.txt").read_bytes())
+    monkeypatch.setattr(runner, "worker_command", lambda file: [sys.executable, "-c", "raise ValueError('once')"])
+    (died,) = run_plan(alone, tmp_path, data=tmp_path).results
+    assert died.error == "ValueError: once"
+    monkeypatch.undo()
+    assert run_plan(alone, tmp_path, data=tmp_path).results == [died]
     (row,) = run_plan(alone, tmp_path, data=tmp_path, retry=True).results
     assert row.status == "done"
     assert row.figure("poses", "ate_rmse_mm") == pytest.approx(0, abs=1e-6)

@@ -64,6 +64,16 @@ def test_a_benchmarks_run_brings_its_figures(tmp_path: Path) -> None:
     output = run("compare", tmp_path / "a", tmp_path / "b").stdout
     assert "**1.000**" in output
     assert "2.000" in output
+    again = tmp_path / "again"
+    again.mkdir()
+    RunResult("clip", "a", figures={"poses": {"ate_rmse_mm": 3.0, "align": "sim3"}}).save(again)
+    named = run("compare", tmp_path / "a", again, "--names", "old,new").stdout
+    assert "old" in named
+    assert "3.000" in named
+    for arguments, message in (((), "all called 'a' on 'clip'"), (("--consistency",), "measured no consistency")):
+        error = run("compare", tmp_path / "a", again, *arguments, code=1).exception
+        assert isinstance(error, InputError)
+        assert message in str(error)
 
 
 def test_refusals_of_compare(places: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -185,13 +185,25 @@ def test_depth_and_its_consistency_are_measured_on_demand(tmp_path: Path) -> Non
     settings = {"networks.flow": "dis", "networks.perceptual": "structure", "fusion.enabled": False}
     config = Config.load(settings={"depth.backend": f"files:{truth}"} | settings)
     reconstruct(open_sequence(truth), config, out=tmp_path / "run")
-    figures = json.loads(run(tmp_path / "run", "--truth", truth, "--depth", "--consistency", "--json").stdout)
+    figures = json.loads(run(tmp_path / "run", "--truth", truth, "--depth", "median", "--consistency", "--json").stdout)
     assert figures["depth"]["abs_rel"] < 1e-3
     assert figures["depth"]["scaling"] == "median"
     assert figures["consistency"]["frames"] == 4
     assert figures["consistency"]["tae_reference"]["percent"] < 2
     assert figures["consistency"]["scale"] == pytest.approx(1, abs=1e-3)
+    assert "sequence-median" in run(tmp_path / "run", "--truth", truth, "--depth", "scaled", code=2).output
+    provenance = (tmp_path / "run/provenance.json").read_text()
+    camera = json.loads(provenance)["camera"]
+    other = provenance.replace(f'"fx": {camera["fx"]}', f'"fx": {camera["fx"] * 1.1}')
+    (tmp_path / "run/provenance.json").write_text(other)
+    with_another = run(tmp_path / "run", "--truth", truth, "--depth", "none", code=1).exception
+    assert "another camera" in str(with_another)
     bare = write_run(tmp_path / "bare", as_trajectory(vector_a()[0]))
-    refused = run(bare, "--truth", truth, "--align", "origin", "--depth", code=1).exception
+    refused = run(bare, "--truth", truth, "--align", "origin", "--depth", "none", code=1).exception
     assert isinstance(refused, InputError)
     assert "no depth maps" in str(refused)
+
+
+def test_options_that_would_be_ignored_are_refused(folders: tuple[Path, Path]) -> None:
+    assert isinstance(run(folders[0], "--truth", folders[1], "--icp", code=1).exception, InputError)
+    assert "--csv" in run(folders[0], "--truth", folders[1], "--csv", "--json", code=2).output

@@ -186,12 +186,12 @@ def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> 
         meter.add(frame, linker.link(view.rgb, EVERYWHERE))
     report = meter.report()
     assert (report.frames, report.pairs) == (4, 3)
-    assert (report.world_poses, report.tae_estimated.pairs, report.tae_reference.pairs) == ("estimated", 1, 0)
-    assert report.orb_world is report.orb_estimated
+    assert (report.tae_estimated.pairs, report.tae_reference.pairs) == (1, 0)
+    assert (report.orb_estimated.pairs, report.orb_reference.pairs) == (1, 0)
     assert report.orb_estimated.pair_matches[:2] == (0, 0)
     assert report.orb_estimated.pair_matches[2] > 50
     assert report.orb_camera.pairs == 3
-    assert measure(ASIDE).world_poses == "reference"
+    assert measure(ASIDE).orb_reference.pairs == 2
     # Without flow nothing along it is measured; without truth there is no jitter.
     assert (report.opw.pairs, report.along_flow.pairs, report.same_pixel.pairs) == (0, 0, 3)
     assert np.isnan([report.opw.mean_mm, report.jitter.log_std, report.tae_reference.percent]).all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,15 @@ class Entry(BaseModel):
 
     @property
     def key(self) -> str:
-        """Fingerprint of all that decides the figures; a run with another key is not this one."""
+        """Fingerprint of all that decides the figures but the code: the plan's words, and the files that it names.
+
+        A file or folder stands for its content by its size and time. Another --data with the same files is the same.
+        """
         described = self.model_dump(mode="json", exclude={"out", "data"})
-        return _digest(described)[:16]
+        named = [self.method.files.format(sequence=self.sequence.name, seed=self.seed), self.sequence.camera or ""]
+        named += [self.sequence.depth.partition("files:")[2], (self.sequence.phantom or {}).get("path_file", "")]
+        stamps = [_stamp(self.data / name) for name in named if name and self.data is not None]
+        return _digest([described, stamps, version("scopemap")])[:16]
 
     def open(self) -> Sequence:
         """Open the sequence; raises as `open_sequence`."""
@@ -78,8 +85,9 @@ class Entry(BaseModel):
         kind, _, folder = self.sequence.depth.partition(":")
         if kind == "true":
             # C3VDv2 and EndoGSLAM keep depth apart; 8 bit is depth, too, when it is the truth.
-            apart = self.source / "depth"
-            settings |= {"depth.backend": f"files:{apart if apart.is_dir() else self.source}"}
+            frames = self.source if self.sequence.phantom is not None else self.open().path
+            apart = frames / "depth"
+            settings |= {"depth.backend": f"files:{apart if apart.is_dir() else frames}"}
             settings |= {"depth.files_kind": "measured"}
         elif kind == "files":
             settings["depth.backend"] = f"files:{_below(self.data, folder)}"
@@ -133,6 +141,13 @@ def render_phantom(entry: Entry) -> None:
     spec = spec_of(entry.sequence.phantom, entry.seed, entry.data)
     if not is_rendered(entry.source, spec):
         write_phantom(spec, entry.source)
+
+
+def _stamp(path: Path) -> list[int]:
+    """Return size and time of a file, or number, size and latest time of the files in a folder; [] for neither."""
+    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
+    stats = [file.stat() for file in files]
+    return [len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)] if stats else []
 
 
 def _digest(tree: Any) -> str:

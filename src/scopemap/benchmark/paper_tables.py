@@ -151,7 +151,8 @@ def _mean_line(of_method: Sequence[Summary], sequences: int, figures: Sequence[F
     of_frames = f"{tracked} of {frames}" if frames else ""
     texts = (of_method[0].method, "measured", f"{len(done)} of {sequences}", of_frames, aligned)
     values = tuple(Value(_mean([figure.value(summary).mean for summary in done])) for figure in figures)
-    everywhere = len(of_method) == sequences and all(summary.competes for summary in of_method)
+    scored = all(math.isfinite(figures[0].value(summary).mean) for summary in done)
+    everywhere = len(of_method) == sequences and scored and all(summary.competes for summary in of_method)
     return Line(texts, values, (aligned,), everywhere, "" if done else "failed")
 
 

@@ -33,6 +33,7 @@ use = "park"
 
 from __future__ import annotations
 
+import mimetypes
 import tomllib
 from collections import Counter
 from dataclasses import replace
@@ -43,8 +44,11 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from scopemap.config import Config, Preset, explain
+from scopemap.datasets import DATASETS
 from scopemap.errors import InputError, ScopemapError, SettingsError
 from scopemap.evaluation.depth import DepthScaling
+from scopemap.evaluation.protocols import PROTOCOLS
+from scopemap.flow import FLOWS
 from scopemap.geometry.align import AlignMode
 from scopemap.phantom import PhantomSpec, parse_events
 
@@ -67,7 +71,7 @@ class ProtocolPlan(_Part):
     surface, depth, consistency : whether these are measured, where there is a truth for them. icp : the mesh also after
         a refinement by ICP. flow : for consistency, the same for all methods, named as `networks.flow`.
     depth_scaling : of predicted depth before it is compared with true depth.
-    depth_range_mm : of true depth that counts.
+    depth_range_mm : of true depth that counts; clip_depth : whether predicted depth is then clipped to it.
     """
 
     align: AlignMode = "sim3"
@@ -79,6 +83,16 @@ class ProtocolPlan(_Part):
     flow: str = "auto"
     depth_scaling: DepthScaling = "median"
     depth_range_mm: tuple[float, float] = (1e-3, 1e4)
+    clip_depth: bool = False
+
+    @model_validator(mode="after")
+    def _known_names(self) -> ProtocolPlan:
+        unknown = [name for name in self.protocols if name not in PROTOCOLS]
+        if unknown:
+            raise ValueError(f"unknown protocol '{unknown[0]}': choose from {', '.join(PROTOCOLS)}")
+        if self.flow not in FLOWS:
+            raise ValueError(f"unknown flow '{self.flow}': choose from {', '.join(FLOWS)}")
+        return self
 
 
 class SequencePlan(_Part):
@@ -86,12 +100,13 @@ class SequencePlan(_Part):
 
     Attributes
     ----------
-    name : for tables; of a pattern's finds, their path below the data folder.
-    path : below the data folder.
+    name : for tables; of a pattern's finds, what stands before their path below the data folder.
+    path : below the data folder. A pattern finds folders and videos, with `dataset` only those that its reader knows.
     phantom : settings of a `PhantomSpec` instead of a path; its `path_file` lies below the data folder, its `seed` is
         added to the benchmark's.
     dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].
-    depth : "" as the settings say; "true" the sequence's own measured depth; "files:FOLDER" below the data folder.
+    depth : "" as the settings say; "true" the depth files of a C3VD, 7-Scenes or phantom folder; "files:FOLDER" below
+        the data folder; else a name that `depth.backend` knows.
     near_far_mm : metric anchor of the first frame. align : instead of the protocol's.
     settings : dotted names to values, for this sequence.
     """
@@ -112,6 +127,8 @@ class SequencePlan(_Part):
     def _one_source(self) -> SequencePlan:
         if bool(self.path) == (self.phantom is not None):
             raise ValueError(f"sequence '{self.name}' needs either a path or a phantom")
+        if self.dataset is not None and self.dataset not in DATASETS:
+            raise ValueError(f"unknown data set '{self.dataset}': choose from {', '.join(DATASETS)}")
         if self.phantom is not None:
             if not self.name:
                 raise ValueError("a phantom needs a name")
@@ -151,7 +168,7 @@ class Plan(_Part):
 
     title: str
     description: str = ""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = Field((0,), min_length=1)
     protocol: ProtocolPlan = ProtocolPlan()
     settings: dict[str, Any] = Field(default_factory=dict)
     sequence: tuple[SequencePlan, ...] = Field(min_length=1)
@@ -199,17 +216,34 @@ def found_sequences(plan: Plan, data: Path | None) -> tuple[list[SequencePlan], 
         if data is None:
             missing.append(f"{sequence.path}: needs --data, the folder that holds it")
             continue
-        places = sorted(data.glob(sequence.path))
+        places = _places(sequence, data)
         if not places:
             missing.append(f"{sequence.path}: nothing like that in {data}")
-        several = any(letter in sequence.path for letter in "*?[")
         for place in places:
-            path = place.relative_to(data).as_posix()
-            name = path if several or not sequence.name else sequence.name
+            path = place.relative_to(data).as_posix() if place.is_relative_to(data) else str(place)
+            exact = path == sequence.path
+            name = sequence.name if exact and sequence.name else " ".join(filter(None, (sequence.name, path)))
             found.append(sequence.model_copy(update={"path": path, "name": name}))
     if not found:
         raise InputError(f"no sequence of the plan '{plan.title}' is there: {missing[0]}")
     return found, missing
+
+
+def _places(sequence: SequencePlan, data: Path) -> list[Path]:
+    """Return the path itself if it is there, else what it finds as a pattern."""
+    if (data / sequence.path).exists():
+        return [data / sequence.path]
+    if Path(sequence.path).is_absolute():
+        return []
+    places = [p for p in sorted(data.glob(sequence.path)) if p.is_dir() or _is_video(p)]
+    if sequence.dataset is None:
+        return places
+    knows = DATASETS[sequence.dataset].recognises
+    return [p for p in places if knows(p) or (p.is_dir() and any(map(knows, filter(Path.is_dir, p.iterdir()))))]
+
+
+def _is_video(path: Path) -> bool:
+    return str(mimetypes.guess_type(path)[0]).startswith("video/")
 
 
 def spec_of(phantom: dict[str, Any], seed: int, data: Path | None = None) -> PhantomSpec:
@@ -224,7 +258,7 @@ def spec_of(phantom: dict[str, Any], seed: int, data: Path | None = None) -> Pha
 
 def folder_name(name: str) -> str:
     """Return a name that is safe for a folder."""
-    return "".join(letter if letter.isalnum() or letter in "._+" else "-" for letter in name).strip("-") or "unnamed"
+    return "".join(letter if letter.isalnum() or letter in "._+" else "-" for letter in name).strip("-.") or "unnamed"
 
 
 def _with_sets(tree: dict[str, Any]) -> dict[str, Any]:

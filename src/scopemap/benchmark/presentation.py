@@ -19,6 +19,7 @@ from scopemap.benchmark.plan import folder_name
 from scopemap.benchmark.result import RunResult
 from scopemap.benchmark.summary import Summary, summarise
 from scopemap.benchmark.tables import write_tables
+from scopemap.config import MaskSettings
 from scopemap.datasets import Sequence as Frames
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import AlignmentError, InputError
@@ -27,6 +28,7 @@ from scopemap.evaluation.orb import displacements
 from scopemap.evaluation.poses import MatchedTrajectories, match
 from scopemap.frame import Frame, Truth
 from scopemap.geometry.align import AlignMode
+from scopemap.masking import Masker
 from scopemap.reconstruction import DepthReader
 from scopemap.report.benchmark_figures import (
     BarGrid,
@@ -41,7 +43,7 @@ from scopemap.report.reconstruction_view import draw_reconstruction
 from scopemap.trajectory import read_trajectory
 
 _MOST_DEPTHS = 6
-_WORLD = "world, true poses"
+_WORLD = {"reference": "world, true poses", "estimated": "world, own poses"}
 
 
 @dataclass(frozen=True)
@@ -97,12 +99,19 @@ def _bars(results: Sequence[RunResult], folder: Path) -> Iterator[Path]:
         file = folder / "frames_until_loss.png"
         draw_frames_until_loss(grid.bars(grid.values("poses", "frames_until_loss")), longest.astype(int).tolist(), file)
         yield file
-    medians = grid.values("consistency", "orb_reference.median_mm")
+    poses = _world_poses(results)
+    medians = grid.values("consistency", f"orb_{poses}.median_mm")
     if np.isfinite(medians).any():
         file = folder / "orb_bars.png"
-        means, spreads = (grid.values("consistency", f"orb_reference.{name}_mm") for name in ("mean", "std"))
-        draw_displacement_bars(grid.bars(means, spreads), medians, file, where=_WORLD)
+        means, spreads = (grid.values("consistency", f"orb_{poses}.{name}_mm") for name in ("mean", "std"))
+        draw_displacement_bars(grid.bars(means, spreads), medians, file, where=_WORLD[poses])
         yield file
+
+
+def _world_poses(results: Sequence[RunResult]) -> str:
+    """Return whose poses bring matched points into the world: the true ones where any run has them, for all."""
+    known = any(np.isfinite(result.figure("consistency", "orb_reference.median_mm")) for result in results)
+    return "reference" if known else "estimated"
 
 
 @dataclass(frozen=True)
@@ -137,16 +146,20 @@ class _Grid:
 def _pictures(sequence: str, rows: Sequence[Shown], folder: Path) -> Iterator[Path]:
     """Draw what needs the frames of one sequence."""
     name = folder_name(sequence)
-    pairs = {row.result.method: _pair_medians(row.result) for row in rows}
+    poses = _world_poses([row.result for row in rows])
+    pairs = {row.result.method: _pair_medians(row.result, poses) for row in rows}
     measured = {method: medians for method, medians in pairs.items() if np.isfinite(medians).any()}
     if measured:
         file = folder / f"orb_pairs_{name}.png"
-        draw_displacement_scatter(measured, file, where=_WORLD)
+        draw_displacement_scatter(measured, file, where=_WORLD[poses])
         yield file
     open_frames = next((row.open for row in rows if row.open is not None), None)
     if open_frames is None:
         return
-    frames = open_frames()
+    try:
+        frames = open_frames()
+    except InputError:  # the frames have gone since the run: what needs them is not drawn
+        return
     if measured:
         yield from _two_frames(sequence, [row for row in rows if row.result.method in measured], frames, folder)
     for row in rows:
@@ -155,22 +168,21 @@ def _pictures(sequence: str, rows: Sequence[Shown], folder: Path) -> Iterator[Pa
             yield file
 
 
-def _pair_medians(result: RunResult) -> np.ndarray:
-    medians = result.figures.get("consistency", {}).get("orb_reference", {}).get("pair_median_mm", [])
+def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
+    medians = result.figures.get("consistency", {}).get(f"orb_{poses}", {}).get("pair_median_mm", [])
     return np.array([np.nan if value is None else value for value in medians], dtype=np.float64)
 
 
 def _two_frames(sequence: str, rows: Sequence[Shown], frames: Frames, folder: Path) -> Iterator[Path]:
     """Draw the depth of the two frames in the middle, and where ORB's matches between them come to lie."""
-    pair = _middle(frames, len(_pair_medians(rows[0].result)))
-    (previous, true_previous), (current, true_current) = pair
+    (previous, true_previous), (current, true_current) = _middle(frames)
     depths = {}
     for row in rows[:_MOST_DEPTHS]:
         reader = DepthReader(row.folder)
-        maps = reader.read(previous.index), reader.read(current.index)
-        if maps[0] is not None and maps[1] is not None:
+        before, now = reader.read(previous.index), reader.read(current.index)
+        if before is not None and now is not None and before.shape == now.shape == previous.valid.shape:
             scale = row.result.figure("consistency", "scale")
-            depths[row.result.method] = (scale * maps[0], scale * maps[1])
+            depths[row.result.method] = (scale * before, scale * now)
     if not depths:
         return
     name = folder_name(sequence)
@@ -190,11 +202,14 @@ def _two_frames(sequence: str, rows: Sequence[Shown], frames: Frames, folder: Pa
     yield file
 
 
-def _middle(frames: Frames, pairs: int) -> list[tuple[Frame, Truth | None]]:
+def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
+    """Return the two frames in the middle, masked as for the measures, with their truth."""
+    stamps = frames.source.stamps(frames.selection) or []
+    masker = Masker(MaskSettings())
     last: list[tuple[Frame, Truth | None]] = []
-    for number, item in enumerate(frames):
-        last = [*last[-1:], item]
-        if number > pairs // 2 and len(last) == 2:
+    for number, (frame, truth) in enumerate(frames):
+        last = [*last[-1:], (masker(frame), truth)]
+        if number > len(stamps) // 2 and len(last) == 2:
             break
     return last
 

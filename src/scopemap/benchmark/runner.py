@@ -6,19 +6,22 @@ OUT/tables/      OUT/figures/     OUT/results.md
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 from scopemap.benchmark.entry import Entry, entries_of
+from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences
 from scopemap.benchmark.result import FILE_NAME, RunResult
-from scopemap.benchmark.worker import failed
-from scopemap.errors import InputError
+from scopemap.benchmark.worker import RUN, failed, source_commit
+from scopemap.errors import InputError, SettingsError
 
 Listener = Callable[[Entry, RunResult, bool], None]
 
@@ -57,6 +60,7 @@ def run_plan(
     except OSError as error:
         raise InputError(f"cannot write a benchmark to {out}: {error.strerror or error}") from None
     results, entries = [], list(entries_of(plan, sequences, None if data is None else Path(data).resolve(), out))
+    _check(plan, entries, data)
     for entry in entries:
         known = _known(entry, retry=retry)
         result = known or _isolated(entry, timeout_s)
@@ -66,11 +70,25 @@ def run_plan(
     return Benchmark(plan, entries, results, notes + _mixed(results))
 
 
+def _check(plan: Plan, entries: list[Entry], data: Path | None) -> None:
+    """Raise `SettingsError` before anything runs for what would fail in every row, or let rows overwrite each other."""
+    for method in plan.method:
+        create_method(method, data)
+    folders = Counter(entry.folder for entry in entries)
+    for entry in entries:
+        if folders[entry.folder] > 1:
+            raise SettingsError(
+                f"the plan '{plan.title}' has two sequences that are called '{entry.label}' (letters and digits "
+                "count): give them names"
+            )
+
+
 def _known(entry: Entry, *, retry: bool) -> RunResult | None:
     """Return the row that an earlier run of the plan left, if it is this one."""
-    if not (entry.folder / FILE_NAME).is_file():
+    try:
+        result = RunResult.load(entry.folder)
+    except InputError:  # none, or a damaged one
         return None
-    result = RunResult.load(entry.folder)
     stale = result.facts.get("key") != entry.key or (retry and result.status == "failed")
     return None if stale else result
 
@@ -78,13 +96,16 @@ def _known(entry: Entry, *, retry: bool) -> RunResult | None:
 def _isolated(entry: Entry, timeout_s: float | None) -> RunResult:
     """Run an entry in a process of its own; whatever becomes of it, there is a row."""
     (entry.folder / FILE_NAME).unlink(missing_ok=True)
+    # What an interrupted run left would be refused, or be taken for this one's.
+    shutil.rmtree(entry.folder / RUN, ignore_errors=True)
     file = entry.save()
     log = entry.folder / "log.txt"
     with log.open("w", encoding="utf-8") as output:
         code = _run_worker(file, output, timeout_s)
-    fault = f"took longer than {timeout_s:g} s" if code is None else "" if code == 0 else _cause(code, log)
-    if not fault and (entry.folder / FILE_NAME).is_file():
+    # A row that was saved stands, even if foreign code crashed while the process came to its end.
+    if (entry.folder / FILE_NAME).is_file():
         return RunResult.load(entry.folder)
+    fault = f"took longer than {timeout_s:g} s" if code is None else "" if code == 0 else _cause(code, log)
     result = failed(entry, fault or "ended without a result")
     result.save(entry.folder)
     return result
@@ -119,8 +140,8 @@ def _cause(code: int, log: Path) -> str:
 
 
 def _mixed(results: list[RunResult]) -> list[str]:
-    """Say so where rows come from different sources: figures of two commits are no comparison."""
-    commits = sorted({str(result.facts.get("commit", "")) for result in results})
+    """Say so where rows were made by other code than this: figures of two commits are no comparison."""
+    commits = sorted({str(result.facts.get("commit", "")) for result in results} | {source_commit()})
     if len(commits) < 2:
         return []
     return [f"rows come from different commits of scopemap ({', '.join(commits)}); a new --out folder redoes all"]

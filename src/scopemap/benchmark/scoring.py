@@ -18,6 +18,7 @@ from scopemap.datasets import Sequence, open_sequence
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthScaling
 from scopemap.evaluation.depth_sequence import DepthPairs, evaluate_depth_sequence, fit_sequence
 from scopemap.evaluation.image_link import ImageLinker
 from scopemap.evaluation.paper import paper_report
@@ -33,6 +34,7 @@ from scopemap.trajectory import Trajectory, read_trajectory
 Figures = dict[str, dict[str, Any]]
 _RAFT_ITERATIONS = 12
 _MOST_VIEWS = 40
+_SAME_CAMERA_PX = 0.01
 
 
 def score(
@@ -67,7 +69,10 @@ def pose_groups(
 ) -> tuple[Figures, MatchedTrajectories | None]:
     """Return "poses", "paper" and the named protocols' groups, and the alignment; without one only what needs none."""
     figures: Figures = {"poses": _without_truth(estimate.tracked)}
-    matched = None if reference is None else _matched(estimate, reference, align)
+    # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the common start.
+    matched = None
+    if reference is not None:
+        matched = _matched(estimate, reference, align) or _matched(estimate, reference, "origin")
     if matched is None or reference is None:
         return figures, None
     figures |= {"poses": asdict(pose_report(matched)), "paper": asdict(paper_report(matched))}
@@ -127,40 +132,62 @@ def surface_figures_of(
 
 def _seen_surface(sequence: Sequence) -> TrueSurface | None:
     surface = read_true_surface(sequence.path)
-    if surface is None or surface.seen is not None or surface.view is not None:
+    every = sequence.selection == slice(None)
+    # What a data set calls seen holds for its whole clip.
+    if surface is None or (surface.seen is not None and every) or surface.view is not None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
-    chosen = {index for index, _ in stamps[:: max(1, len(stamps) // _MOST_VIEWS)]}
+    chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MOST_VIEWS))]}
     truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
     views = {t.index: (t.T_world_camera, t.depth_mm) for t in truths if t.T_world_camera is not None}
     known = {index: (T, depth_mm) for index, (T, depth_mm) in views.items() if depth_mm is not None}
     return surface.seen_by(sequence.camera, known.values(), indices=list(known)) if known else surface
 
 
-def depth_groups(run: Path, truth: Path, scaling: str, *, consistency: bool) -> Figures:
-    """Return "depth" (unless `scaling` is "") and "consistency" of a run's depth maps against the data set in `truth`.
+def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:
+    """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
 
-    Raises `InputError` where the run kept no depth, or was made with another camera than the data set gives.
+    True depth counts in the range that the data set's users evaluate (`DEPTH_RANGES_MM`). Raises `InputError` where the
+    run kept no depth, or was made with another camera than the data set gives.
     """
     depth = DepthReader(run)
     if not depth.present:
         raise InputError(f"{run} holds no depth maps (depth/depth.json); only a run's folder does")
-    sequence = open_sequence(truth, size=working_size(run))
+    camera = _camera_of(run)
+    sequence = open_sequence(truth, size=(int(camera["width"]), int(camera["height"])))
+    parts = ("fx", "fy", "cx", "cy")
+    if any(abs(camera[name] - getattr(sequence.camera, name)) > _SAME_CAMERA_PX for name in parts):
+        raise InputError(f"the run {run} was made with another camera than {truth} gives: their depths do not compare")
+    protocol = default_protocol(sequence)
     figures: Figures = {}
-    if scaling:
-        figures |= _depth(depth, sequence, ProtocolPlan(depth_scaling=scaling))
+    if scaling is not None:
+        figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}))
     if consistency:
-        figures |= _consistency(depth, sequence, read_trajectory(run), ProtocolPlan())
+        figures |= _consistency(depth, sequence, read_trajectory(run), protocol)
     return figures
 
 
-def working_size(run: Path) -> tuple[int, int]:
-    """Return the working size (width, height) of a run, which its depth maps have; raises `InputError`."""
+def default_protocol(sequence: Sequence) -> ProtocolPlan:
+    """Return the protocol with the range of true depth that is usual for the data set."""
+    name = next((known for known in DEPTH_RANGES_MM if sequence.source.name.startswith(known)), "")
+    return ProtocolPlan(depth_range_mm=DEPTH_RANGES_MM.get(name, ProtocolPlan().depth_range_mm))
+
+
+def working_size(run: Path) -> tuple[int, int] | None:
+    """Return the working size (width, height) of a run, which its depth maps have; None where nothing tells."""
+    try:
+        camera = _camera_of(run)
+    except InputError:
+        return None
+    return int(camera["width"]), int(camera["height"])
+
+
+def _camera_of(run: Path) -> dict[str, float]:
     try:
         camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
-        return int(camera["width"]), int(camera["height"])
+        return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot tell the working size of the run {run} from its provenance.json: {error}") from None
+        raise InputError(f"cannot tell the camera of the run {run} from its provenance.json: {error}") from None
 
 
 def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
@@ -181,6 +208,7 @@ def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Fi
         pairs,
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
+        clip_prediction=protocol.clip_depth,
     )
     if not report.frames:
         return {}

@@ -79,6 +79,8 @@ def source_commit() -> str:
     """Return the commit of the source tree that this package runs from, "+" where it was changed; "" outside one."""
     folder = Path(__file__).resolve().parent
     try:
+        # An environment may lie in some other repository, whose commits say nothing of this.
+        _git(folder, "ls-files", "--error-unmatch", Path(__file__).name)
         head = _git(folder, "rev-parse", "--short=10", "HEAD")
         return head + ("+" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):

@@ -25,7 +25,9 @@ def compare(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
     names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
-    align: Annotated[AlignChoice, typer.Option(help="Fit before measuring.")] = AlignChoice.SIM3,
+    align: Annotated[
+        AlignChoice, typer.Option(help="Fit before measuring; a benchmark's runs stand as they were measured.")
+    ] = AlignChoice.SIM3,
     unit: Annotated[
         UnitChoice, typer.Option(help="Unit of trajectory files that do not say their own.")
     ] = UnitChoice.MM,

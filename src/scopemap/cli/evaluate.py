@@ -32,6 +32,16 @@ class AlignChoice(StrEnum):
     SCALE = "scale"
 
 
+class DepthChoice(StrEnum):
+    """Ways to scale depth before it is compared."""
+
+    NONE = "none"
+    MEDIAN = "median"
+    SCALE_AND_SHIFT = "scale-and-shift"
+    SEQUENCE_MEDIAN = "sequence-median"
+    SEQUENCE_SCALE_AND_SHIFT = "sequence-scale-and-shift"
+
+
 class UnitChoice(StrEnum):
     """Units of foreign files."""
 
@@ -78,14 +88,13 @@ def evaluate(
         typer.Option(help="Also the figures of another paper's protocol, by name; may be repeated."),
     ] = None,
     icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,
-    depth: Annotated[bool, typer.Option("--depth", help="Also a run's depth maps against true depth.")] = False,
+    depth: Annotated[
+        DepthChoice | None,
+        typer.Option(metavar="SCALING", help="Also a run's depth maps against true depth, scaled so."),
+    ] = None,
     consistency: Annotated[
         bool, typer.Option("--consistency", help="Also the consistency of a run's depth over time.")
     ] = False,
-    depth_scaling: Annotated[
-        str,
-        typer.Option(help="none, median, scale-and-shift, sequence-median or sequence-scale-and-shift."),
-    ] = "median",
     as_json: AsJson = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
@@ -95,6 +104,8 @@ def evaluate(
     Frames are matched by number where both sides have one (line of the pose file, index in frames.csv, whole numbers
     as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s.
     """
+    if as_json and as_csv:
+        raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
     from scopemap.evaluation.paper import paper_report
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.trajectory import read_trajectory
@@ -107,7 +118,7 @@ def evaluate(
         figures["paper"] = asdict(paper_report(matched))
     figures |= _protocols(estimate, reference, protocol or [])
     if depth or consistency:
-        figures |= _depths(trajectory, truth, depth_scaling if depth else "", consistency=consistency)
+        figures |= _depths(trajectory, truth, depth, consistency=consistency)
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
         _warn(matched)
@@ -117,6 +128,8 @@ def evaluate(
 
 def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp: bool) -> dict[str, Any]:
     if not (trajectory / "mesh.ply").is_file() or not truth.is_dir():
+        if icp:
+            raise InputError("--icp needs a run's mesh.ply and a folder with a true surface")
         return {}
     from scopemap.benchmark.scoring import surface_figures_of
     from scopemap.datasets import open_sequence
@@ -143,10 +156,10 @@ def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) ->
     return {name: report.figures | {"description": report.description} for name, report in reports.items()}
 
 
-def _depths(trajectory: Path, truth: Path, scaling: str, *, consistency: bool) -> dict[str, Any]:
+def _depths(trajectory: Path, truth: Path, scaling: DepthChoice | None, *, consistency: bool) -> dict[str, Any]:
     from scopemap.benchmark.scoring import depth_groups
 
-    return depth_groups(trajectory, truth, scaling, consistency=consistency)
+    return depth_groups(trajectory, truth, scaling.value if scaling else None, consistency=consistency)
 
 
 def _warn(matched: MatchedTrajectories) -> None:

@@ -103,16 +103,6 @@ class ConsistencyReport:
     orb_reference: DisplacementSummary
     orb_estimated: DisplacementSummary
 
-    @property
-    def world_poses(self) -> Poses:
-        """Whose poses `orb_world` has: the reference's if it measured any pair, else the method's own."""
-        return "reference" if self.orb_reference.pairs > 0 else "estimated"
-
-    @property
-    def orb_world(self) -> DisplacementSummary:
-        """The paper's displacement in the world, by `world_poses`."""
-        return self.orb_reference if self.world_poses == "reference" else self.orb_estimated
-
 
 @dataclass(frozen=True)
 class _Scaled:

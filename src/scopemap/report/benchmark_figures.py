@@ -44,7 +44,7 @@ class BarGrid:
     methods: Sequence[str]
     values: np.ndarray
     spreads: np.ndarray | None = None
-    absent: str = "failed"
+    absent: str = "no figure"
 
     def __post_init__(self) -> None:
         shape = (len(self.sequences), len(self.methods))
