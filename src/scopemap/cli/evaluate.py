@@ -85,12 +85,15 @@ def evaluate(
     ] = False,
     protocol: Annotated[
         list[str] | None,
-        typer.Option(help="Also the figures of another paper's protocol, by name; may be repeated."),
+        typer.Option(
+            help="Also another protocol's figures, may be repeated: evo, af, endogslam, surgcut3r, free-surgs, simcol, "
+            "robust-pose-estimator, oneslam."
+        ),
     ] = None,
     icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,
     depth: Annotated[
         DepthChoice | None,
-        typer.Option(metavar="SCALING", help="Also a run's depth maps against true depth, scaled so."),
+        typer.Option(help="Also a run's depth maps against true depth, scaled so."),
     ] = None,
     consistency: Annotated[
         bool, typer.Option("--consistency", help="Also the consistency of a run's depth over time.")
