@@ -3,7 +3,8 @@
     python benchmarks/speed.py [--input PATH] [--frames N] [--set KEY=VALUE ...]
 
 Without an input a colon phantom of 337x270 px is rendered first. Prints median milliseconds per frame and the ratio to
-one DIS flow pair in the same run: machines differ and are shared, ratios travel better.
+one DIS flow pair in the same run: machines differ and are shared, ratios travel better. The embedded depth network is
+timed on the same frames at 320x256 px, whichever depth the run uses, with torch on one thread and on two.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=337, height=270, seed=0)
+NETWORK_SIZE = (320, 256)
 WARM_UP = 5  # frames that compile, load and fill caches
 
 
@@ -71,6 +73,23 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
     return per_frame, (sequence.camera.width, sequence.camera.height)
 
 
+def measure_network(path: Path, frames: int, model: str) -> dict[str, float]:
+    """Return milliseconds per frame of the embedded depth network on the CPU, by threads; `model` as in Config."""
+    import torch
+
+    from scopemap.depth.scopenet.estimator import ScopeNetDepth
+
+    images = [frame for frame, _ in open_sequence(path, size=NETWORK_SIZE, frames=slice(0, frames))]
+    network, threads_before = ScopeNetDepth.from_file(model, device="cpu"), torch.get_num_threads()
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for threads, words in ((1, "1 thread"), (2, "2 threads")):
+        torch.set_num_threads(threads)
+        for frame in images:
+            timed(network.estimate, f"depth scopenet {NETWORK_SIZE[0]}x{NETWORK_SIZE[1]}, {words}", seconds)(frame)
+    torch.set_num_threads(threads_before)
+    return {part: 1e3 * float(np.median(values[WARM_UP:])) for part, values in seconds.items()}
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -83,11 +102,13 @@ def main() -> None:
         if options.input is None:
             write_phantom(PHANTOM, Path(folder))
         per_frame, (width, height) = measure(options.input or Path(folder), options.frames, config)
+        model = config.depth.model if config.depth.backend == "scopenet" else ""
+        network = measure_network(options.input or Path(folder), options.frames, model)
     unit = per_frame.pop("DIS")
     both = sum(per_frame[part] for part in ("track", "keyframe", "MAPIS", "fuse"))
     print(f"{width}x{height} px, median per frame; one DIS flow pair with its check: {unit:.1f} ms\n")
     print("| part | ms | in DIS pairs |\n|---|---|---|")
-    for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + fuse**", both)]:
+    for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + fuse**", both), *network.items()]:
         print(f"| {part} | {ms:.1f} | {ms / unit:.2f} |")
 
 

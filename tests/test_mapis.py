@@ -74,7 +74,7 @@ def test_robust_scale_needs_an_overlap() -> None:
         ("linear", 1 - np.clip(DISTANCE, 0, 1)),
         ("paper-equation", np.clip(DISTANCE, 0, 1)),
         ("constant", np.full(SHAPE, 0.5)),
-        ("auto", np.exp(-DISTANCE / 0.15)),
+        ("auto", 1 - np.clip(DISTANCE, 0, 1)),
         ("none", np.zeros(SHAPE)),
     ],
 )

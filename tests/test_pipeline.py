@@ -199,7 +199,8 @@ def test_a_frame_that_is_too_dark_to_track_fixes_no_scale(folder: Path, tmp_path
     first[:, SIZE[0] // 3 :] = 0
     cv2.imwrite(str(bare / "0000.png"), first)
     steps: list[Step] = []
-    reconstruct(open_sequence(bare, frames=slice(0, 3)), Config.load(), observers=(steps.append,))
+    config = Config.load(settings={"depth.backend": "shading"})
+    reconstruct(open_sequence(bare, frames=slice(0, 3)), config, observers=(steps.append,))
     assert [step.track.status for step in steps] == ["lost", "initial", "ok"]
     assert steps[0].frame.valid.mean() > 0.02
     assert np.isnan(steps[0].raw_mm).all()

@@ -43,8 +43,11 @@ class MaskSettings(Settings):
 class DepthSettings(Settings):
     """Where depth comes from and what fixes its scale."""
 
-    backend: str = Field("shading", description="shading | depth-anything | depth-pro | files:FOLDER")
-    model: str = Field("", description="hub id or local folder for the network back ends; empty: the pinned default")
+    backend: str = Field("shading", description="scopenet | shading | depth-anything | depth-pro | files:FOLDER")
+    model: str = Field(
+        "",
+        description="weights of the networks: hub id or local folder, for scopenet a .safetensors file; empty: pinned",
+    )
     anchor: Literal["auto", "near-far", "depth-pro", "shading", "factor"] = Field(
         "auto", description="metric anchor of frame 1; auto: near-far if given, else the depth's own mm, else shading"
     )
@@ -79,10 +82,16 @@ class MapisSettings(Settings):
         "auto", description="robust scale of each frame against the warped previous depth; auto: not for measured depth"
     )
     blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = Field(
-        "auto", description="weight of the warped depth; auto: exponential, none for measured depth"
+        "auto", description="weight of the warped depth; auto: linear, none for measured depth"
     )
     tau: float = Field(0.15, gt=0, description="LPIPS distance at which the exponential weight falls to 1/e")
     constant_weight: float = Field(0.5, ge=0, le=1, description="weight of the warped depth with blend = constant")
+    sigma_fading: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="variance that warped depth gains per frame, share of what it lies below the frame's",
+    )
     recursive: bool = Field(True, description="warp the refined previous depth; False: the unrefined, as the paper")
     compare_warped: bool = Field(True, description="LPIPS of the warped previous image; False: of the images as are")
     perceptual_score: bool = Field(False, description="one LPIPS score per pair instead of the map")
@@ -130,6 +139,9 @@ class OdometrySettings(Settings):
         ge=0,
         description="grey = (cosine / distance^2)^gamma; sRGB alone: 0.45; 0.35 did better; 0: off",
     )
+    depth_sigma_share: float = Field(
+        0.05, gt=0, description="relative error that all depth has anyhow: more uncertain pixels count less; large: off"
+    )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
@@ -163,6 +175,9 @@ class FusionSettings(Settings):
     truncation_mm: float = Field(5.0, ge=0.05)
     max_depth_mm: float = Field(100.0, gt=0, description="depth beyond this is not fused")
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
+    depth_sigma_share: float = Field(
+        0.2, gt=0, description="as odometry's; no pixel counts more than without an uncertainty; large: off"
+    )
     min_weight: float = Field(1.5, ge=0, description="voxels with less weight give no surface")
     min_component_share: float = Field(0.02, ge=0, le=1, description="floaters below this share of the faces go")
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")

@@ -30,6 +30,7 @@ class Frame:
     depth_mm : (H, W) float32 along the optical axis, NaN = unknown; None until a depth stage has spoken.
     T_world_camera : (4, 4) float64, takes a point in the camera to the world; None until tracked.
     name : the file's own name, or "".
+    depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: nothing is said of it.
     """
 
     index: int
@@ -40,6 +41,7 @@ class Frame:
     depth_mm: np.ndarray | None = None
     T_world_camera: np.ndarray | None = None
     name: str = ""
+    depth_sigma_mm: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -47,6 +49,8 @@ class Frame:
         check_shape("Frame.valid", self.valid, size)
         if self.depth_mm is not None:
             check_shape("Frame.depth_mm", self.depth_mm, size)
+        if self.depth_sigma_mm is not None:
+            check_shape("Frame.depth_sigma_mm", self.depth_sigma_mm, size)
         if self.T_world_camera is not None:
             check_shape("Frame.T_world_camera", self.T_world_camera, (4, 4))
 

@@ -37,7 +37,8 @@ class Percept:
     ----------
     frame : masked. raw_mm : (H, W) float32, anchored but not yet consistent, NaN = unknown. kind : of the estimate.
     link : correspondence with the frame before it, None for the first. anchored : whether the metric anchor was fitted
-    to this very frame.
+    to this very frame. raw_sigma_mm : (H, W) float32, one standard deviation of `raw_mm`, NaN = unknown; None: the
+    estimator does not say.
     """
 
     frame: Frame
@@ -45,6 +46,7 @@ class Percept:
     kind: DepthKind
     link: Correspondence | None
     anchored: bool = False
+    raw_sigma_mm: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,13 @@ class Estimators:
         """Build what the settings name; raises what the parts raise where weights or files are missing."""
         networks = config.networks
         return cls(
-            create_depth(config.depth, sequence.rectifier, networks.device, sequence.depth_scale_mm),
+            create_depth(
+                config.depth,
+                sequence.rectifier,
+                networks.device,
+                sequence.depth_scale_mm,
+                calibrated=sequence.calibrated,
+            ),
             create_anchor(config.depth, networks.device),
             create_flow(networks.flow, networks.flow_iterations, networks.device),
             create_perceptual(networks.perceptual, networks.device),
@@ -125,20 +133,22 @@ class Pipeline:
         usable = frame.valid.mean() >= self.config.odometry.min_valid_share
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
-        raw_mm = self.estimators.anchor.depth_mm(estimate, shown)
+        raw = self.estimators.anchor.metric(estimate, shown)
         link = self._link(frame, estimate.kind)
         self._previous = frame
-        return Percept(frame, raw_mm, estimate.kind, link, self.estimators.anchor.just_fitted)
+        just_fitted = self.estimators.anchor.just_fitted
+        return Percept(frame, raw.depth_mm, estimate.kind, link, just_fitted, raw.sigma_mm)
 
     def step(self, percept: Percept) -> Step:
         """Track a frame, make its depth consistent, fuse it."""
         refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
-        track = self._tracker.track(replace(percept.frame, depth_mm=percept.raw_mm))
+        raw = replace(percept.frame, depth_mm=percept.raw_mm, depth_sigma_mm=percept.raw_sigma_mm)
+        track = self._tracker.track(raw)
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
             known = percept if track.status != "lost" else replace(percept, link=None)
             refined = self._refine(known, self._motion(track))
-        frame = replace(percept.frame, depth_mm=refined.depth_mm)
+        frame = replace(percept.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
         track = self._keyed(track, frame, measured=percept.kind == "measured")
         if track.status == "lost":
             self._mapis.forget()
@@ -176,9 +186,15 @@ class Pipeline:
         return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
-        camera = percept.frame.camera
-        raw_mm, kind, link = percept.raw_mm, percept.kind, percept.link
-        return self._mapis.refine(raw_mm, kind, camera, link, T_current_previous, anchored=percept.anchored)
+        return self._mapis.refine(
+            percept.raw_mm,
+            percept.kind,
+            percept.frame.camera,
+            percept.link,
+            T_current_previous,
+            sigma_mm=percept.raw_sigma_mm,
+            anchored=percept.anchored,
+        )
 
     def _motion(self, track: Track) -> np.ndarray | None:
         """Motion from the previous frame to this one, None unless both poses are known."""

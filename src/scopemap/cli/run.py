@@ -66,7 +66,8 @@ def run(
         str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
     ] = None,
     depth: Annotated[
-        str | None, typer.Option(help="shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files).")
+        str | None,
+        typer.Option(help="scopenet, shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files)."),
     ] = None,
     flow: Annotated[
         str | None,

@@ -18,13 +18,19 @@ _FILES = "files:"
 
 
 def create_depth(
-    settings: DepthSettings, rectifier: Rectifier, device: str, depth_scale_mm: float | None = None
+    settings: DepthSettings,
+    rectifier: Rectifier,
+    device: str,
+    depth_scale_mm: float | None = None,
+    *,
+    calibrated: bool = True,
 ) -> DepthEstimator:
-    """Return the estimator that `settings.backend` names: shading, depth-anything, depth-pro or files:FOLDER.
+    """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
 
     rectifier : from the source camera to the working camera, for depth files.
     device : "auto", "cpu" or "cuda", for networks.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+    calibrated : whether the frames' camera is known; False: ScopeNet is not told the rays, which would mislead it.
 
     Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
     """
@@ -32,15 +38,19 @@ def create_depth(
         return FilesDepth(Path(settings.backend.removeprefix(_FILES)), rectifier, settings, depth_scale_mm)
     if settings.backend == "shading":
         return ShadingDepth(settings)
+    # Networks take seconds to import: only who asks for one waits.
+    if settings.backend == "scopenet":
+        from scopemap.depth.scopenet.estimator import ScopeNetDepth
+
+        return ScopeNetDepth.from_file(settings.model, device, rays_known=calibrated)
     if settings.backend == "depth-pro":
         return _depth_pro(settings.model, device)
     if settings.backend == "depth-anything":
-        # Networks take seconds to import: only who asks for one waits.
         from scopemap.depth.depth_anything import DepthAnything
 
         return DepthAnything.from_folder_or_hub(settings.model, device)
     raise SettingsError(
-        f"unknown depth '{settings.backend}': choose shading, depth-anything, depth-pro or files:FOLDER"
+        f"unknown depth '{settings.backend}': choose scopenet, shading, depth-anything, depth-pro or files:FOLDER"
     )
 
 

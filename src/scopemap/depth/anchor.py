@@ -33,6 +33,24 @@ class DepthScale:
         scaled = np.asarray(depth, dtype=np.float32) * np.float32(self.factor)
         return np.where(scaled > 0, scaled, np.float32(np.nan))
 
+    def sigma_mm(self, sigma: np.ndarray | None) -> np.ndarray | None:
+        """Return the standard deviation, same shape, float32, mm, of depth with that of `sigma`; None for None."""
+        return None if sigma is None else np.asarray(sigma, dtype=np.float32) * np.float32(self.factor)
+
+
+@dataclass(frozen=True)
+class MetricDepth:
+    """Depth of one frame in millimetres, and what is known of its error.
+
+    Attributes
+    ----------
+    depth_mm : (H, W) float32, NaN = unknown. sigma_mm : (H, W) float32, one standard deviation, NaN = unknown; None:
+    nothing is said.
+    """
+
+    depth_mm: np.ndarray
+    sigma_mm: np.ndarray | None
+
 
 @dataclass(frozen=True)
 class _Target:
@@ -86,7 +104,14 @@ class AnchoredDepth:
         return self._conversion
 
     def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
-        """Return metric depth (H, W) float32 in mm, NaN = unknown or not positive.
+        """Return the depth of `metric` alone."""
+        return self.metric(estimate, frame).depth_mm
+
+    def metric(self, estimate: DepthEstimate, frame: Frame) -> MetricDepth:
+        """Return metric depth (H, W) float32 in mm, NaN = unknown or not positive, with its sigma where one is told.
+
+        Sigma is scaled as a predicted or measured depth is; of a disparity nothing is said, and neither is it where
+        the anchor's own depth takes the estimate's place.
 
         Depth that is not measured is NaN too beyond `reach_mm`, where an estimate says nothing any more.
         All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
@@ -95,11 +120,12 @@ class AnchoredDepth:
         self._frames_held += 1
         first_mm = self._anchor(estimate, frame) if self._is_due(estimate) else None
         if self._conversion is None:
-            return np.full(estimate.values.shape, np.nan, dtype=np.float32)
+            return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None)
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
-        if estimate.kind == "measured":
-            return depth_mm
-        return np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
+        sigma_mm = self._conversion.sigma_mm(estimate.sigma) if first_mm is None else None
+        if estimate.kind != "measured":
+            depth_mm = np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
+        return MetricDepth(depth_mm, sigma_mm)
 
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self._conversion is None:

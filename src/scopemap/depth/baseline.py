@@ -38,6 +38,10 @@ class AffineDisparity:
         inverse = self.scale * np.asarray(disparity, dtype=np.float64) + self.shift
         return np.divide(1.0, inverse, out=np.full(inverse.shape, np.nan), where=inverse > 0).astype(np.float32)
 
+    def sigma_mm(self, sigma: np.ndarray | None) -> np.ndarray | None:
+        """Return None: what a disparity's sigma means for depth hangs on a shift that is itself a guess."""
+        return None
+
 
 def baseline_closed_form(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float) -> float:
     """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2: B = sum(D g) / sum(g g), g = f / d.

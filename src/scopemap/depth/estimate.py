@@ -23,14 +23,19 @@ class DepthEstimate:
     kind : "disparity": unitless, larger is nearer, known up to a scale and a shift; "depth": predicted, mm along the
         optical axis, whose scale may float from frame to frame; "measured": mm, to be trusted.
     focal_px : focal length that the estimator found in the image, px of this frame's width, or None.
+    sigma : (H, W) float32, one standard deviation of `values`, in their unit, NaN = unknown; None: the estimator does
+        not say.
     """
 
     values: np.ndarray
     kind: DepthKind
     focal_px: float | None = None
+    sigma: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         check_shape("DepthEstimate.values", self.values, (None, None))
+        if self.sigma is not None:
+            check_shape("DepthEstimate.sigma", self.sigma, np.shape(self.values))
 
 
 class DepthEstimator(Protocol):

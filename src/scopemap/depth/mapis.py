@@ -3,11 +3,15 @@
 METHOD section MAPIS-Depth, steps 5-8. The previous depth is warped into the current frame along the flow, filtered, and
 blended with the current estimate by a weight from their perceptual distance. The paper's text trusts the warped depth
 where the images are alike, its equation does the reverse; `blend = "paper-equation"` is the latter, taken literally.
+
+Where the estimator says how certain it is, the odds of that weight are multiplied by the ratio of inverse variances: a
+pixel that was seen well and is now in glare keeps what was seen. Sigma is carried along as a share of depth.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +19,7 @@ from scopemap.camera import PinholeCamera
 from scopemap.config import MapisSettings
 from scopemap.depth.estimate import DepthKind
 from scopemap.errors import check_shape
+from scopemap.geometry.uncertainty import blended_share, by_variance, faded_share, sigma_share
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 
 _LEAST_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
@@ -42,12 +47,21 @@ class RefinedDepth:
     Attributes
     ----------
     depth_mm : (H, W) float32, NaN = unknown. scale : factor that was put on the raw depth.
-    warped_share : share of the image that had a warped previous depth.
+    warped_share : share of the image that had a warped previous depth. sigma_mm : (H, W) float32, one standard
+    deviation of the depth, NaN = nothing is said.
     """
 
     depth_mm: np.ndarray
     scale: float
     warped_share: float
+    sigma_mm: np.ndarray
+
+
+class _Carried(NamedTuple):
+    """What the next frame takes over: depth (H, W) mm and its sigma as a share of it, NaN = unknown."""
+
+    depth_mm: np.ndarray
+    share: np.ndarray
 
 
 class Mapis:
@@ -55,7 +69,7 @@ class Mapis:
 
     def __init__(self, settings: MapisSettings) -> None:
         self.settings = settings
-        self._carried_mm: np.ndarray | None = None
+        self._carried: _Carried | None = None
         self._scale = 1.0
 
     def refine(
@@ -66,28 +80,34 @@ class Mapis:
         link: Correspondence | None,
         T_current_previous: np.ndarray | None,
         *,
+        sigma_mm: np.ndarray | None = None,
         anchored: bool = False,
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
-        `raw_mm` is (H, W) float32; `link` is None for the first frame. With a motion the previous depth is moved by
-        it; with None its values are carried unchanged, as in the paper. A frame that was just `anchored` to a metric
-        depth takes nothing from the past: the chain of scales starts anew with it.
+        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where nothing is said; `link` is
+        None for the first frame. With a motion the previous depth is moved by it; with None its values are carried
+        unchanged, as in the paper. A frame that was just `anchored` to a metric depth takes nothing from the past: the
+        chain of scales starts anew with it.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         if anchored:
             self._scale, link = 1.0, None
-        warped_mm = self._warped(camera, link, T_current_previous)
+        share = sigma_share(raw_mm, sigma_mm)
+        warped_mm, warped_share = self._warped(camera, link, T_current_previous, share)
         if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
         scaled_mm = raw_mm * np.float32(self._scale)
-        depth_mm = scaled_mm
+        depth_mm, refined_share = scaled_mm, share
         blend = self._blend(kind)
         if link is not None and blend != "none":
             weight = np.where(np.isfinite(warped_mm), self._weight(blend, link.distance), np.float32(0.0))
+            weight = by_variance(weight, warped_share, share)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
-        self._carried_mm = depth_mm if self.settings.recursive else scaled_mm
-        return RefinedDepth(depth_mm, self._scale, float(np.isfinite(warped_mm).mean()))
+            refined_share = blended_share(weight, warped_share, share)
+        self._carried = _Carried(depth_mm, refined_share) if self.settings.recursive else _Carried(scaled_mm, share)
+        overlap = float(np.isfinite(warped_mm).mean())
+        return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
 
     def links(self, kind: DepthKind) -> bool:
         """Return whether depth of this kind is compared with the frame before it at all."""
@@ -95,7 +115,7 @@ class Mapis:
 
     def forget(self) -> None:
         """Let the next frame start without a previous depth; the scale found last is held."""
-        self._carried_mm = None
+        self._carried = None
 
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.frame_scale
@@ -104,18 +124,26 @@ class Mapis:
     def _blend(self, kind: DepthKind) -> str:
         if self.settings.blend != "auto":
             return self.settings.blend
-        return "none" if kind == "measured" else "exponential"
+        return "none" if kind == "measured" else "linear"
 
     def _warped(
-        self, camera: PinholeCamera, link: Correspondence | None, T_current_previous: np.ndarray | None
-    ) -> np.ndarray:
-        if link is None or self._carried_mm is None:
-            return np.full((camera.height, camera.width), np.nan, np.float32)
-        warped_mm = pull(self._carried_mm, link.to_previous)
+        self,
+        camera: PinholeCamera,
+        link: Correspondence | None,
+        T_current_previous: np.ndarray | None,
+        share: np.ndarray,
+    ) -> _Carried:
+        """Bring what the frame before knew to the current one, whose own sigma is `share` of its depth."""
+        if link is None or self._carried is None:
+            nothing = np.full((camera.height, camera.width), np.nan, np.float32)
+            return _Carried(nothing, nothing)
+        warped_mm = pull(self._carried.depth_mm, link.to_previous)
         warped_mm = np.where(link.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, link.to_previous, camera, T_current_previous)
-        return bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
+        filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
+        warped_share = pull(self._carried.share, link.to_previous)
+        return _Carried(filtered_mm, faded_share(warped_share, share, self.settings.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""

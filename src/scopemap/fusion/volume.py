@@ -22,6 +22,7 @@ from scopemap.fusion.tsdf import (
     unpack,
 )
 from scopemap.geometry.se3 import inverse
+from scopemap.geometry.uncertainty import depth_trust
 
 # Below this cosine a slanted wall cannot be told from a depth edge, whatever the setting.
 _LEAST_INCIDENCE = 0.05
@@ -42,6 +43,8 @@ class TsdfVolume:
     def integrate(self, frame: Frame) -> None:
         """Fuse the valid pixels of a frame up to `max_depth_mm`; a frame without any changes nothing.
 
+        Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less.
+
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or out of reach.
         """
         depth_mm, T_world_camera = self._checked(frame)
@@ -56,6 +59,8 @@ class TsdfVolume:
             usable = frame.valid & (depth_mm > 0) & (depth_mm <= settings.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
         surface = measure_surface(inverse_depth, view, step, settings.min_incidence, settings.max_depth_mm)
+        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
+        surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
         keys = np.unique(touched_blocks(surface.inverse_depth, view, grid))
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, frame.rgb, view, grid)

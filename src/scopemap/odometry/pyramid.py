@@ -11,6 +11,7 @@ from numba import njit
 from scopemap.camera import PinholeCamera
 from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
+from scopemap.geometry.uncertainty import depth_trust
 from scopemap.odometry.residuals import View
 
 _GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
@@ -24,6 +25,9 @@ def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool
     `trust_slope` says that the depth is good enough for tangent planes; predicted depth is not (its slopes follow the
     paint of the tissue), and every point then counts as lying on a plane parallel to the image.
 
+    The weights are 1 where a pixel is usable, times how far its depth can be trusted by `frame.depth_sigma_mm`
+    (`depth_trust`, 1 where nothing is said).
+
     Levels whose short side would fall below `min_side_px` are left out; the finest is always there. A frame without
     depth gives views that can only be tracked, not tracked against.
     """
@@ -32,6 +36,7 @@ def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool
     depth = np.full(grey.shape, np.nan, np.float32)
     if frame.depth_mm is not None:
         depth = np.where(frame.valid, frame.depth_mm, np.float32(np.nan))
+    trust = depth_trust(depth, frame.depth_sigma_mm, settings.depth_sigma_share)
     camera = frame.camera
     views: list[View] = []
     for level in range(settings.levels):
@@ -41,7 +46,8 @@ def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool
                 break
             # An odd last row or column has no partner: without it, pixels, depth and camera halve alike.
             camera = replace(camera, width=2 * width, height=2 * height)
-            grey, weight, depth = (plane[: 2 * height, : 2 * width] for plane in (grey, weight, depth))
+            grey, weight, depth, trust = (p[: 2 * height, : 2 * width] for p in (grey, weight, depth, trust))
+            trust, _ = _halve_image(trust, weight, (width, height))
             grey, weight = _halve_image(grey, weight, (width, height))
             depth, camera = _halve_depth(depth), camera.resized(width, height)
         if level >= min(settings.finest_level, settings.levels - 1):
@@ -49,7 +55,7 @@ def build_pyramid(frame: Frame, settings: OdometrySettings, *, trust_slope: bool
             views.append(
                 View(
                     _channels(grey, weight, settings),
-                    weight,
+                    weight * trust,
                     depth,
                     slope,
                     np.array([camera.fx, camera.fy, camera.cx, camera.cy]),

@@ -34,7 +34,7 @@ class View(NamedTuple):
     Attributes
     ----------
     channels : (C, H, W) float32, of which `Loss` says how each is compared.
-    weight : (H, W) float32, 0 where a pixel must not be used.
+    weight : (H, W) float32, 0 where a pixel must not be used; the current image's 0 or 1.
     slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = parallel to the image,
     or unknown.
     depth_mm : (H, W) float32, NaN = unknown (only the reference's is read).

@@ -81,7 +81,7 @@ def _align_level(
 ) -> tuple[Motion, int]:
     start = _residuals(reference, current, motion, settings)
     loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
-    least_weight = 0.5 * np.isfinite(start[0]).sum()
+    least_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
         [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
     )

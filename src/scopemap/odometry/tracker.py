@@ -48,7 +48,7 @@ class Tracker:
         if self._keyframe is None:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
         # The keyframe's points are moved: the depth of the frame itself has no say.
-        pyramid = build_pyramid(replace(frame, depth_mm=None), self.settings)
+        pyramid = build_pyramid(replace(frame, depth_mm=None, depth_sigma_mm=None), self.settings)
         alignment = self._best(pyramid)
         T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
         trouble = self._trouble(alignment, T_world_camera)

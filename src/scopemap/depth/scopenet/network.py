@@ -1,0 +1,108 @@
+"""ScopeNet: a compact encoder-decoder from an endoscope's image and its rays to distance and its uncertainty.
+
+Residual blocks (He et al., CVPR 2016) on six scales with skips, a global context in the middle, decoded to the full
+resolution so that the edges of folds stay where they are. Trained from nothing on the project's own phantom
+(`training/`).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scopemap.depth.scopenet.planes import PLANES
+
+WIDTHS = (24, 48, 80, 128, 160)
+_BLOCKS = (1, 2, 2, 3, 2)
+_HEAD = 16
+_STRIDE = 32
+_TYPICAL_LOG_MM = 3.4  # 30 mm: the network starts from there
+_SPREAD_RANGE = (-5.0, 1.0)
+
+
+class _Block(nn.Module):
+    """Two convolutions with a short cut around them."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = _convolution(width, width), _convolution(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(functional.relu(self.first(x))))
+
+
+class _Context(nn.Module):
+    """Adds what the whole image says to every pixel."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        whole = self.second(functional.relu(self.first(x.mean((2, 3)))))
+        return functional.relu(x + whole[:, :, None, None])
+
+
+class _Merge(nn.Module):
+    """Brings coarse features to the next finer scale, where they meet the encoder's."""
+
+    def __init__(self, coarse: int, fine: int) -> None:
+        super().__init__()
+        self.from_coarse, self.from_fine = nn.Conv2d(coarse, fine, 1), nn.Conv2d(fine, fine, 1)
+        self.block = _Block(fine)
+
+    def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        # The short side first: a 1x1 convolution and the enlargement commute.
+        enlarged = functional.interpolate(self.from_coarse(coarse), scale_factor=2.0, mode="bilinear")
+        return self.block(functional.relu(enlarged + self.from_fine(fine)))
+
+
+class ScopeNet(nn.Module):
+    """The network.
+
+    widths : channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution. blocks : residual blocks there.
+    """
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = _BLOCKS) -> None:
+        super().__init__()
+        entries = [_convolution(a, b, 2) for a, b in pairwise((PLANES, *widths))]
+        self.stages = nn.ModuleList(
+            nn.Sequential(entry, nn.ReLU(), *(_Block(width) for _ in range(count)))
+            for entry, width, count in zip(entries, widths, blocks, strict=True)
+        )
+        self.context = _Context(widths[-1])
+        self.merges = nn.ModuleList(_Merge(coarse, fine) for fine, coarse in reversed(list(pairwise(widths))))
+        self.from_coarse, self.from_planes = nn.Conv2d(widths[0], _HEAD, 1), _convolution(PLANES, _HEAD)
+        self.detail = _convolution(_HEAD, _HEAD)
+        self.head = nn.Conv2d(_HEAD, 2, 3, padding=1)
+        for start in self.head.parameters():
+            nn.init.zeros_(start)
+
+    def forward(self, planes: Tensor) -> Tensor:
+        """Return (N, 2, H, W) from planes (N, 8, H, W), any H and W.
+
+        Channel 0: ln of the distance along the ray, mm. Channel 1: ln of the Laplace scale of channel 0's error.
+        """
+        height, width = planes.shape[-2:]
+        x = functional.pad(planes, (0, -width % _STRIDE, 0, -height % _STRIDE))
+        full, scales = x, []
+        for stage in self.stages:
+            x = stage(x)
+            scales.append(x)
+        x = self.context(x)
+        for merge, fine in zip(self.merges, reversed(scales[:-1]), strict=True):
+            x = merge(x, fine)
+        x = functional.interpolate(self.from_coarse(x), scale_factor=2.0, mode="bilinear")
+        x = functional.relu(self.detail(functional.relu(x + self.from_planes(full))))
+        x = self.head(x)[..., :height, :width].float()
+        return torch.stack([x[:, 0] + _TYPICAL_LOG_MM, (x[:, 1] - 2.0).clamp(*_SPREAD_RANGE)], 1)
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(outputs),
+    )

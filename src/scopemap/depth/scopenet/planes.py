@@ -1,0 +1,38 @@
+"""What the network is told of a frame: colour, brightness, ray directions and which pixels show tissue."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.errors import check_shape
+
+PLANES = 8
+# Below this linear brightness (sRGB level 3 of 255) there is only noise.
+_DARKEST = 1e-3
+_CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], np.float32)
+_LEVEL = np.arange(256) / 255
+# IEC 61966-2-1, one entry for each 8-bit level.
+_LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarray) -> np.ndarray:
+    """Return the network's input (8, H, W) float32.
+
+    rgb : (H, W, 3) uint8, sRGB.
+    unit_rays : (H, W, 3) float32 directions of length 1, camera axes; None = unknown, told as zeros.
+    valid : (H, W) bool, where usable tissue shows.
+
+    Planes: red, green, blue (-0.5..0.5), ln of the linear brightness of red and green against the median of the valid
+    pixels (what the lamp's distance is read from, whatever the exposure), ray x, y, z, valid (0 or 1).
+    """
+    height, width = valid.shape
+    check_shape("rgb", rgb, (height, width, 3))
+    planes = np.zeros((PLANES, height, width), np.float32)
+    planes[:3] = rgb.transpose(2, 0, 1) * np.float32(1 / 255) - np.float32(0.5)
+    brightness = np.log(np.maximum(_LINEAR[rgb] @ _CHANNEL_WEIGHTS, _DARKEST))
+    planes[3] = 0.5 * (brightness - (np.median(brightness[valid]) if valid.any() else 0.0))
+    if unit_rays is not None:
+        check_shape("unit_rays", unit_rays, (height, width, 3))
+        planes[4:7] = unit_rays.transpose(2, 0, 1)
+    planes[7] = valid
+    return planes

@@ -1,0 +1,77 @@
+"""How far depth can be trusted, pixel by pixel: its standard deviation as a share of it, and the weight that follows.
+
+Shares, not millimetres, since an error of predicted depth grows with depth. What nothing is said of (no sigma at all,
+or NaN) is NaN as a share and 1 as a weight: who says nothing counts like the image's median pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.errors import check_shape
+
+# A sigma of 0 or of infinity must not make weights infinite or undefined.
+_LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1e3
+
+
+def sigma_share(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray:
+    """Return the standard deviation of depth as a share of it, (H, W) float32, 1e-4..1e3; NaN where either is unknown.
+
+    depth_mm : (H, W), mm, NaN = unknown. sigma_mm : (H, W), mm, one standard deviation, NaN = unknown; None: all is.
+    """
+    if sigma_mm is None:
+        return np.full(np.shape(depth_mm), np.nan, dtype=np.float32)
+    check_shape("sigma_mm", sigma_mm, np.shape(depth_mm))
+    with np.errstate(invalid="ignore"):
+        known = (depth_mm > 0) & (sigma_mm >= 0)
+        share = np.divide(sigma_mm, depth_mm, out=np.full(np.shape(depth_mm), np.nan, np.float32), where=known)
+    return np.clip(share, _LEAST_SHARE, _LARGEST_SHARE)
+
+
+def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: float) -> np.ndarray:
+    """Return how much each pixel's depth should count against the image's median pixel, (H, W) float32, positive.
+
+    (f^2 + m^2) / (f^2 + s^2) with s the pixel's share of `sigma_share`, m its median over the image and f the
+    `floor_share`: the relative error that every pixel has anyhow, by what sigma does not tell of. That is the inverse
+    variance of both errors together, 1 at the median: sigma in proportion to depth changes nothing, and neither does
+    any sigma where f is large. 1 where nothing is said.
+    """
+    share = sigma_share(depth_mm, sigma_mm)
+    known = np.isfinite(share)
+    if not known.any():
+        return np.ones(share.shape, dtype=np.float32)
+    floor, median = np.float32(floor_share**2), np.median(share[known]) ** 2
+    return np.where(known, (floor + median) / (floor + share**2), 1.0).astype(np.float32)
+
+
+def faded_share(carried: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
+    """Return the share of a depth that comes from the frame before, (H, W) float32: old certainty fades.
+
+    Per frame, variance grows by `fading` (0..1) of what it lies below the current frame's; it never shrinks. NaN where
+    `carried` is; unchanged where `current` is NaN.
+    """
+    excess = np.maximum(np.nan_to_num(current**2 - carried**2, nan=0.0), 0.0)
+    return np.sqrt(carried**2 + np.float32(fading) * excess)
+
+
+def by_variance(weight: np.ndarray, share: np.ndarray, share_other: np.ndarray) -> np.ndarray:
+    """Return the `weight` (H, W) 0..1 of one of two depths, changed by how certain both are, (H, W) float32 0..1.
+
+    The odds weight / (1 - weight) are multiplied by the ratio of the inverse variances, (share_other / share)^2; where
+    either share is NaN the weight stays. Equal shares change nothing, to the last bit.
+    """
+    ratio = (share / share_other) ** 2
+    ratio = np.where(np.isfinite(ratio), ratio, np.float32(1.0))
+    return weight / (weight + (1 - weight) * ratio)
+
+
+def blended_share(weight: np.ndarray, share: np.ndarray, share_other: np.ndarray) -> np.ndarray:
+    """Return the share of weight * one + (1 - weight) * other, (H, W) float32, where their errors are the same kind.
+
+    weight * share + (1 - weight) * share_other: the standard deviation of a sum of fully correlated errors, since a
+    network errs alike on neighbouring frames and their mean is no better than they are. The known one where the other
+    is NaN, whatever the weight.
+    """
+    one = np.where(np.isfinite(share), share, share_other)
+    other = np.where(np.isfinite(share_other), share_other, share)
+    return weight * one + (1 - weight) * other

@@ -1,0 +1,249 @@
+"""ScopeNet's estimator on the real network class, small or with random weights: closed forms, files, provenance."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from scopemap import weights
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config, DepthSettings
+from scopemap.depth import create_anchor, create_depth
+from scopemap.depth.scopenet import estimator as module
+from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth, folded, load_network
+from scopemap.depth.scopenet.network import ScopeNet
+from scopemap.depth.scopenet.planes import input_planes
+from scopemap.errors import WeightsError
+from scopemap.frame import Frame
+from scopemap.rectification import Rectifier
+
+HEIGHT, WIDTH = 50, 61  # no multiple of anything
+CAMERA = PinholeCamera(40.0, 42.0, 28.0, 26.0, WIDTH, HEIGHT)
+SAME = Rectifier(CAMERA, CAMERA)
+UNIT_RAYS = (CAMERA.rays / np.linalg.norm(CAMERA.rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _shaken(network: ScopeNet) -> ScopeNet:
+    """Give every weight and statistic a value that shows in the output; a new network's head tells nothing."""
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        nn.init.normal_(network.head.weight, 0.0, 0.05, generator)
+        for part in network.modules():
+            if isinstance(part, nn.BatchNorm2d):
+                part.running_mean.normal_(0.0, 0.1, generator=generator)
+                part.running_var.uniform_(0.5, 2.0, generator=generator)
+                part.weight.uniform_(0.5, 1.5, generator=generator)
+                part.bias.normal_(0.0, 0.1, generator=generator)
+    return network.eval()
+
+
+def _small() -> ScopeNet:
+    torch.manual_seed(2)
+    return _shaken(ScopeNet(widths=(8, 8, 16, 16, 16)))
+
+
+def _saved(file: Path, network: ScopeNet | None = None, **changes: Any) -> Path:
+    state = {name: value.half() for name, value in (network or _whole()).state_dict().items()} | changes
+    save_file({name: value.contiguous() for name, value in state.items() if value is not None}, file)
+    return file
+
+
+def _whole() -> ScopeNet:
+    torch.manual_seed(3)
+    return _shaken(ScopeNet())
+
+
+@pytest.fixture(scope="module")
+def frame() -> Frame:
+    rng = np.random.default_rng(3)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[:, :9] = False
+    return Frame(0, 0.0, rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), CAMERA, valid)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _saved(tmp_path_factory.mktemp("weights") / "mine.safetensors")
+
+
+def _told(network: nn.Module, planes: np.ndarray) -> np.ndarray:
+    with torch.no_grad():
+        return network(torch.from_numpy(planes)[None])[0].numpy()
+
+
+@pytest.mark.parametrize("rays_known", [True, False])
+def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(frame: Frame, rays_known: bool) -> None:
+    estimate = ScopeNetDepth(_small(), device="cpu", rays_known=rays_known).estimate(frame)
+    told = _told(_small(), input_planes(frame.rgb, UNIT_RAYS if rays_known else None, frame.valid))
+    assert np.ptp(told[0]) > 0.1
+    depth_mm = np.exp(told[0]) * UNIT_RAYS[..., 2]
+    assert estimate.kind == "depth"
+    assert estimate.focal_px is None
+    np.testing.assert_allclose(estimate.values, depth_mm, rtol=1e-4)
+    assert estimate.sigma is not None
+    np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-4)
+
+
+def test_the_answer_has_the_frames_size_and_is_repeatable_and_whole(frame: Frame) -> None:
+    estimator = ScopeNetDepth(_small(), device="cpu")
+    estimate, again = estimator.estimate(frame), estimator.estimate(frame)
+    for array, twin in ((estimate.values, again.values), (estimate.sigma, again.sigma)):
+        assert array is not None
+        assert array.shape == (HEIGHT, WIDTH)
+        assert array.dtype == np.float32
+        assert np.isfinite(array).all()
+        assert (array > 0).all()
+        np.testing.assert_array_equal(array, twin)
+
+
+def test_the_network_is_told_the_mask_and_the_rays(frame: Frame) -> None:
+    estimator = ScopeNetDepth(_small(), device="cpu")
+    plain = estimator.estimate(frame).values
+    masked = estimator.estimate(replace(frame, valid=np.zeros_like(frame.valid))).values
+    wide = replace(CAMERA, fx=20.0, fy=21.0)
+    elsewhere = estimator.estimate(replace(frame, camera=wide)).values
+    assert np.abs(masked / plain - 1).max() > 1e-3
+    assert np.isfinite(masked).all()
+    unit_z = 1 / np.linalg.norm(wide.rays, axis=-1)
+    assert np.abs(elsewhere / unit_z / (plain / UNIT_RAYS[..., 2]) - 1).max() > 1e-3
+    blind = ScopeNetDepth(_small(), device="cpu", rays_known=False)
+    one, two = blind.estimate(frame).values, blind.estimate(replace(frame, camera=wide)).values
+    np.testing.assert_allclose(two / unit_z, one / UNIT_RAYS[..., 2], rtol=1e-5)
+
+
+def test_folding_leaves_no_normalisation_and_the_same_function(frame: Frame) -> None:
+    planes = input_planes(frame.rgb, UNIT_RAYS, frame.valid)
+    fast = folded(_small())
+    assert not any(isinstance(part, nn.BatchNorm2d) for part in fast.modules())
+    np.testing.assert_allclose(_told(fast, planes), _told(_small(), planes), atol=1e-5)
+
+
+def test_a_network_in_training_is_put_to_evaluation(frame: Frame) -> None:
+    training = ScopeNetDepth(_small().train(), device="cpu").estimate(frame).values
+    np.testing.assert_array_equal(training, ScopeNetDepth(_small(), device="cpu").estimate(frame).values)
+
+
+def test_float16_weights_of_a_file_are_used_in_float32(frame: Frame, file: Path) -> None:
+    network = load_network(file)
+    assert {value.dtype for value in network.parameters()} == {torch.float32}
+    rounded = _whole()
+    rounded.load_state_dict({name: value.half() for name, value in rounded.state_dict().items()})
+    expected = ScopeNetDepth(rounded, device="cpu").estimate(frame).values
+    estimator = create_depth(DepthSettings(backend="scopenet", model=str(file)), SAME, "cpu")
+    np.testing.assert_array_equal(estimator.estimate(frame).values, expected)
+
+
+def test_the_weights_of_the_package_are_the_default(
+    frame: Frame, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / WEIGHTS_NAME).write_bytes(file.read_bytes())
+    monkeypatch.setattr(module.resources, "files", lambda package: tmp_path)
+    estimator = create_depth(DepthSettings(backend="scopenet"), SAME, "cpu")
+    origin = estimator.provenance()
+    assert origin["model"] == "that come with the package"
+    assert origin[f"sha256 {WEIGHTS_NAME}"] == weights.sha256_of(file)
+    named = ScopeNetDepth.from_file(str(file), "cpu").estimate(frame)
+    np.testing.assert_array_equal(estimator.estimate(frame).values, named.values)
+
+
+def test_what_is_shipped_is_small_and_fits() -> None:
+    shipped = Path(module.__file__).parent / WEIGHTS_NAME
+    if not shipped.exists():
+        pytest.skip("this tree holds no trained weights yet")
+    assert shipped.stat().st_size <= 8_000_000
+    load_network(shipped)
+
+
+def test_the_package_lists_its_weights() -> None:
+    import tomllib
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    listed = project["tool"]["setuptools"]["package-data"]["scopemap"]
+    assert any(Path(f"depth/scopenet/{WEIGHTS_NAME}").match(pattern) for pattern in listed)
+
+
+@pytest.mark.parametrize(("calibrated", "rays"), [(True, "known"), (False, "assumed")])
+def test_provenance_says_whose_weights_and_whether_the_rays_were_known(file: Path, calibrated: bool, rays: str) -> None:
+    settings = DepthSettings(backend="scopenet", model=str(file))
+    origin = create_depth(settings, SAME, "cpu", calibrated=calibrated).provenance()
+    assert origin == {
+        "depth": "scopenet",
+        "model": str(file),
+        "sha256 mine.safetensors": weights.sha256_of(file),
+        "rays": rays,
+    }
+
+
+def test_an_installation_without_weights_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "estimator.py"))
+    with pytest.raises(WeightsError, match=r"installation lacks .*depth\.backend=shading"):
+        ScopeNetDepth.from_file()
+    with pytest.raises(WeightsError, match=r"names .*other\.safetensors, which is no file"):
+        ScopeNetDepth.from_file(str(tmp_path / "other.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"head.bias": None}, r"1 missing \(head\.bias"),
+        ({"more.weight": torch.zeros(3)}, r"1 unknown \(more\.weight"),
+        ({"head.bias": torch.zeros(5)}, r"1 of another shape \(head\.bias"),
+        ({"head.bias": torch.tensor([0.0, math.nan])}, r"1 not finite \(head\.bias"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(changes: dict[str, Any], complaint: str, tmp_path: Path) -> None:
+    wrong = _saved(tmp_path / "wrong.safetensors", **changes)
+    with pytest.raises(WeightsError, match=complaint):
+        ScopeNetDepth.from_file(str(wrong))
+
+
+def test_weights_of_another_architecture_and_rubbish_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="do not fit ScopeNet"):
+        load_network(_saved(tmp_path / "small.safetensors", _small()))
+    rubbish = tmp_path / "rubbish.safetensors"
+    rubbish.write_bytes(b"rubbish")
+    with pytest.raises(WeightsError, match="cannot load ScopeNet from"):
+        load_network(rubbish)
+
+
+def test_training_s_counters_may_be_left_out(tmp_path: Path) -> None:
+    names = [name for name in ScopeNet().state_dict() if name.endswith("num_batches_tracked")]
+    assert names
+    load_network(_saved(tmp_path / "bare.safetensors", **dict.fromkeys(names)))
+
+
+def test_its_millimetres_are_its_anchor_unless_another_is_asked_for(frame: Frame) -> None:
+    estimate = ScopeNetDepth(_small(), device="cpu").estimate(frame)
+    lit = replace(frame, rgb=np.full_like(frame.rgb, 120))
+    own = create_anchor(DepthSettings(backend="scopenet"), "cpu")
+    np.testing.assert_array_equal(own.depth_mm(estimate, lit), estimate.values)
+    assert own.description == "millimetres as scopenet gives them"
+    shaded = create_anchor(DepthSettings(backend="scopenet", anchor="shading", shading_median_mm=50.0), "cpu")
+    metric = shaded.metric(estimate, lit)
+    assert shaded.description == "shading prior, median distance 50 mm"
+    factor = np.nanmedian(metric.depth_mm / estimate.values)
+    assert factor != pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(metric.depth_mm, factor * estimate.values, rtol=1e-5)
+    assert metric.sigma_mm is not None
+    np.testing.assert_allclose(metric.sigma_mm, factor * estimate.sigma, rtol=1e-5)
+
+
+def test_the_paper_names_its_own_depth() -> None:
+    assert Config.load("paper").depth.backend == "depth-anything"
+
+
+def test_what_was_given_is_not_changed_by_the_answer(frame: Frame) -> None:
+    before = copy.deepcopy(frame)
+    ScopeNetDepth(_small(), device="cpu").estimate(frame)
+    np.testing.assert_array_equal(frame.rgb, before.rgb)
+    np.testing.assert_array_equal(frame.valid, before.valid)
