@@ -1,0 +1,104 @@
+"""The training loop on a handful of drawn scenes: it learns, goes on where it was stopped, exports what it learnt."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from drawn_buffers import HEIGHT, WIDTH, sphere
+from safetensors.torch import load_file
+
+from scopemap.depth.scopenet.network import ScopeNet
+from training.buffers import create_store, open_store
+from training.evaluate import score_pictures
+from training.export import export
+from training.recipe import Part, Recipe
+from training.report import write_report
+from training.train import Training
+
+SMALL = Part("small", WIDTH, HEIGHT, 4, 2, 1.0)
+HELD_OUT = Part("held-out", WIDTH, HEIGHT, 3, 2, 0.0)
+RECIPE = Recipe(steps=4, check_every=2, warm_up=1, ema=0.5, parts=(SMALL,), held_out=HELD_OUT)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    for part in (SMALL, HELD_OUT):
+        store = create_store(folder / part.name, part.count, (HEIGHT, WIDTH))
+        for n in range(part.count):
+            slope = np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32) * (n + 1)
+            wall = sphere(20.0 + 10 * n)
+            store.put(n, replace(wall, log_distance=wall.log_distance + slope))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(scenes, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return Training(RECIPE, scenes, folder, "cpu", lambda text: None).run(), folder
+
+
+def test_a_stopped_training_goes_on_to_the_same_weights(scenes, whole, tmp_path):
+    def stop(text: str) -> None:
+        raise KeyboardInterrupt(text)
+
+    with pytest.raises(KeyboardInterrupt, match="step 2 of 4"):
+        Training(RECIPE, scenes, tmp_path, "cpu", stop).run()
+    said = []
+    network = Training(RECIPE, scenes, tmp_path, "cpu", said.append).run()
+    assert said[0] == "going on from step 2"
+    for (name, value), other in zip(network.state_dict().items(), whole[0].state_dict().values(), strict=True):
+        assert torch.equal(value, other), name
+    steps = [row["step"] for row in csv.DictReader((tmp_path / "log.csv").open())]
+    assert steps == ["2", "4"]
+
+
+def test_another_recipe_does_not_go_on_with_a_checkpoint(scenes, whole):
+    with pytest.raises(SystemExit, match="another recipe"):
+        Training(replace(RECIPE, rate=1e-3), scenes, whole[1], "cpu", lambda text: None).run()
+
+
+def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
+    recipe = replace(RECIPE, steps=40, check_every=20)
+    Training(recipe, scenes, tmp_path, "cpu", lambda text: None).run()
+    rows = list(csv.DictReader((tmp_path / "log.csv").open()))
+    assert float(rows[-1]["l1"]) < 0.9 * float(rows[0]["l1"])
+
+
+def test_the_exported_file_holds_the_network_in_half_precision(whole, tmp_path):
+    network, _ = whole
+    export(network, tmp_path / "net.safetensors", {"seed": "0"})
+    tensors = load_file(tmp_path / "net.safetensors")
+    assert {t.dtype for t in tensors.values()} == {torch.float16, torch.int64}
+    again = ScopeNet()
+    again.load_state_dict({name: t.float() for name, t in tensors.items()})
+    planes = torch.randn(1, 8, 32, 32)
+    assert torch.allclose(again.eval()(planes), network(planes), atol=0.02)
+
+
+def test_the_report_says_every_kind_that_was_there(whole, scenes):
+    network, folder = whole
+    said = []
+    write_report(network, open_store(scenes / "held-out"), folder, said.append)
+    assert [line.split()[0] for line in said] == ["all", "colon"]
+    assert (folder / "curves.png").stat().st_size > 1000
+
+
+def test_a_constant_is_right_about_a_sphere_but_for_its_size(tmp_path):
+    class Constant(torch.nn.Module):
+        def forward(self, planes):
+            return torch.stack([torch.full_like(planes[:, 0], np.log(33.0)), planes[:, 3]], 1)
+
+    store = create_store(tmp_path, 1, (HEIGHT, WIDTH))
+    store.put(0, sphere(30.0))
+    score = score_pictures(Constant(), store)[0]
+    assert score.abs_rel == pytest.approx(0, abs=1e-5)
+    assert score.delta == 1
+    assert score.unscaled == pytest.approx(0.1, abs=1e-3)
+
+
+def test_recipes_survive_the_way_through_a_file(tmp_path):
+    (tmp_path / "recipe.toml").write_text(RECIPE.toml())
+    assert Recipe.read(tmp_path / "recipe.toml") == RECIPE

@@ -1,0 +1,223 @@
+"""From the bare buffers of a scene to linear light at the lens: tissue, paint, wetness and one or two lamps, at random.
+
+Irradiance from a lamp beside the lens falls as cosine over squared distance. What comes back is a diffuse part, a wet
+coat that mirrors the lamp (sharp where the film is calm, broad where it is not) and light that bounced between walls.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+
+from training.buffers import Buffers
+
+INSTRUMENT = 7
+_PARTS = 8
+_TISSUES = np.array(
+    [
+        [0.64, 0.27, 0.17],
+        [0.62, 0.36, 0.24],
+        [0.52, 0.20, 0.16],
+        [0.30, 0.07, 0.06],
+        [0.66, 0.42, 0.18],
+        [0.60, 0.44, 0.36],
+        [0.70, 0.34, 0.30],
+        [0.45, 0.13, 0.10],
+        [0.72, 0.60, 0.50],
+    ]
+)
+
+
+class Light(NamedTuple):
+    """How a scene is lit and painted; drawn by `draw_light`.
+
+    Attributes
+    ----------
+    tints : (8, 3) linear RGB of each part. gloss : (8,) strength of mirroring of each part.
+    mottling : (5,) strength of each period of noise. tone : (3,) how mottling colours.
+    vessels : (2, 2) width (in units of the noise) and depth of colour. vessel_rgb : (3,).
+    stains : (2, 5) threshold (in units of the noise, above 1: none), softness, RGB that it multiplies by.
+    lamps : (2,) brightness. fall : (4,) powers of distance and cosine, of the lamp's own axis, least cosine.
+    coat : (5,) sharpness and strength of the sharp, then of the broad coat; tilt of the film.
+    """
+
+    tints: np.ndarray
+    gloss: np.ndarray
+    mottling: np.ndarray
+    tone: np.ndarray
+    vessels: np.ndarray
+    vessel_rgb: np.ndarray
+    stains: np.ndarray
+    lamps: np.ndarray
+    fall: np.ndarray
+    coat: np.ndarray
+
+
+def draw_light(rng: np.random.Generator) -> Light:
+    """Return a random light and paint: mostly mild textures, seldom strong ones, wet and dry."""
+    base = _TISSUES[rng.integers(len(_TISSUES))] * rng.uniform(0.75, 1.25, 3)
+    other = _TISSUES[rng.integers(len(_TISSUES), size=_PARTS)] * rng.uniform(0.7, 1.3, (_PARTS, 3))
+    # Parts of one organ look alike, organs do not.
+    alike = rng.random((_PARTS, 1)) if rng.random() < 0.5 else rng.uniform(0.7, 1.0, (_PARTS, 1))
+    tints = alike * base + (1 - alike) * other
+    tints[0] = base
+    tints[INSTRUMENT] = _instrument(rng)
+    wetness = rng.choice([0.0, rng.uniform(0, 1), rng.uniform(0.5, 2.0)], p=[0.15, 0.5, 0.35])
+    gloss = wetness * rng.uniform(0.7, 1.3, _PARTS)
+    gloss[INSTRUMENT] = rng.uniform(0.2, 3.0)
+    strength = rng.choice([0.0, rng.uniform(0, 1.0), rng.uniform(1.0, 2.2)], p=[0.1, 0.65, 0.25])
+    vessels = np.stack([rng.uniform(0.02, 0.12, 2), strength * rng.uniform(0, 1.0, 2) * (rng.random(2) < 0.7)], -1)
+    broad = rng.uniform(0.0, 0.35) if rng.random() < 0.4 else 0.0
+    return Light(
+        tints=np.clip(tints, 0.01, 0.95),
+        gloss=gloss,
+        mottling=strength * rng.uniform(0, 1, 5) * np.array([0.5, 0.5, 0.4, 0.4, 0.4]),
+        tone=rng.uniform(-0.3, 0.1, 3) * [0.2, 1, 1],
+        vessels=vessels,
+        vessel_rgb=rng.uniform([0.6, 0.25, 0.3], [0.9, 0.6, 0.7]),
+        stains=np.stack([_blood(rng), _mucus(rng)]),
+        lamps=np.array([1.0, rng.uniform(0.3, 1.0)]),
+        fall=np.array([rng.uniform(1.8, 2.15), rng.uniform(0.6, 1.15), rng.uniform(0, 2.0), rng.uniform(0.0, 0.08)]),
+        coat=np.array(
+            [np.exp(rng.uniform(3.0, 7.3)), rng.uniform(0.3, 4.0), rng.uniform(2, 15), broad, rng.uniform(0.02, 0.5)]
+        ),
+    )
+
+
+def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
+    """Return linear light (H, W, 3) float32 before exposure, the median of what is lit being about 1; 0 = nothing hit.
+
+    bounce : share of the light that comes by way of other walls, 0..0.6.
+    """
+    distance_mm = np.exp(buffers.log_distance)
+    out = np.zeros((*distance_mm.shape, 3), np.float32)
+    albedo = np.zeros_like(out)
+    _shade(
+        distance_mm,
+        buffers.rays,
+        buffers.normal,
+        buffers.noise,
+        buffers.part,
+        buffers.lit,
+        buffers.lamps_mm.astype(np.float64),
+        light,
+        out,
+        albedo,
+    )
+    lit = brightest(out)
+    level = float(np.median(lit[lit > 0])) if (lit > 0).any() else 1.0
+    out /= np.float32(max(level, 1e-12))
+    if bounce > 0:
+        out += np.float32(bounce) * albedo * _bounced(out)
+    return out
+
+
+def brightest(light: np.ndarray) -> np.ndarray:
+    """Return the largest channel (H, W) of (H, W, 3); numpy's own maximum along a short axis is slow."""
+    return np.maximum(np.maximum(light[..., 0], light[..., 1]), light[..., 2])
+
+
+def _bounced(light: np.ndarray) -> np.ndarray:
+    """Light that arrives from the walls around, (H, W, 3): a wide mean of what they send out."""
+    height, width = light.shape[:2]
+    small = cv2.resize(np.minimum(light, 8.0), (max(width // 8, 4), max(height // 8, 4)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), 2.5), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _instrument(rng: np.random.Generator) -> np.ndarray:
+    grey = rng.choice([rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.8)])
+    return grey * rng.uniform(0.9, 1.1, 3)
+
+
+def _blood(rng: np.random.Generator) -> np.ndarray:
+    threshold = rng.uniform(0.05, 0.5) if rng.random() < 0.12 else 2.0
+    return np.array([threshold, rng.uniform(0.05, 0.3), 0.55, rng.uniform(0.05, 0.2), rng.uniform(0.04, 0.15)])
+
+
+def _mucus(rng: np.random.Generator) -> np.ndarray:
+    threshold = rng.uniform(0.1, 0.5) if rng.random() < 0.2 else 2.0
+    return np.array([threshold, rng.uniform(0.02, 0.3), 1.15, rng.uniform(1.2, 2.0), rng.uniform(0.8, 2.2)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _paint(noise, part, light, rgb):  # type: ignore[no-untyped-def]
+    """Write the albedo of a pixel into rgb (3,)."""
+    mottling = 0.0
+    for k in range(5):
+        mottling += light.mottling[k] * noise[k]
+    red, brightness = noise[0] + noise[1], np.exp(mottling)
+    for c in range(3):
+        rgb[c] = light.tints[part, c] * brightness * max(1.0 + light.tone[c] * red, 0.2)
+    if part == INSTRUMENT:
+        for c in range(3):
+            rgb[c] = light.tints[part, c]
+        return
+    for k in range(2):
+        width, depth = light.vessels[k, 0], light.vessels[k, 1]
+        if depth > 0:
+            away = noise[5 + k] / width
+            if abs(away) < 2.5:
+                stain = depth * np.exp(-away * away) * min(max(0.5 + 2.0 * noise[1 - k], 0.0), 1.0)
+                for c in range(3):
+                    rgb[c] *= 1.0 - min(stain, 1.0) * (1.0 - light.vessel_rgb[c])
+    for k in range(2):
+        here = (noise[1] if k == 0 else noise[7]) + 0.5 * noise[2] + 0.25 * noise[3]
+        share = min(max((here - light.stains[k, 0]) / light.stains[k, 1], 0.0), 1.0)
+        if share > 0:
+            for c in range(3):
+                rgb[c] *= 1.0 + share * (light.stains[k, 2 + c] - 1.0)
+    for c in range(3):
+        rgb[c] = min(rgb[c], 0.98)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _mirrored(normal, noise, tilt, view, towards):  # type: ignore[no-untyped-def]
+    """Cosine between the wavy film's normal and the direction half way between the eye and the lamp."""
+    total, square, length = 0.0, 0.0, 0.0
+    for c in range(3):
+        wavy = normal[c] + tilt * (noise[2 + c] + noise[(3 + 2 * c) % 5])
+        half = towards[c] - view[c]
+        total, square, length = total + wavy * half, square + wavy * wavy, length + half * half
+    return max(total / np.sqrt(square * length + 1e-12), 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, out, albedo):  # type: ignore[no-untyped-def]
+    """Fill out and albedo (H, W, 3)."""
+    towards = np.empty(3)
+    for row in range(distance.shape[0]):
+        for column in range(distance.shape[1]):
+            reach = distance[row, column]
+            if not reach > 0:
+                continue
+            view, normal, noise = rays[row, column], normals[row, column], noises[row, column]
+            part, rgb = parts[row, column], albedo[row, column]
+            _paint(noise, part, light, rgb)
+            wet = light.gloss[part] * min(max(0.4 + 2.0 * noise[7], 0.0), 1.5)
+            for n in range(2):
+                seen = lit[row, column, n] * light.lamps[n]
+                if seen <= 0:
+                    continue
+                square, cosine = 0.0, 0.0
+                for c in range(3):
+                    towards[c] = lamps_mm[n, c] - reach * view[c]
+                    square += towards[c] * towards[c]
+                way = np.sqrt(square)
+                for c in range(3):
+                    towards[c] /= way
+                    cosine += towards[c] * normal[c]
+                axis = max(-towards[2], 0.05)
+                power = seen * np.exp(light.fall[2] * np.log(axis) - light.fall[0] * np.log(way))
+                diffuse = power * max(cosine, light.fall[3]) ** light.fall[1]
+                mirror = 0.0
+                if wet > 0:
+                    logarithm = np.log(_mirrored(normal, noise, light.coat[4], view, towards) + 1e-6)
+                    if light.coat[0] * logarithm > -8:
+                        mirror = light.coat[1] * np.exp(light.coat[0] * logarithm)
+                    if light.coat[3] > 0:
+                        mirror += light.coat[3] * np.exp(light.coat[2] * logarithm)
+                for c in range(3):
+                    out[row, column, c] += diffuse * rgb[c] + power * wet * mirror

@@ -1,0 +1,95 @@
+"""A training sample: buffers lit, painted and photographed anew each time they are used, and what is true of them."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import MaskSettings
+from scopemap.depth.scopenet.planes import input_planes
+from scopemap.frame import Frame
+from scopemap.masking import Masker
+from training.buffers import Buffers, Store
+from training.light import draw_light, shade
+from training.sensor import take_picture
+
+_RAYS_UNKNOWN_SHARE = 0.15
+_MASKED_SHARE = 0.7
+_FIELD_OF_VIEW_ERROR = 0.02
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One picture with its truth.
+
+    Attributes
+    ----------
+    rgb : (H, W, 3) uint8. valid : (H, W) bool, as the masker or the field of view says.
+    rays : (H, W, 3) float32 true unit rays. told_rays : what the network is told of them, None = nothing.
+    log_distance : (H, W) float32, ln of mm along the ray, NaN = unknown or outside the field of view.
+    """
+
+    rgb: np.ndarray
+    valid: np.ndarray
+    rays: np.ndarray
+    told_rays: np.ndarray | None
+    log_distance: np.ndarray
+
+    @property
+    def planes(self) -> np.ndarray:
+        """The network's input (8, H, W) float32."""
+        return input_planes(self.rgb, self.told_rays, self.valid)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """N samples of one size: planes (N, 8, H, W), log_distance (N, H, W), rays (N, 3, H, W), all float32."""
+
+    planes: np.ndarray
+    log_distance: np.ndarray
+    rays: np.ndarray
+
+
+def make_sample(buffers: Buffers, rng: np.random.Generator) -> Sample:
+    """Return a random picture of a scene; equal generators give equal samples."""
+    rgb, field = take_picture(shade(buffers, draw_light(rng), _bounce(rng)), rng)
+    valid = field & np.isfinite(buffers.log_distance)
+    if rng.random() < _MASKED_SHARE:
+        height, width = field.shape
+        camera = PinholeCamera(width, width, width / 2, height / 2, width, height)
+        valid = Masker(MaskSettings())(Frame(0, 0.0, rgb, camera, np.ones_like(field))).valid
+    rays, log_distance = buffers.rays, np.where(field, buffers.log_distance, np.float32(np.nan))
+    for axis in (0, 1):
+        if rng.random() < 0.5:
+            rgb, valid, rays, log_distance = (np.flip(image, axis) for image in (rgb, valid, rays, log_distance))
+            rays = rays * np.where(np.arange(3) == 1 - axis, np.float32(-1), np.float32(1))
+    return Sample(np.ascontiguousarray(rgb), valid, rays, _told(rays, rng), log_distance)
+
+
+def _bounce(rng: np.random.Generator) -> float:
+    return rng.uniform(0, 0.6) if rng.random() < 0.6 else 0.0
+
+
+def _told(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """The rays as a user's calibration gives them: a little off, or not at all."""
+    if rng.random() < _RAYS_UNKNOWN_SHARE:
+        return None
+    told = rays * np.array([1, 1, np.exp(rng.normal(0, _FIELD_OF_VIEW_ERROR))], np.float32)
+    return told / np.linalg.norm(told, axis=-1, keepdims=True)
+
+
+def make_batch(store: Store, indices: np.ndarray, seed: tuple[int, ...], pool: ThreadPoolExecutor) -> Batch:
+    """Return the batch of buffers `indices`; sample n is drawn by (*seed, n), whichever thread makes it."""
+
+    def sample(n: int) -> Sample:
+        return make_sample(store[int(indices[n])], np.random.default_rng((*seed, n)))
+
+    samples = list(pool.map(sample, range(len(indices))))
+    return Batch(
+        np.stack([s.planes for s in samples]),
+        np.stack([s.log_distance for s in samples]),
+        np.stack([s.rays.transpose(2, 0, 1) for s in samples]),
+    )
