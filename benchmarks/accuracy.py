@@ -28,6 +28,7 @@ HEADER = (
     "|---|---|---|---|---|---|---|---|---|"
 )
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
+SHADING = {"depth.backend": "shading"}
 NO_SURFACE = {"fusion.enabled": False}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -73,8 +74,10 @@ def real_runs(data: Path) -> Iterator[Run]:
     yield Run("cecum_t1_a, Depth Anything files, near-far, RAFT small, LPIPS", cecum, "sim3", files | near_far | raft)
     yield Run("the same, DIS, structural similarity", cecum, "sim3", files | near_far | LIGHT)
     yield Run("the same, anchored by shading", cecum, "sim3", files | {"depth.anchor": "shading"} | LIGHT)
-    yield Run("cecum_t1_a, embedded shading, RAFT small, LPIPS", cecum, "sim3", raft)
-    yield Run("cecum_t1_a, embedded shading, DIS, structural similarity", cecum, "sim3", LIGHT)
+    yield Run("cecum_t1_a, scopenet, RAFT small, LPIPS", cecum, "sim3", raft)
+    yield Run("cecum_t1_a, scopenet, DIS, structural similarity", cecum, "sim3", LIGHT)
+    yield Run("cecum_t1_a, shading, RAFT small, LPIPS", cecum, "sim3", SHADING | raft)
+    yield Run("cecum_t1_a, shading, DIS, structural similarity", cecum, "sim3", SHADING | LIGHT)
     yield Run(
         "trans_t1_a, true depth", trans, "se3", {"depth.backend": f"files:{trans}", "fusion.min_weight": 0.5} | LIGHT
     )
@@ -97,7 +100,8 @@ def phantom_runs(folder: Path, data: Path) -> Iterator[Run]:
         source = folder / f"phantom{number}"
         write_phantom(spec, source)
         yield Run(f"{name}, true depth", source, "origin", {"depth.backend": f"files:{source}"} | LIGHT)
-        yield Run(f"{name}, embedded shading", source, "sim3", LIGHT)
+        yield Run(f"{name}, scopenet", source, "sim3", LIGHT)
+        yield Run(f"{name}, shading", source, "sim3", SHADING | LIGHT)
 
 
 def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:

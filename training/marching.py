@@ -188,8 +188,8 @@ def trace(scene, eye, d, start, step, far, slope):
             return t, slope
         go = max(step * f, 4e-4 * t)
         if f < 0.03 * t and slope > 0.0:
-            # Near the surface go to where the chord meets it.
-            go = max(go, min(f / slope, 3.0 * f))
+            # Near the surface go to where the chord meets it, but not through what is thin.
+            go = max(go, min(f / slope, 3.0 * f if f < 0.006 * t else f))
         before, f_before = t, f
         t += go
         if t > far:

@@ -6,11 +6,13 @@ Every frame is made from its own random stream (seed, index), so it does not mat
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +161,18 @@ def render_store(
             progress(finished, count)
 
 
+def _end_with_parent() -> None:
+    """Make this worker end when the process that started it is killed; else it would wait for work for ever."""
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _chunks_done(
     folder: str, chunks: list[list[int]], seed: int, size: tuple[int, int], workers: int
 ) -> Iterator[list[int]]:
@@ -166,7 +180,7 @@ def _chunks_done(
         yield from (_render_chunk(folder, chunk, seed, size) for chunk in chunks)
         return
     # Spawned, not forked: the caller may hold threads.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
         waiting = [pool.submit(_render_chunk, folder, chunk, seed, size) for chunk in chunks]
         for done in as_completed(waiting):
             yield done.result()

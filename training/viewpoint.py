@@ -56,6 +56,7 @@ def random_view(scene: Scene, rng: np.random.Generator, width: int, height: int)
     """Return a random view of a scene, or None where the draw is no good: draw again."""
     camera = random_camera(rng, width, height)
     arrays = scene.arrays()
+    ahead: np.ndarray | None
     if scene.kind == COLON:
         eye, ahead = _in_colon(scene, rng)
     elif scene.kind in (LAPAROSCOPY, WALL):
