@@ -9,17 +9,19 @@ import torch
 from drawn_buffers import HEIGHT, WIDTH, sphere
 from safetensors.torch import load_file
 
-from scopemap.depth.scopenet.network import ScopeNet
-from training.buffers import create_store, open_store
+from scopemap.depth.scopenet.network import TYPICAL_LOG_MM, ScopeNet
+from training.buffers import create_store, open_store, thinned
+from training.calibrate import calibrated, fit_calibration
 from training.evaluate import score_pictures
 from training.export import export
-from training.recipe import Part, Recipe
+from training.recipe import Part, Recipe, Use
 from training.report import write_report
 from training.train import Training
 
-SMALL = Part("small", WIDTH, HEIGHT, 4, 2, 1.0)
-HELD_OUT = Part("held-out", WIDTH, HEIGHT, 3, 2, 0.0)
-RECIPE = Recipe(steps=4, check_every=2, warm_up=1, ema=0.5, parts=(SMALL,), held_out=HELD_OUT)
+SMALL = Part("small", WIDTH, HEIGHT, 4)
+HELD_OUT = Part("held-out", WIDTH, HEIGHT, 3)
+USES = (Use("small", 2, 3, 1.0, 0.0, 0.5), Use("small", 1, 2, 1.0, 0.5, 1.0))
+RECIPE = Recipe(steps=4, check_every=2, warm_up=1, ema=0.5, parts=(SMALL,), uses=USES, held_out=HELD_OUT)
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +80,29 @@ def test_the_exported_file_holds_the_network_in_half_precision(whole, tmp_path):
     assert torch.allclose(again.eval()(planes), network(planes), atol=0.02)
 
 
+def test_calibration_stretches_a_compressed_range_and_rights_the_spread(scenes):
+    class Compressed(ScopeNet):
+        """Knows the truth of every drawn scene but says it with half the range, and a spread far too large."""
+
+        def forward(self, planes):
+            slope = torch.linspace(-0.5, 0.5, WIDTH).expand(planes.shape[0], HEIGHT, WIDTH)
+            said = 3.0 + 0.5 * slope * torch.sign(planes[:, 4].mean((1, 2)) + 0.5)[:, None, None]
+            raw = torch.stack([said - TYPICAL_LOG_MM, torch.zeros_like(said) + 2.0], 1)
+            raw = raw * self.head.weight[:, 0, 1, 1, None, None] + self.head.bias[:, None, None]
+            return raw + torch.tensor([TYPICAL_LOG_MM, 0.0])[:, None, None]
+
+    network = Compressed()
+    with torch.no_grad():
+        network.head.weight.fill_(1.0)
+    fitted = fit_calibration(network, [open_store(scenes / "small")])
+    before = network(torch.zeros(1, 8, HEIGHT, WIDTH))
+    after = calibrated(network, fitted)(torch.zeros(1, 8, HEIGHT, WIDTH))
+    assert fitted.exponent > 1.5
+    assert fitted.spread < 0.2
+    expected = fitted.pivot + fitted.exponent * (before[0, 0] - fitted.pivot)
+    assert torch.allclose(after[0, 0], expected, atol=1e-5)
+
+
 def test_the_report_says_every_kind_that_was_there(whole, scenes):
     network, folder = whole
     said = []
@@ -97,6 +122,20 @@ def test_a_constant_is_right_about_a_sphere_but_for_its_size(tmp_path):
     assert score.abs_rel == pytest.approx(0, abs=1e-5)
     assert score.delta == 1
     assert score.unscaled == pytest.approx(0.1, abs=1e-3)
+
+
+def test_thinned_buffers_keep_every_ray_with_its_distance():
+    whole = sphere()
+    half = thinned(whole, 2)
+    assert half.size == (HEIGHT // 2, WIDTH // 2)
+    assert np.allclose(half.rays, whole.rays[::2, ::2], atol=1e-6)
+    assert (half.log_distance == whole.log_distance[::2, ::2]).all()
+    assert thinned(whole, 1) is whole
+
+
+def test_coarse_pictures_come_first():
+    assert [use.stride for use in RECIPE.uses_at(1)] == [2]
+    assert [use.stride for use in RECIPE.uses_at(2)] == [1]
 
 
 def test_recipes_survive_the_way_through_a_file(tmp_path):

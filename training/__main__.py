@@ -26,6 +26,7 @@ def main() -> int:
     import torch
 
     from training.buffers import open_store
+    from training.calibrate import calibrated, fit_calibration
     from training.export import export
     from training.recipe import Recipe
     from training.render import render_store
@@ -44,6 +45,9 @@ def main() -> int:
         render_store(scenes / part.name, part.count, size, seed, workers=options.threads, progress=_counted(part.name))
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
     network = Training(recipe, scenes, options.out, device, _say).run(options.threads)
+    calibration = fit_calibration(network, [open_store(scenes / part.name) for part in recipe.parts])
+    _say(f"calibrated on training scenes: exponent {calibration.exponent:.3f}, spread times {calibration.spread:.3f}")
+    network = calibrated(network, calibration)
     facts = {"name": "scopenet", "licence": "Apache-2.0", "seed": str(recipe.seed), "steps": str(recipe.steps)}
     export(network, options.out / "scopenet.safetensors", facts)
     write_report(network, open_store(scenes / recipe.held_out.name), options.out, _say)

@@ -6,7 +6,7 @@ it anew at every use.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -80,6 +80,17 @@ def camera_rays(camera: np.ndarray) -> np.ndarray:
     angle = np.hypot(x, y)
     side = np.sinc(angle / np.pi)
     return np.stack([x * side, y * side, np.cos(angle)], -1)
+
+
+def thinned(buffers: Buffers, stride: int) -> Buffers:
+    """Return every `stride`-th pixel of a frame, with the camera that sees just these."""
+    if stride == 1:
+        return buffers
+    images = {name: getattr(buffers, name)[::stride, ::stride] for name in _ARRAYS}
+    height, width = images["part"].shape
+    model, fx, fy, cx, cy, _, _ = buffers.camera
+    camera = np.array([model, fx / stride, fy / stride, cx / stride, cy / stride, width, height], np.float32)
+    return replace(buffers, camera=camera, **images)
 
 
 def encode(buffers: Buffers) -> dict[str, np.ndarray]:

@@ -128,8 +128,9 @@ def _bounced(light: np.ndarray) -> np.ndarray:
 
 
 def _instrument(rng: np.random.Generator) -> np.ndarray:
-    grey = rng.choice([rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.8)])
-    return grey * rng.uniform(0.9, 1.1, 3)
+    """Black plastic, bare metal, or coated shafts, which are bluish as often as not."""
+    grey = rng.choice([rng.uniform(0.02, 0.1), rng.uniform(0.1, 0.8)])
+    return grey * rng.uniform([0.7, 0.85, 0.95], [1.1, 1.1, 1.5])
 
 
 def _blood(rng: np.random.Generator) -> np.ndarray:

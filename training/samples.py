@@ -12,7 +12,7 @@ from scopemap.config import MaskSettings
 from scopemap.depth.scopenet.planes import input_planes
 from scopemap.frame import Frame
 from scopemap.masking import Masker
-from training.buffers import Buffers, Store
+from training.buffers import Buffers, Store, thinned
 from training.light import draw_light, shade
 from training.sensor import take_picture
 
@@ -81,11 +81,13 @@ def _told(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     return told / np.linalg.norm(told, axis=-1, keepdims=True)
 
 
-def make_batch(store: Store, indices: np.ndarray, seed: tuple[int, ...], pool: ThreadPoolExecutor) -> Batch:
-    """Return the batch of buffers `indices`; sample n is drawn by (*seed, n), whichever thread makes it."""
+def make_batch(
+    store: Store, indices: np.ndarray, seed: tuple[int, ...], pool: ThreadPoolExecutor, *, stride: int = 1
+) -> Batch:
+    """Return the batch of buffers `indices`, every `stride`-th pixel; sample n is drawn by (*seed, n)."""
 
     def sample(n: int) -> Sample:
-        return make_sample(store[int(indices[n])], np.random.default_rng((*seed, n)))
+        return make_sample(thinned(store[int(indices[n])], stride), np.random.default_rng((*seed, n)))
 
     samples = list(pool.map(sample, range(len(indices))))
     return Batch(

@@ -48,7 +48,7 @@ class Training:
             waiting = ahead.submit(self._draw, self._step, pool)
             while self._step < self.recipe.steps:
                 batch = waiting.result()
-                waiting = ahead.submit(self._draw, self._step + 1, pool)
+                waiting = ahead.submit(self._draw, min(self._step + 1, self.recipe.steps - 1), pool)
                 sums.append(self._update(batch))
                 self._step += 1
                 if self._step % self.recipe.check_every == 0 or self._step == self.recipe.steps:
@@ -58,10 +58,12 @@ class Training:
 
     def _draw(self, step: int, pool: ThreadPoolExecutor) -> Batch:
         rng = np.random.default_rng((self.recipe.seed, 1, step))
-        parts = self.recipe.parts
-        part = parts[rng.choice(len(parts), p=[p.share for p in parts])]
-        indices = rng.integers(len(self._stores[part.name]), size=part.batch)
-        return make_batch(self._stores[part.name], indices, (self.recipe.seed, 2, step), pool)
+        uses = self.recipe.uses_at(step)
+        shares = np.array([use.share for use in uses])
+        use = uses[rng.choice(len(uses), p=shares / shares.sum())]
+        store = self._stores[use.part]
+        indices = rng.integers(len(store), size=use.batch)
+        return make_batch(store, indices, (self.recipe.seed, 2, step), pool, stride=use.stride)
 
     def _update(self, batch: Batch) -> dict[str, float]:
         for group in self._optimiser.param_groups:

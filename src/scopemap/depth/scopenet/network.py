@@ -19,7 +19,7 @@ WIDTHS = (24, 48, 80, 128, 160)
 _BLOCKS = (1, 2, 2, 3, 2)
 _HEAD = 16
 _STRIDE = 32
-_TYPICAL_LOG_MM = 3.4  # 30 mm: the network starts from there
+TYPICAL_LOG_MM = 3.4  # 30 mm: the network starts from there
 _SPREAD_RANGE = (-5.0, 1.0)
 
 
@@ -98,7 +98,7 @@ class ScopeNet(nn.Module):
         x = functional.interpolate(self.from_coarse(x), scale_factor=2.0, mode="bilinear")
         x = functional.relu(self.detail(functional.relu(x + self.from_planes(full))))
         x = self.head(x)[..., :height, :width].float()
-        return torch.stack([x[:, 0] + _TYPICAL_LOG_MM, (x[:, 1] - 2.0).clamp(*_SPREAD_RANGE)], 1)
+        return torch.stack([x[:, 0] + TYPICAL_LOG_MM, (x[:, 1] - 2.0).clamp(*_SPREAD_RANGE)], 1)
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
