@@ -18,7 +18,7 @@ SOURCE = Path(scopemap.config.__file__).parent
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
     "mask": ["masking.py"],
-    "depth": ["depth/*.py"],
+    "depth": ["depth/*.py", "depth_range.py"],
     "mapis": ["depth/mapis.py", "pipeline.py"],
     "networks": ["pipeline.py"],
     "odometry": ["odometry/*.py"],

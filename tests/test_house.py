@@ -66,7 +66,9 @@ def _read(path: Path) -> _Module:
 
 MODULES = [_read(path) for path in sorted(SOURCE.rglob("*.py"))]
 TESTS = [_read(path) for path in sorted((ROOT / "tests").rglob("*.py"))]
-OTHERS = [_read(path) for name in ("benchmarks", "examples") for path in sorted((ROOT / name).rglob("*.py"))]
+OTHERS = [
+    _read(path) for name in ("benchmarks", "examples", "training") for path in sorted((ROOT / name).rglob("*.py"))
+]
 
 
 def _is_command(function: Function) -> bool:

@@ -13,7 +13,7 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -70,6 +70,11 @@ class DepthSettings(Settings):
     max_depth_mm: float = Field(
         300.0, gt=0, description="depth beyond this is unknown, unless measured or stated by near-far"
     )
+    exponent: Annotated[float, Field(ge=0.25, le=4)] | Literal["fit"] = Field(
+        1.0,
+        description="range of predicted depth about its median: distance^exponent; fit: from the flow, before the run",
+    )
+    exponent_frames: int = Field(80, ge=2, description="exponent = fit: how many frames at the start are looked at")
 
 
 class MapisSettings(Settings):

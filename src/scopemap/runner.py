@@ -17,6 +17,7 @@ import numpy as np
 
 from scopemap.config import Config, FusionSettings
 from scopemap.datasets import Sequence
+from scopemap.depth_range import described, fit_exponent, with_exponent
 from scopemap.errors import InputError
 from scopemap.masking import is_constant
 from scopemap.odometry import FrameTracker
@@ -49,6 +50,7 @@ def reconstruct(
     observers : called with each `Step` as it is done.
     tracker : odometry that takes the place of ours; None: as `config.odometry` says.
 
+    The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there.
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
     """
     config = config or Config()
@@ -58,16 +60,21 @@ def reconstruct(
         _refuse_own_input(Path(out), sequence, config)
         prepare_folder(Path(out), overwrite=overwrite)
         observers = (DepthWriter(Path(out), estimators.reach_mm(config.depth)), *observers)
-    sequence = _with_best_camera(sequence, estimators)
+    sequence, clock = _with_best_camera(sequence, estimators), _Clock()
+    config, exponent_note = _with_exponent(sequence, config, estimators, clock)
+    if exponent_note:
+        # Some estimators remember the first frame that they saw, and the anchor holds the settings.
+        estimators = Estimators.create(config, sequence)
     distances = _Distances()
     observers = (distances, *observers)
-    pipeline, clock = Pipeline(config, estimators, tracker), _Clock()
+    pipeline = Pipeline(config, estimators, tracker)
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
     mesh = clock.timed("mesh", pipeline.surface)
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
+    provenance["notes"] += exponent_note
     provenance["warnings"] += distances.warnings(config.fusion)
     result = Reconstruction(sequence.camera, records, mesh, config, provenance)
     if out is not None:
@@ -152,6 +159,16 @@ def _with_best_camera(sequence: Sequence, estimators: Estimators) -> Sequence:
     if first is None or focal_px is None:
         return sequence
     return sequence.with_focal(focal_px, f"estimated: Depth Pro on frame {first.index}")
+
+
+def _with_exponent(
+    sequence: Sequence, config: Config, estimators: Estimators, clock: _Clock
+) -> tuple[Config, list[str]]:
+    """Put a number where the settings ask for a fitted exponent, with a note of what was found; else change nothing."""
+    if config.depth.exponent != "fit":
+        return config, []
+    fit = clock.timed("depth exponent", fit_exponent, sequence, config, estimators.depth)
+    return with_exponent(config, fit), [described(fit, config.depth.exponent_frames)]
 
 
 def _provenance(

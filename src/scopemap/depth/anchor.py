@@ -6,7 +6,7 @@ frame to frame is the business of the consistency stage, which knows how the cam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from scopemap.config import DepthSettings
 from scopemap.depth.baseline import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
+from scopemap.depth.exponent import ray_lengths, stretched
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 
@@ -69,6 +70,9 @@ class AnchoredDepth:
     frame (`depth-pro`), the shading prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if one is
     given, else the estimate's own millimetres if it has them, else shading. Measured depth is never touched.
 
+    `settings.exponent` widens (or, below 1, narrows) the range of predicted depth before anything else: the median
+    distance along the ray of the first usable frame is the pivot, which stays, and is held too.
+
     `settings.reanchor_every` asks the reference again every so many frames: a metric network then bounds the drift.
 
     reference : the estimator that is asked where the anchor is neither the range nor the estimate itself.
@@ -82,6 +86,7 @@ class AnchoredDepth:
         self._conversion: AffineDisparity | DepthScale | None = None
         self._description = "not anchored: no usable frame yet"
         self._frames_held = 0
+        self._pivot: float | None = None
 
     @property
     def description(self) -> str:
@@ -115,8 +120,9 @@ class AnchoredDepth:
 
         Depth that is not measured is NaN too beyond `reach_mm`, where an estimate says nothing any more.
         All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
-        anchor.
+        anchor, `SettingsError` if an exponent is asked for and the estimate is no predicted depth.
         """
+        estimate = self._in_range(estimate, frame)
         self._frames_held += 1
         first_mm = self._anchor(estimate, frame) if self._is_due(estimate) else None
         if self._conversion is None:
@@ -126,6 +132,31 @@ class AnchoredDepth:
         if estimate.kind != "measured":
             depth_mm = np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
         return MetricDepth(depth_mm, sigma_mm)
+
+    def _in_range(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
+        """Return the estimate with the range that the exponent gives it; its error grows in proportion, as a share."""
+        exponent = self._settings.exponent
+        if exponent == "fit":
+            raise SettingsError("depth.exponent=fit: only a whole run can fit it, before it starts; give a number here")
+        if exponent == 1.0:
+            return estimate
+        if estimate.kind != "depth":
+            raise SettingsError(
+                f"depth.exponent={exponent:g} is for predicted depth; depth.backend={self._settings.backend} gives "
+                f"{estimate.kind}: leave it at 1"
+            )
+        if self._pivot is None:
+            distance = estimate.values * ray_lengths(frame.camera)
+            seen = distance[frame.valid & (distance > 0)]
+            if seen.size < _LEAST_SHARE * distance.size:
+                return estimate
+            self._pivot = float(np.median(seen))
+        values = stretched(estimate.values, frame.camera, exponent, self._pivot)
+        if estimate.sigma is None:
+            return replace(estimate, values=values)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sigma = (estimate.sigma * np.float32(exponent) * values / estimate.values).astype(np.float32)
+        return replace(estimate, values=values, sigma=sigma)
 
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self._conversion is None:
