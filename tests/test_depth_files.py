@@ -192,7 +192,8 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
 
 def test_the_registry_knows_its_names(tmp_path: Path) -> None:
     write(tmp_path, "0.png", ramp(np.uint8, 255))
-    assert create_depth(DepthSettings(), SAME, "cpu").name == "shading"
+    assert create_depth(DepthSettings(), SAME, "cpu").name == "scopenet"
+    assert create_depth(DepthSettings(backend="shading"), SAME, "cpu").name == "shading"
     assert isinstance(create_depth(DepthSettings(backend=f"files:{tmp_path}"), SAME, "cpu"), FilesDepth)
     assert isinstance(create_anchor(DepthSettings(), "cpu"), AnchoredDepth)
     with pytest.raises(SettingsError, match="shading, depth-anything, depth-pro or files:FOLDER"):

@@ -13,7 +13,7 @@ from tiny_phantom import write_tiny
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 PROMISED = {
-    "01_reconstruct.py": r"8 of 8 frames tracked, \d+\.\d mm\nsurface: [1-9]\d* vertices, .*\nscale: .*shading",
+    "01_reconstruct.py": r"8 of 8 frames tracked, \d+\.\d mm\nsurface: [1-9]\d* vertices, .*\nscale: .*scopenet",
     "02_evaluate.py": r"origin: ATE (0|1)\.\d+ mm.*\nse3 .*\nsim3  : ATE 0\.\d+ mm.*8 of 8 frames tracked",
     "03_depth_from_files.py": r"depth: 8 files in .* \(measured\)\n8 of 8 frames tracked\nsurface: [1-9]\d* faces",
 }

@@ -43,7 +43,7 @@ class MaskSettings(Settings):
 class DepthSettings(Settings):
     """Where depth comes from and what fixes its scale."""
 
-    backend: str = Field("shading", description="scopenet | shading | depth-anything | depth-pro | files:FOLDER")
+    backend: str = Field("scopenet", description="scopenet | shading | depth-anything | depth-pro | files:FOLDER")
     model: str = Field(
         "",
         description="weights of the networks: hub id or local folder, for scopenet a .safetensors file; empty: pinned",

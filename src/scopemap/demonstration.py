@@ -3,7 +3,7 @@
     OUT/phantom   frames, true poses, depth and surface     OUT/run   what `scopemap run` would write
     OUT/pictures  trajectory.png, mesh.png, depth.png
 
-Needs no network and no weights: shading depth, DIS flow, structural similarity.
+Needs no connection and no weights but the package's own: ScopeNet's depth, DIS flow, structural similarity.
 """
 
 from __future__ import annotations

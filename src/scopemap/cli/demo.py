@@ -29,7 +29,7 @@ def demo(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a phantom colon, reconstruct it, and compare with the truth; no network, no weights."""
+    """Render a phantom colon, reconstruct it, and compare with the truth; nothing is downloaded."""
     silent = quiet or as_json
     _tell("preparing a phantom colon; the first time kernels are compiled, too", silent)
     # Imported here, so that --help does not wait for the kernels.
