@@ -348,7 +348,10 @@ class _Telling:
 def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "images")
     create, runs = Estimators.create, {}
-    config = Config.load(settings={"networks.flow": "dis", "networks.perceptual": "structure"})
+    # Shading tells no uncertainty of its own.
+    config = Config.load(
+        settings={"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
+    )
     for name, left in {"none": None, "equal": 0.1, "doubted": 1.0}.items():
 
         def telling(config: Config, sequence: Any, left: float | None = left) -> Estimators:

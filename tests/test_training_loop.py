@@ -1,7 +1,11 @@
 """The training loop on a handful of drawn scenes: it learns, goes on where it was stopped, exports what it learnt."""
 
 import csv
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,7 @@ import torch
 from drawn_buffers import HEIGHT, WIDTH, sphere
 from safetensors.torch import load_file
 
+from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.depth.scopenet.network import TYPICAL_LOG_MM, ScopeNet
 from training.buffers import create_store, open_store, thinned
 from training.calibrate import calibrated, fit_calibration
@@ -141,3 +146,19 @@ def test_coarse_pictures_come_first():
 def test_recipes_survive_the_way_through_a_file(tmp_path):
     (tmp_path / "recipe.toml").write_text(RECIPE.toml())
     assert Recipe.read(tmp_path / "recipe.toml") == RECIPE
+
+
+def test_one_command_renders_trains_evaluates_and_exports(tmp_path):
+    small, large = Part("small", 40, 32, 6), Part("held-out", 40, 32, 4)
+    recipe = replace(RECIPE, parts=(small,), uses=(Use("small", 1, 2, 1.0),), held_out=large)
+    (tmp_path / "tiny.toml").write_text(recipe.toml())
+    command = [sys.executable, "-m", "training", "--out", "run", "--recipe", "tiny.toml", "--threads", "1"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "6 of 6 scenes rendered" in done.stdout
+    assert "calibrated on training scenes" in done.stdout
+    made = {path.name for path in (tmp_path / "run").iterdir()}
+    assert made >= {"recipe.toml", "log.csv", "curves.png", "checkpoint.pt", "held_out.json", "scopenet.safetensors"}
+    estimator = ScopeNetDepth.from_file(str(tmp_path / "run" / "scopenet.safetensors"))
+    assert estimator.provenance()["depth"] == "scopenet"
