@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,9 +69,7 @@ def score_pictures(
         )
 
     indices = np.linspace(0, len(store) - 1, min(limit or len(store), len(store))).astype(int)
-    with ThreadPoolExecutor(1) as pool:
-        scores = list(pool.map(score, indices))
-    return [s for s in scores if np.isfinite(s.abs_rel)]
+    return [found for found in map(score, indices) if np.isfinite(found.abs_rel)]
 
 
 def evaluate(network: ScopeNet, store: Store, device: str = "cpu", limit: int | None = None) -> Summary:

@@ -14,10 +14,10 @@ import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from scopemap.depth.scopenet.network import ScopeNet
-from training.buffers import Store, open_store
+from training.buffers import open_store
 from training.evaluate import evaluate
 from training.losses import Weights, loss_parts, total
-from training.recipe import Part, Recipe
+from training.recipe import Recipe
 from training.samples import Batch, make_batch
 
 Say = Callable[[str], None]
@@ -131,8 +131,3 @@ class Training:
         self._optimiser.load_state_dict(state["optimiser"])
         self._step = state["step"]
         self._say(f"going on from step {self._step}")
-
-
-def held_out_store(scenes: Path, part: Part) -> Store:
-    """Return the held-out scenes."""
-    return open_store(scenes / part.name)
