@@ -324,6 +324,16 @@ def test_shading_has_the_figures_that_the_document_states(real_data: Path) -> No
 
 
 @pytest.mark.real
+def test_the_shipped_network_has_the_figures_that_the_model_card_states(real_data: Path) -> None:
+    (maker,) = bench.networks([]).values()
+    table = bench.measure(real_data, (160, 128), {"scopenet": maker})
+    stated = {"cecum clouds": (0.075, 1.00), "trans_t1_a": (0.122, 0.86), "endonerf pulling": (0.108, 0.87)}
+    for scene, figures in stated.items():
+        score = table[scene]["scopenet"]
+        assert (score.abs_rel, score.delta) == pytest.approx(figures, abs=0.006), scene
+
+
+@pytest.mark.real
 @pytest.mark.parametrize(("scene", "count"), [("cecum clouds", 2), ("trans_t1_a", 10), ("endonerf pulling", 11)])
 def test_a_scene_is_the_same_at_twice_the_size(real_data: Path, scene: str, count: int) -> None:
     make: Callable = scenes.SCENES[scene]

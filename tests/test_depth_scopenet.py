@@ -157,10 +157,13 @@ def test_the_weights_of_the_package_are_the_default(
 
 def test_what_is_shipped_is_small_and_fits() -> None:
     shipped = Path(module.__file__).parent / WEIGHTS_NAME
-    if not shipped.exists():
-        pytest.skip("this tree holds no trained weights yet")
     assert shipped.stat().st_size <= 8_000_000
     load_network(shipped)
+
+
+def test_what_is_shipped_is_what_the_model_card_describes() -> None:
+    card = (Path(__file__).parents[1] / "docs" / "models" / "scopenet.md").read_text()
+    assert weights.sha256_of(Path(module.__file__).parent / WEIGHTS_NAME) in card
 
 
 def test_the_package_lists_its_weights() -> None:
