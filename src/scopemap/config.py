@@ -13,9 +13,9 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from scopemap.errors import SettingsError
 
@@ -70,11 +70,23 @@ class DepthSettings(Settings):
     max_depth_mm: float = Field(
         300.0, gt=0, description="depth beyond this is unknown, unless measured or stated by near-far"
     )
-    exponent: Annotated[float, Field(ge=0.25, le=4)] | Literal["fit"] = Field(
+    exponent: float | Literal["fit"] = Field(
         1.0,
         description="range of predicted depth about its median: distance^exponent; fit: from the flow, before the run",
     )
     exponent_frames: int = Field(80, ge=2, description="exponent = fit: how many frames at the start are looked at")
+
+    @field_validator("exponent", mode="before")
+    @classmethod
+    def _number_or_fit(cls, value: Any) -> Any:
+        """Refuse with one sentence; of a union pydantic would name every part."""
+        try:
+            possible = value == "fit" or 0.25 <= float(value) <= 4
+        except (TypeError, ValueError):
+            possible = False
+        if not possible:
+            raise ValueError("must be 'fit' or a number from 0.25 to 4")
+        return value
 
 
 class MapisSettings(Settings):
