@@ -94,12 +94,14 @@ def _normals(log_distance: Tensor, rays: Tensor) -> Tensor:
     """Unit normals (N, 3, H-2, W-2) of the surface exp(log_distance) * rays, by central differences."""
     middle = log_distance[:, 1:-1, 1:-1]
 
-    def relative(rows: slice, columns: slice) -> Tensor:
+    def relative(rows: slice, columns: slice) -> tuple[Tensor, ...]:
         # Over the middle's own distance: ln differences stay small, exponentials safe.
         nearness = torch.exp((log_distance[:, rows, columns] - middle).clamp(-1.5, 1.5))
-        return nearness[:, None] * rays[:, :, rows, columns]
+        return tuple(nearness * rays[:, axis, rows, columns] for axis in range(3))
 
     inner, before, after = slice(1, -1), slice(0, -2), slice(2, None)
-    along_x = relative(inner, after) - relative(inner, before)
-    along_y = relative(after, inner) - relative(before, inner)
-    return torch.nn.functional.normalize(torch.linalg.cross(along_x, along_y, dim=1), dim=1, eps=1e-9)
+    ax, ay, az = (b - a for a, b in zip(relative(inner, before), relative(inner, after), strict=True))
+    bx, by, bz = (b - a for a, b in zip(relative(before, inner), relative(after, inner), strict=True))
+    # Axis by axis: torch's cross product and norm along a short axis take twice as long on a CPU.
+    normal = torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+    return normal * torch.rsqrt((normal * normal).sum(1, keepdim=True) + 1e-12)

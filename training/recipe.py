@@ -48,7 +48,7 @@ class Recipe:
 
     seed: int = 0
     scene_seed: int = 1
-    steps: int = 3600
+    steps: int = 7500
     rate: float = 2e-3
     rate_end: float = 1e-5
     warm_up: int = 200
@@ -56,12 +56,12 @@ class Recipe:
     ema: float = 0.998
     clip: float = 1.0
     check_every: int = 300
-    parts: tuple[Part, ...] = (Part("small", 160, 128, 10000), Part("large", 320, 256, 1500))
+    parts: tuple[Part, ...] = (Part("small", 160, 128, 18000), Part("large", 320, 256, 1500))
     # Coarse pictures first: the shape of a whole picture is learnt four times as fast from a quarter of its pixels.
     uses: tuple[Use, ...] = (
         Use("small", 2, 32, 1.0, 0.0, 0.6),
-        Use("small", 1, 16, 0.7, 0.6, 1.0),
-        Use("large", 1, 4, 0.3, 0.6, 1.0),
+        Use("small", 1, 16, 0.6, 0.6, 1.0),
+        Use("large", 1, 4, 0.4, 0.6, 1.0),
     )
     held_out: Part = Part("held-out", 160, 128, 300)
 

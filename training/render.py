@@ -29,7 +29,7 @@ _NEAREST_MM, _FARTHEST_MM = 2.0, 400.0
 _MEDIANS_MM = {COLON: (6, 90), BAG: (8, 130), AIRWAY: (6, 60), SINUS: (6, 100), LAPAROSCOPY: (16, 150), WALL: (6, 120)}
 _SCENES, _VIEWS = 200, 6
 _CHUNK = 16
-_MOST_MISSED, _MOST_TOOL = 0.02, 0.6
+_MOST_MISSED, _MOST_TOOL, _MOST_UNLIT = 0.02, 0.6, 0.2
 
 
 def render_buffers(seed: int, index: int, width: int, height: int, *, kind: int | None = None) -> Buffers:
@@ -70,6 +70,8 @@ def _rendered(scene: Scene, view: View, rng: np.random.Generator) -> Buffers | N
     normal = turned(normal, view.turn.T)
     lamps_mm = _random_lamps(rng, scale * float(np.nanmedian(distances)))
     lit = _lit(arrays, view, (rays, distances, normal), lamps_mm / scale, rng)
+    if unlit_share(scale * distances[..., None] * rays, normal, lit, lamps_mm) > _MOST_UNLIT:
+        return None
     return Buffers(
         log_distance=np.log(scale * distances).astype(np.float32),
         normal=normal.astype(np.float32),
@@ -126,6 +128,16 @@ def _lit(
             shade_shadows(arrays, place, seen, np.ascontiguousarray(lamps[n]), view.step, soft, out)
             lit[..., n] = out
     return np.clip(lit, 0, 1).astype(np.float32)
+
+
+def unlit_share(points_mm: np.ndarray, normal: np.ndarray, lit: np.ndarray, lamps_mm: np.ndarray) -> float:
+    """Share of the surface that no lamp reaches: it is large only where a lamp is buried in tissue close by."""
+    most = np.zeros(points_mm.shape[:2])
+    for n in np.flatnonzero(np.isfinite(lamps_mm).all(1)):
+        towards = lamps_mm[n] - points_mm
+        cosine = (towards * normal).sum(-1) / np.linalg.norm(towards, axis=-1)
+        most = np.fmax(most, lit[..., n] * cosine)
+    return float((most < 0.01).mean())
 
 
 def _render_chunk(folder: str, indices: list[int], seed: int, size: tuple[int, int]) -> list[int]:

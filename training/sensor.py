@@ -17,6 +17,9 @@ def take_picture(light: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     scale = width / 320
     light = light * _vignette(height, width, rng) * rng.uniform(0.8, 1.25, 3).astype(np.float32)
     light = _exposed(light, rng)
+    if rng.random() < 0.4:
+        # Glare: the lens scatters a little of all light over the whole picture.
+        light = light + np.float32(rng.uniform(0, 0.05)) * light.mean((0, 1))
     if rng.random() < 0.10:
         light = _smoke(light, rng)
     if rng.random() < 0.10:
@@ -56,13 +59,13 @@ def _vignette(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _exposed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Expose for a random share of the picture: in a third of them the near wall saturates, some are too dark."""
+    """Expose for a random share of the picture: in a third of them the near wall saturates, some are dark."""
     lit = brightest(light)
     lit = lit[lit > 0]
     if not lit.size:
         return light
-    level = np.exp(rng.normal(np.log(0.55), 0.45))
-    return light * np.float32(level / max(float(np.percentile(lit, rng.uniform(55, 95))), 1e-9))
+    level = np.exp(rng.normal(np.log(0.5), 0.55))
+    return light * np.float32(level / max(float(np.percentile(lit, rng.uniform(68, 97))), 1e-9))
 
 
 def _smoke(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -120,10 +123,10 @@ def _noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _encoded(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Tone curve and sRGB: a power of 0.5 to 1.1 makes light fall as distance^-1 to distance^-2.2."""
+    """Tone curve and sRGB: a power of 0.42 to 1.08, mostly near 0.75, makes light fall as distance^-0.9 to -2.2."""
     knee = rng.uniform(0.4, 1.0)
     light = np.maximum(light, 0)
-    power = np.float32(rng.uniform(0.48, 1.1))
+    power = np.float32(0.42 + 0.66 * rng.beta(2, 2))
     rest = 1 - knee + 1e-3
     light = np.where(light > knee, knee + rest * (1 - np.exp(np.minimum(knee - light, 0) / rest)), light)
     light = np.maximum(light, 1e-6)
