@@ -24,8 +24,8 @@ def write_report(network: ScopeNet, store: Store, folder: Path, say: Callable[[s
     (folder / "held_out.json").write_text(json.dumps({k: asdict(v) for k, v in table.items()}, indent=2) + "\n")
     for name, row in table.items():
         say(
-            f"{name:12s} {row.pictures:4d} pictures: AbsRel {row.abs_rel:.3f}, delta<1.25 {row.delta:.3f}, "
-            f"unscaled AbsRel {row.unscaled:.3f}, rank {row.rank:.2f}"
+            f"{name:12s} {row.pictures:4d} pictures: AbsRel {row.abs_rel:.3f} (tissue {row.tissue:.3f}), delta<1.25 "
+            f"{row.delta:.3f}, unscaled AbsRel {row.unscaled:.3f}, rank {row.rank:.2f} (pooled {row.pooled_rank:.2f})"
         )
     _draw_curves(folder)
 

@@ -13,7 +13,7 @@ from scopemap.depth.scopenet.planes import input_planes
 from scopemap.frame import Frame
 from scopemap.masking import Masker
 from training.buffers import Buffers, Store, thinned
-from training.light import draw_light, shade
+from training.light import INSTRUMENT, draw_light, shade
 from training.sensor import take_picture
 
 _RAYS_UNKNOWN_SHARE = 0.15
@@ -30,6 +30,7 @@ class Sample:
     rgb : (H, W, 3) uint8. valid : (H, W) bool, as the masker or the field of view says.
     rays : (H, W, 3) float32 true unit rays. told_rays : what the network is told of them, None = nothing.
     log_distance : (H, W) float32, ln of mm along the ray, NaN = unknown or outside the field of view.
+    tissue : (H, W) bool, False where an instrument is seen.
     """
 
     rgb: np.ndarray
@@ -37,6 +38,7 @@ class Sample:
     rays: np.ndarray
     told_rays: np.ndarray | None
     log_distance: np.ndarray
+    tissue: np.ndarray
 
     @property
     def planes(self) -> np.ndarray:
@@ -62,11 +64,13 @@ def make_sample(buffers: Buffers, rng: np.random.Generator) -> Sample:
         camera = PinholeCamera(width, width, width / 2, height / 2, width, height)
         valid = Masker(MaskSettings())(Frame(0, 0.0, rgb, camera, np.ones_like(field))).valid
     rays, log_distance = buffers.rays, np.where(field, buffers.log_distance, np.float32(np.nan))
+    tissue = buffers.part != INSTRUMENT
     for axis in (0, 1):
         if rng.random() < 0.5:
-            rgb, valid, rays, log_distance = (np.flip(image, axis) for image in (rgb, valid, rays, log_distance))
+            images = (rgb, valid, rays, log_distance, tissue)
+            rgb, valid, rays, log_distance, tissue = (np.flip(image, axis) for image in images)
             rays = rays * np.where(np.arange(3) == 1 - axis, np.float32(-1), np.float32(1))
-    return Sample(np.ascontiguousarray(rgb), valid, rays, _told(rays, rng), log_distance)
+    return Sample(np.ascontiguousarray(rgb), valid, rays, _told(rays, rng), log_distance, tissue)
 
 
 def _bounce(rng: np.random.Generator) -> float:
