@@ -23,6 +23,7 @@ READERS = {
     "networks": ["pipeline.py"],
     "odometry": ["odometry/*.py"],
     "smoothing": ["odometry/smoothing.py"],
+    "backend": ["backend/backend.py", "backend/links.py", "pipeline.py"],
     "fusion": ["fusion/*.py", "pipeline.py"],
 }
 

@@ -184,6 +184,31 @@ class SmoothingSettings(Settings):
         return self
 
 
+class BackendSettings(Settings):
+    """Adjustment of all keyframes together, once the last frame is tracked."""
+
+    method: Literal["none", "full"] = Field(
+        "full",
+        description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
+        "predicted (measured depth tracks as well or better without)",
+    )
+    gaps: tuple[int, ...] = Field(
+        (1, 2, 3, 5, 8), min_length=1, description="keyframes are linked to those so many before them"
+    )
+    cell_px: int = Field(16, ge=4, description="one point in each cell of that size")
+    consistency_px: float = Field(1.0, gt=0, description="largest error of flow there and back")
+    depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
+    scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
+    turn_sigma_deg: float = Field(3.0, gt=0, description="how far tracked turns between keyframes are trusted")
+    way_sigma_share: float = Field(0.1, gt=0, description="the same of ways, over the mean depth")
+    max_sigma_px: float = Field(
+        0.4,
+        gt=0,
+        description="where points seen again stay farther off than that (robust standard deviation), tissue moves by "
+        "itself or the camera is not what it is said to be: poses then stay as tracked",
+    )
+
+
 class FusionSettings(Settings):
     """Volumetric fusion; voxel and truncation as Endo-Depth-and-Motion uses on the same kind of data."""
 
@@ -210,6 +235,7 @@ class Config(Settings):
     networks: NetworkSettings = NetworkSettings()
     odometry: OdometrySettings = OdometrySettings()
     smoothing: SmoothingSettings = SmoothingSettings()
+    backend: BackendSettings = BackendSettings()
     fusion: FusionSettings = FusionSettings()
 
     @classmethod
@@ -261,6 +287,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.gain_bias": False,
         "odometry.start": "identity",
         "smoothing.method": "wema",
+        "backend.method": "none",
     },
     "realtime": {
         "networks.flow": "dis",
@@ -268,6 +295,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.max_iterations": 15,
         "fusion.voxel_mm": 1.5,
         "fusion.every": 2,
+        "backend.method": "none",
     },
 }
 

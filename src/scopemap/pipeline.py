@@ -3,7 +3,8 @@
     frame -> mask -> raw depth -> track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS)
           -> smooth (WEMA) -> fuse (TSDF)
 
-The `paper` preset refines before it tracks. Nothing here reads or writes files, looks at the clock, draws or prints:
+With a back end, fusion waits until the last frame is tracked: all keyframes are adjusted together first. The `paper`
+preset has none, and refines before it tracks. Nothing here reads or writes files, looks at the clock, draws or prints:
 that is the runner's work. `perceive` is what needs no motion, so it may run a frame ahead of `step`.
 """
 
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 
+from scopemap.backend import Backend, Correction
 from scopemap.config import Config, DepthSettings
 from scopemap.datasets import Sequence
 from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
@@ -21,7 +23,7 @@ from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.flow import FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Frame
-from scopemap.fusion import TsdfVolume
+from scopemap.fusion import FrameSpool, TsdfVolume
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import pull
 from scopemap.masking import Masker, is_constant
@@ -119,7 +121,9 @@ class Pipeline:
         self._tracker = tracker or Tracker(config.odometry)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
+        self._backend = Backend(config.backend) if config.backend.method == "full" else None
         self._volume = TsdfVolume(config.fusion)
+        self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
         self._fusable = 0
@@ -140,7 +144,10 @@ class Pipeline:
         return Percept(frame, raw.depth_mm, estimate.kind, link, just_fitted, raw.sigma_mm)
 
     def step(self, percept: Percept) -> Step:
-        """Track a frame, make its depth consistent, fuse it."""
+        """Track a frame, make its depth consistent, fuse it or let it wait for the back end."""
+        if percept.kind == "measured":
+            # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
+            self._backend = None
         refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
         raw = replace(percept.frame, depth_mm=percept.raw_mm, depth_sigma_mm=percept.raw_sigma_mm)
         track = self._tracker.track(raw)
@@ -159,15 +166,31 @@ class Pipeline:
         self._last = track
         return Step(frame, track, percept.raw_mm, refined)
 
+    def adjust(self) -> Correction | None:
+        """Adjust all keyframes together after the last frame, and fuse what waited; None where there is no back end.
+
+        Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
+        """
+        if self._backend is None or not self._backend.keyframes:
+            return None
+        correction = self._backend.adjust()
+        for frame in self._waiting.frames():
+            self._volume.integrate(correction.frame(frame))
+        self._waiting, self._backend = FrameSpool(), None
+        return correction
+
     def surface(self) -> trimesh.Trimesh:
-        """Return the surface of all frames so far, world mm; may be empty."""
+        """Return the surface of all fused frames, world mm; may be empty."""
         return self._volume.extract_mesh()
 
     def _keyed(self, track: Track, frame: Frame, *, measured: bool) -> Track:
         """Make the frame a keyframe where one is due; a first frame that cannot be one fixes no world and is lost."""
         if track.status == "lost" or not self._tracker.wants_keyframe():
             return track
-        adopted = self._tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=measured)
+        keyframe = replace(frame, T_world_camera=track.T_world_camera)
+        adopted = self._tracker.adopt(keyframe, measured=measured)
+        if adopted and self._backend is not None:
+            self._backend.add(keyframe)
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track
@@ -204,5 +227,8 @@ class Pipeline:
 
     def _fuse(self, frame: Frame) -> None:
         if self.config.fusion.enabled and self._fusable % self.config.fusion.every == 0:
-            self._volume.integrate(frame)
+            if self._backend is None:
+                self._volume.integrate(frame)
+            else:
+                self._waiting.put(frame)
         self._fusable += 1

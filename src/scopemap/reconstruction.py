@@ -10,7 +10,7 @@ import csv
 import json
 import math
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from scopemap.backend import Correction
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.config import Config
@@ -45,7 +46,10 @@ _MARKS = ("provenance.json", "depth/depth.json")
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One line of frames.csv: what is known of a frame besides its pixels; `depth_scale` is MAPIS' factor."""
+    """One line of frames.csv: what is known of a frame besides its pixels.
+
+    `depth_scale` is MAPIS' factor of its depth, times the back end's.
+    """
 
     index: int
     time_s: float
@@ -72,6 +76,19 @@ class FrameRecord:
             *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
         ]
+
+
+def corrected(records: list[FrameRecord], correction: Correction) -> list[FrameRecord]:
+    """Return the records with the poses and scales of the back end; a lost frame repeats the last pose known."""
+    out: list[FrameRecord] = []
+    for record in records:
+        if record.track.status == "lost":
+            pose = out[-1].T_world_camera if out else record.T_world_camera
+            out.append(replace(record, T_world_camera=pose))
+            continue
+        pose, factor = correction.pose(record.index, record.T_world_camera), correction.depth_factor(record.index)
+        out.append(replace(record, T_world_camera=pose, depth_scale=record.depth_scale * factor))
+    return out
 
 
 @dataclass(frozen=True)
@@ -147,11 +164,24 @@ class DepthWriter:
 
     def __call__(self, step: Step) -> None:
         """Write one frame's depth."""
-        units = np.nan_to_num(step.refined.depth_mm / self._scale_mm, nan=0.0)
+        self._write(step.frame.index, step.refined.depth_mm / self._scale_mm)
+
+    def correct(self, records: list[FrameRecord], correction: Correction) -> None:
+        """Write the depth of all tracked frames once more, with the scale that the back end gave it."""
+        for record in records:
+            if record.track.status != "lost":
+                image = np.asarray(cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED))
+                units = np.where(image > 0, image * np.float32(correction.depth_factor(record.index)), np.nan)
+                self._write(record.index, units)
+
+    def _file(self, index: int) -> Path:
+        return self._folder / f"{index:06d}.png"
+
+    def _write(self, index: int, units: np.ndarray) -> None:
+        units = np.nan_to_num(units, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
-        file = self._folder / f"{step.frame.index:06d}.png"
-        if not cv2.imwrite(str(file), image):
-            raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
+        if not cv2.imwrite(str(self._file(index)), image):
+            raise InputError(f"cannot write {self._file(index)}: the disk is full or the folder may not be written")
 
 
 class DepthReader:

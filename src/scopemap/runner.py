@@ -22,7 +22,7 @@ from scopemap.errors import InputError
 from scopemap.masking import is_constant
 from scopemap.odometry import FrameTracker
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, prepare_folder
 
 Observer = Callable[[Step], None]
 _VERSIONS = (
@@ -47,7 +47,7 @@ def reconstruct(
     config : settings, by default the preset `default`.
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
-    observers : called with each `Step` as it is done.
+    observers : called with each `Step` as it is done, its pose and depth as tracked: a back end has not spoken yet.
     tracker : odometry that takes the place of ours; None: as `config.odometry` says.
 
     The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there.
@@ -56,10 +56,12 @@ def reconstruct(
     config = config or Config()
     started = time.perf_counter()
     estimators = Estimators.create(config, sequence)
+    writer = None
     if out is not None:
         _refuse_own_input(Path(out), sequence, config)
         prepare_folder(Path(out), overwrite=overwrite)
-        observers = (DepthWriter(Path(out), estimators.reach_mm(config.depth)), *observers)
+        writer = DepthWriter(Path(out), estimators.reach_mm(config.depth))
+        observers = (writer, *observers)
     sequence, clock = _with_best_camera(sequence, estimators), _Clock()
     config, exponent_note = _with_exponent(sequence, config, estimators, clock)
     if exponent_note:
@@ -71,11 +73,17 @@ def reconstruct(
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
+    correction = clock.timed("back end", pipeline.adjust)
+    if correction is not None:
+        records = corrected(records, correction)
+        if writer is not None:
+            clock.timed("depth corrected", writer.correct, records, correction)
     mesh = clock.timed("mesh", pipeline.surface)
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
     provenance["notes"] += exponent_note
     provenance["warnings"] += distances.warnings(config.fusion)
+    provenance["notes"] += [] if correction is None else [correction.description]
     result = Reconstruction(sequence.camera, records, mesh, config, provenance)
     if out is not None:
         result.save(Path(out))

@@ -15,8 +15,13 @@ from scopemap.config import Config
 from scopemap.errors import SettingsError
 from scopemap.odometry import FrameTracker, Tracker
 
-# Depth as it is: consistency over time is a part of our method, not of the input that all share.
-PLAIN_DEPTH = {"mapis.frame_scale": "none", "mapis.blend": "none", "smoothing.method": "none"}
+# Depth as it is and poses as tracked: consistency over time is a part of our method, not of the input that all share.
+PLAIN = {
+    "mapis.frame_scale": "none",
+    "mapis.blend": "none",
+    "smoothing.method": "none",
+    "backend.method": "none",
+}
 
 
 def create_method(plan: MethodPlan, data: Path | None) -> Method:
@@ -30,7 +35,7 @@ def create_method(plan: MethodPlan, data: Path | None) -> Method:
         return PipelineMethod(_ours, preset=plan.preset, settings=plan.settings)
     if plan.use not in BASELINES:
         raise SettingsError(f"unknown method '{plan.use}': choose one of scopemap, import, {', '.join(BASELINES)}")
-    return PipelineMethod(BASELINES[plan.use], preset=plan.preset, settings=PLAIN_DEPTH | plan.settings)
+    return PipelineMethod(BASELINES[plan.use], preset=plan.preset, settings=PLAIN | plan.settings)
 
 
 def _ours(config: Config) -> FrameTracker:

@@ -1,0 +1,131 @@
+"""Which points of which keyframes are seen again where: corners spread over the image, carried by optical flow.
+
+Shading moves with the lamp and pulls flow along where tissue has no texture; corners hold on to the tissue itself.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from scopemap.backend.adjustment import Points, Sightings
+from scopemap.config import BackendSettings
+from scopemap.flow import FlowEstimator, pair_flow
+from scopemap.frame import Frame
+from scopemap.geometry.uncertainty import sigma_share
+
+_CORNER_BLOCK_PX = 5
+_BORDER_PX = 3
+
+
+@dataclass(frozen=True)
+class _Keyframe:
+    """A keyframe that others can be linked to: number, image, mask, places (n, 2) of its points, first point."""
+
+    number: int
+    rgb: np.ndarray
+    valid: np.ndarray
+    places: np.ndarray
+    first: int
+
+
+class _Sighting(NamedTuple):
+    point: np.ndarray
+    keyframe: np.ndarray
+    pixel: np.ndarray
+
+
+class Linker:
+    """Collects keyframes one by one; each is linked to those `settings.gaps` before it, both ways."""
+
+    def __init__(self, settings: BackendSettings, flow: FlowEstimator) -> None:
+        self.settings, self._flow = settings, flow
+        self._recent: deque[_Keyframe] = deque(maxlen=max(settings.gaps))
+        self._points: list[Points] = []
+        self._sightings: list[_Sighting] = []
+        self._count = self._keyframes = 0
+
+    def add(self, keyframe: Frame) -> None:
+        """Take a keyframe with depth: choose its points, find them in earlier keyframes, and theirs in it."""
+        assert keyframe.depth_mm is not None
+        places = corners(keyframe, self.settings.cell_px)
+        rows, columns = places[:, 1], places[:, 0]
+        camera = keyframe.camera
+        depth_mm = keyframe.depth_mm[rows, columns]
+        share = sigma_share(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
+        rays = np.column_stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))])
+        sigma = np.hypot(np.nan_to_num(share, nan=0.0), self.settings.depth_share)
+        self._points.append(Points(np.full(len(rows), self._keyframes), rays, np.log(depth_mm), sigma))
+        new = _Keyframe(self._keyframes, keyframe.rgb, keyframe.valid, places, self._count)
+        for past in self._recent:
+            if new.number - past.number in self.settings.gaps:
+                self._link(past, new)
+        self._recent.append(new)
+        self._keyframes += 1
+        self._count += len(rows)
+
+    def points(self) -> Points:
+        """Return all points so far, sorted by host."""
+        parts = self._points
+        return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in Points.__annotations__))
+
+    def sightings(self) -> Sightings:
+        """Return all sightings so far, sorted by point."""
+        empty = _Sighting(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+        point, keyframe, pixel = (np.concatenate(parts) for parts in zip(empty, *self._sightings, strict=True))
+        order = np.argsort(point, kind="stable")
+        return Sightings(point[order], keyframe[order], pixel[order])
+
+    def _link(self, past: _Keyframe, new: _Keyframe) -> None:
+        flow = pair_flow(self._flow, past.rgb, new.rgb, self.settings.consistency_px)
+        self._see(new, past, flow.to_previous, flow.to_current)
+        self._see(past, new, flow.to_current, flow.to_previous)
+
+    def _see(self, host: _Keyframe, other: _Keyframe, forth: np.ndarray, back: np.ndarray) -> None:
+        """Note where points of `host` are seen in `other`, where the way back ends where it began."""
+        start = host.places.astype(np.float32)
+        pixel = start + forth[host.places[:, 1], host.places[:, 0]]
+        returned = pixel + _sampled(back, pixel)
+        height, width = other.valid.shape
+        nearest = np.clip(np.rint(pixel).astype(int), 0, [width - 1, height - 1])
+        inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(1)
+        good = inside & other.valid[nearest[:, 1], nearest[:, 0]]
+        good &= np.linalg.norm(returned - start, axis=1) <= self.settings.consistency_px
+        number = np.flatnonzero(good)
+        self._sightings.append(
+            _Sighting(host.first + number, np.full(len(number), other.number), pixel[number].astype(np.float64))
+        )
+
+
+def corners(frame: Frame, cell_px: int) -> np.ndarray:
+    """Return pixels (n, 2) int x, y: the most corner-like one with depth of each cell of `cell_px` x `cell_px`.
+
+    The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every cell with usable
+    tissue gives one, however weak: where corners are few, edges and shades are better than nothing.
+    """
+    assert frame.depth_mm is not None
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    # On brightness relative to its surround: far tissue is dark, not featureless.
+    level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
+    strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
+    usable = frame.valid & np.isfinite(frame.depth_mm)
+    # A patch that touches a mask's edge has a corner that is not the tissue's.
+    usable = cv2.erode(usable.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0) > 0
+    strength = np.where(usable, strength, -1.0)
+    height, width = (side // cell_px * cell_px for side in strength.shape)
+    cells: np.ndarray = strength[:height, :width].reshape(height // cell_px, cell_px, width // cell_px, cell_px)
+    cells = cells.transpose(0, 2, 1, 3).reshape(-1, cell_px * cell_px)
+    best = cells.argmax(1)
+    row, column = np.divmod(np.arange(len(cells)), width // cell_px)
+    places = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
+    return places[cells.max(1) > 0]
+
+
+def _sampled(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Flow (n, 2) at pixels (n, 2), bilinear; NaN outside."""
+    x, y = (pixel[:, axis].astype(np.float32)[None] for axis in (0, 1))
+    return cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)[0]

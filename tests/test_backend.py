@@ -1,0 +1,168 @@
+"""The back end on a textured plane whose truth is a closed form: links, correction of every frame, waiting frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+
+from scopemap.backend import Backend, Correction
+from scopemap.backend.links import Linker, corners
+from scopemap.config import BackendSettings
+from scopemap.flow import DisFlow
+from scopemap.frame import Frame
+from scopemap.fusion import FrameSpool
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+
+POSES = [
+    plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
+]
+
+
+def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
+    """View number `number` of the plane, as if tracked at `T_tracked` with depth wrong by `factor`."""
+    view = plane_scene.see(POSES[number])
+    T = view.T_world_camera if T_tracked is None else T_tracked
+    depth_mm = (factor * view.depth_mm).astype(np.float32)
+    return Frame(10 * number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm, T)
+
+
+def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, float]:
+    off = np.stack([inverse(a) @ b for a, b in zip(poses, true, strict=True)])
+    return float(rotation_angle_rad(off[:, :3, :3]).max()), float(np.linalg.norm(off[:, :3, 3], axis=1).max())
+
+
+def test_drifting_poses_are_set_right_and_frames_between_keyframes_with_them() -> None:
+    drift = [se3_exp(0.01 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
+    tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
+    backend = Backend(BackendSettings())
+    for number in (0, 1, 3, 4, 5):
+        backend.add(_frame(number, tracked[number]))
+    correction = backend.adjust()
+    before = _errors(tracked, POSES)
+    turn, way = _errors([correction.pose(10 * n, T) for n, T in enumerate(tracked)], POSES)
+    assert before[0] > 0.05
+    assert turn < 0.1 * before[0]
+    assert way < 0.15 * before[1]
+    assert correction.sigma_px < 0.3
+    assert "5 keyframes adjusted" in correction.description
+
+
+def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
+    backend = Backend(BackendSettings(depth_share=0.05, scale_sigma=0.3))
+    for number in range(6):
+        backend.add(_frame(number, factor=0.8 if number == 2 else 1.0))
+    correction = backend.adjust()
+    factors = np.array([correction.depth_factor(10 * number) for number in range(6)])
+    assert factors[2] / np.delete(factors, 2).mean() == pytest.approx(1.25, rel=0.03)
+    assert correction.depth_factor(15) == pytest.approx(np.sqrt(factors[1] * factors[2]))
+
+
+def test_points_are_seen_where_the_plane_says() -> None:
+    linker = Linker(BackendSettings(gaps=(1, 2)), DisFlow())
+    for number in (0, 1, 2):
+        linker.add(_frame(number))
+    points, sightings = linker.points(), linker.sightings()
+    assert (np.diff(points.host) >= 0).all()
+    assert (np.diff(sightings.point) >= 0).all()
+    hosts = points.host[sightings.point]
+    assert {(int(a), int(b)) for a, b in zip(hosts, sightings.keyframe, strict=True)} == {
+        *((0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)),
+    }
+    for host in range(3):
+        for other in {0, 1, 2} - {host}:
+            some = (hosts == host) & (sightings.keyframe == other)
+            number = sightings.point[some]
+            in_host = np.exp(points.log_depth[number])[:, None] * points.rays[number]
+            T = inverse(POSES[other]) @ POSES[host]
+            truth = CAMERA.project(in_host @ T[:3, :3].T + T[:3, 3])
+            away = np.linalg.norm(truth - sightings.pixel[some], axis=1)
+            assert some.sum() > 80
+            assert np.median(away) < 0.25
+
+
+def test_keyframes_that_are_not_named_by_the_gaps_are_not_linked() -> None:
+    linker = Linker(BackendSettings(gaps=(2,)), DisFlow())
+    for number in (0, 1, 2):
+        linker.add(_frame(number))
+    sightings, host = linker.sightings(), linker.points().host
+    assert set(np.abs(host[sightings.point] - sightings.keyframe)) == {2}
+
+
+def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> None:
+    rgb = np.full((180, 240, 3), 90, np.uint8)
+    for x, y in ((40, 40), (136, 100)):
+        rgb[y : y + 4, x : x + 4] = 200
+    valid = plane_scene.EVERYWHERE.copy()
+    valid[:, 200:] = False
+    depth_mm = np.full((180, 240), 50.0, np.float32)
+    depth_mm[150:] = np.nan
+    places = corners(Frame(0, 0.0, rgb, CAMERA, valid, depth_mm), 16)
+    for x, y in ((41.5, 41.5), (137.5, 101.5)):
+        assert np.abs(places - [x, y]).max(1).min() <= 3
+    assert places[:, 0].max() < 200
+    assert places[:, 1].max() < 150
+    cells = places // 16
+    assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+def test_outside_all_keyframes_the_nearest_correction_holds() -> None:
+    T = np.stack([se3_exp(np.array([0, 0, 0.1 * k, k, 0, 0.0])) for k in range(3)])
+    correction = Correction(np.array([10, 20, 40]), T, np.log([1.0, 1.1, 1.3]))
+    np.testing.assert_allclose(correction.pose(3, np.eye(4)), T[0])
+    np.testing.assert_allclose(correction.pose(20, np.eye(4)), T[1])
+    np.testing.assert_allclose(correction.pose(99, np.eye(4)), T[2])
+    assert correction.depth_factor(99) == pytest.approx(1.3)
+    middle = correction.pose(30, np.eye(4))
+    assert rotation_angle_rad(middle[:3, :3]) == pytest.approx(0.15)
+    assert "as tracked" in correction.description
+
+
+def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
+    rng = np.random.default_rng(1)
+    backend = Backend(BackendSettings())
+    x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
+    for number in range(5):
+        frame = _frame(number)
+        # A slow swell that differs from keyframe to keyframe, by some 3 px.
+        swell = cv2.resize(rng.normal(0, 3, (4, 5, 2)).astype(np.float32), (240, 180), interpolation=cv2.INTER_CUBIC)
+        moved = cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR)
+        backend.add(replace(frame, rgb=moved))
+    correction = backend.adjust()
+    assert not correction.taken
+    assert correction.sigma_px > 0.4
+    assert correction.depth_factor(20) == 1.0
+    np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
+    assert "moves by itself" in correction.description
+
+
+def test_nothing_to_adjust_is_an_error_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="no keyframe"):
+        Backend(BackendSettings()).adjust()
+
+
+def test_a_waiting_frame_comes_back_as_it_was() -> None:
+    rng = np.random.default_rng(0)
+    frame = _frame(2)
+    depth_mm = np.exp(rng.uniform(-3, 8, frame.valid.shape)).astype(np.float32)
+    depth_mm[rng.random(depth_mm.shape) < 0.2] = np.nan
+    with_sigma = Frame(
+        7, 0.5, frame.rgb, CAMERA, rng.random(depth_mm.shape) < 0.5, depth_mm, POSES[1], "", 0.1 * depth_mm
+    )
+    spool = FrameSpool()
+    spool.put(with_sigma)
+    spool.put(frame)
+    assert len(spool) == 2
+    first, second = spool.frames()
+    np.testing.assert_array_equal(first.rgb, with_sigma.rgb)
+    np.testing.assert_array_equal(first.valid, with_sigma.valid)
+    np.testing.assert_allclose(first.depth_mm, depth_mm, rtol=2e-4)
+    np.testing.assert_allclose(first.depth_sigma_mm, 0.1 * depth_mm, rtol=2e-4)
+    np.testing.assert_array_equal(first.T_world_camera, POSES[1])
+    assert (first.index, first.time_s) == (7, 0.5)
+    assert second.depth_sigma_mm is None
+    assert second.index == 20

@@ -1,0 +1,106 @@
+"""Bundle adjustment: exact data give back exact poses, scales and depths; bad data do little harm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scopemap.backend.adjustment import Points, Priors, Problem, Sightings, adjust
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
+
+INTRINSICS = np.array([150.0, 152.0, 80.0, 64.0])
+KEYFRAMES, PER_KEYFRAME = 6, 80
+
+
+def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Sightings]:
+    """True poses (camera from world), points with true depth, and where they are truly seen."""
+    twists = [np.append(rng.normal(0, 0.02, 3), [1.5 * k, 0.6 * np.sin(k), 0.8 * k]) for k in range(KEYFRAMES)]
+    T = np.stack([inverse(se3_exp(twist)) for twist in twists])
+    T = T @ inverse(T[0])
+    pixels = rng.uniform([10, 10], [150, 118], (KEYFRAMES * PER_KEYFRAME, 2))
+    rays = np.column_stack([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(len(pixels))])
+    host = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME)
+    depth_mm = rng.uniform(25, 60, len(host))
+    seen = []
+    for p, (h, ray, depth) in enumerate(zip(host, rays, depth_mm, strict=True)):
+        for t in (h - 2, h - 1, h + 1, h + 2):
+            if 0 <= t < KEYFRAMES:
+                x = transform(T[t] @ inverse(T[h]), depth * ray)
+                seen.append((p, t, *(INTRINSICS[:2] * x[:2] / x[2] + INTRINSICS[2:])))
+    table = np.array(seen)
+    sightings = Sightings(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return T, Points(host, rays, np.log(depth_mm), np.full(len(host), 0.1)), sightings
+
+
+def _tracked(T: np.ndarray, rng: np.random.Generator, turn: float = 0.02, way: float = 0.8) -> np.ndarray:
+    """True poses with errors; the first is kept."""
+    errors = [se3_exp(rng.normal(0, [turn] * 3 + [way] * 3)) for _ in T[1:]]
+    return np.stack([T[0], *(error @ pose for error, pose in zip(errors, T[1:], strict=True))])
+
+
+def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    off = T @ inverse(true)
+    return float(rotation_angle_rad(off[:, :3, :3]).max()), float(np.linalg.norm(off[:, :3, 3], axis=1).max())
+
+
+def test_exact_sightings_and_depths_give_back_exact_poses() -> None:
+    rng = np.random.default_rng(0)
+    T, points, sightings = _world(rng)
+    found = adjust(Problem(INTRINSICS, _tracked(T, rng), points, sightings, Priors(turn_rad=10, way_share=10)))
+    turn, way = _pose_errors(found.T_camera_world, T)
+    assert turn < 1e-4
+    assert way < 1e-2
+    assert np.abs(found.log_depth - points.log_depth).max() < 1e-3
+    assert found.sigma_px == pytest.approx(0.1)  # its floor
+
+
+def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
+    rng = np.random.default_rng(1)
+    T, points, sightings = _world(rng)
+    wrong = replace(
+        points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=np.full(len(points.host), 0.02)
+    )
+    found = adjust(
+        Problem(INTRINSICS, _tracked(T, rng), wrong, sightings, Priors(scale=0.3, turn_rad=10, way_share=10))
+    )
+    assert found.log_scale[3] - np.delete(found.log_scale, 3).mean() == pytest.approx(0.2, abs=0.02)
+    assert _pose_errors(found.T_camera_world, T)[0] < 2e-3
+
+
+def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
+    rng = np.random.default_rng(2)
+    T, points, sightings = _world(rng)
+    pixel = sightings.pixel + rng.normal(0, 0.3, sightings.pixel.shape)
+    wild = rng.random(len(pixel)) < 0.2
+    pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
+    tracked = _tracked(T, rng)
+    noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
+    found = adjust(Problem(INTRINSICS, tracked, noisy, replace(sightings, pixel=pixel), Priors()))
+    turn, way = _pose_errors(found.T_camera_world, T)
+    turn_before, way_before = _pose_errors(tracked, T)
+    assert turn < 0.2 * turn_before
+    assert way < 0.3 * way_before
+    assert found.sigma_px == pytest.approx(0.3, rel=0.6)
+
+
+def test_without_sightings_nothing_changes() -> None:
+    rng = np.random.default_rng(3)
+    T, points, _ = _world(rng)
+    nothing = Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    found = adjust(Problem(INTRINSICS, T, points, nothing, Priors()))
+    np.testing.assert_array_equal(found.T_camera_world, T)
+    assert found.iterations == 0
+
+
+def test_where_no_sighting_says_anything_the_tracked_motion_stays() -> None:
+    rng = np.random.default_rng(4)
+    T, points, sightings = _world(rng)
+    # Nobody sees anything of the last two keyframes, nor they of others.
+    known = (sightings.keyframe < 4) & (points.host[sightings.point] < 4)
+    some = Sightings(sightings.point[known], sightings.keyframe[known], sightings.pixel[known])
+    tracked = _tracked(T, rng)
+    found = adjust(Problem(INTRINSICS, tracked, points, some, Priors())).T_camera_world
+    np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
+    np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)

@@ -1,0 +1,117 @@
+"""The back end in a whole run: poses, depth maps and mesh of one piece, nothing of it where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_phantom import true_poses, with_true_depth, write_tiny
+
+from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap.config import Config
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.pipeline import Estimators, Step
+from scopemap.reconstruction import DepthReader
+
+LOST, FRAMES = 8, 14
+SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__keyframe_every": 2}
+
+
+@dataclass(frozen=True)
+class _Bent:
+    """True depth made wrong: near gets nearer and far farther, and it is said to be predicted."""
+
+    inner: Any
+    name: str = "bent"
+
+    def estimate(self, frame: Any) -> Any:
+        found = self.inner.estimate(frame)
+        middle = np.nanmedian(found.values)
+        return replace(found, kind="depth", values=middle * (found.values / middle) ** np.float32(1.3))
+
+    def provenance(self) -> dict[str, str]:
+        return {"depth": self.name}
+
+
+@dataclass(frozen=True)
+class _Run:
+    phantom: Path
+    out: Path
+    steps: list[Step]
+    adjusted: Reconstruction
+    tracked: Reconstruction
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
+    folder = tmp_path_factory.mktemp("backend")
+    phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}", frames=FRAMES)
+    create, steps = Estimators.create, []
+
+    def bent(config: Config, sequence: Any) -> Estimators:
+        parts = create(config, sequence)
+        return replace(parts, depth=_Bent(parts.depth))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Estimators, "create", bent)
+        config = with_true_depth(phantom, **SETTINGS)
+        adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
+        plain = with_true_depth(phantom, **SETTINGS, backend__method="none")
+        tracked = reconstruct(open_sequence(phantom), plain)
+    return _Run(phantom, folder / "out", steps, adjusted, tracked)
+
+
+def _turn_errors_rad(result: Reconstruction, phantom: Path) -> np.ndarray:
+    poses, status = result.trajectory.T_world_camera, result.trajectory.status
+    return rotation_angle_rad((inverse(poses) @ true_poses(phantom))[status != "lost", :3, :3])
+
+
+def test_adjusted_poses_go_less_astray_than_tracked_ones(run: _Run) -> None:
+    tracked, adjusted = (_turn_errors_rad(result, run.phantom) for result in (run.tracked, run.adjusted))
+    assert adjusted.max() < 0.8 * tracked.max()
+
+
+def test_a_lost_frame_stays_lost_where_the_camera_was_last_seen(run: _Run) -> None:
+    trajectory = run.adjusted.trajectory
+    assert trajectory.status[LOST] == "lost"
+    np.testing.assert_array_equal(trajectory.T_world_camera[LOST], trajectory.T_world_camera[LOST - 1])
+
+
+def test_depth_maps_in_the_folder_have_the_adjusted_scale(run: _Run) -> None:
+    reader, factors = DepthReader(run.out), []
+    for step, before, after in zip(run.steps, run.tracked.records, run.adjusted.records, strict=True):
+        if step.track.status == "lost":
+            continue
+        factors.append(after.depth_scale / before.depth_scale)
+        known = np.isfinite(step.refined.depth_mm)
+        kept = reader.read(step.frame.index)
+        assert kept is not None
+        np.testing.assert_allclose(kept[known], factors[-1] * step.refined.depth_mm[known], atol=0.02)
+    assert max(np.abs(np.log(factors))) > 1e-4
+
+
+def test_the_mesh_lies_where_adjusted_poses_and_depth_put_it(run: _Run) -> None:
+    number = FRAMES - 1
+    depth_mm = DepthReader(run.out).read(number)
+    assert depth_mm is not None
+    camera, T = run.adjusted.camera, run.adjusted.trajectory.T_world_camera[number]
+    points = (camera.rays * depth_mm[..., None])[20:-20:7, 20:-20:7].reshape(-1, 3)
+    points = points[np.isfinite(points[:, 2])] @ T[:3, :3].T + T[:3, 3]
+    distances = np.linalg.norm(run.adjusted.mesh.vertices[None] - points[:, None], axis=-1).min(1)
+    assert np.median(distances) < 1.5
+
+
+def test_the_run_says_what_the_back_end_did(run: _Run) -> None:
+    notes = run.adjusted.provenance["notes"]
+    assert any("keyframes adjusted" in note for note in notes)
+    assert not any("back end" in note for note in run.tracked.provenance["notes"])
+    assert run.adjusted.provenance["seconds"]["back end"] > 0
+
+
+def test_measured_depth_is_not_adjusted(run: _Run) -> None:
+    result = reconstruct(open_sequence(run.phantom), with_true_depth(run.phantom, **SETTINGS))
+    assert not any("back end" in note for note in result.provenance["notes"])
+    assert len(result.mesh.faces) > 1000
