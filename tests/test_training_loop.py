@@ -67,6 +67,17 @@ def test_another_recipe_does_not_go_on_with_a_checkpoint(scenes, whole):
         Training(replace(RECIPE, rate=1e-3), scenes, whole[1], "cpu", lambda text: None).run()
 
 
+def test_a_training_can_begin_from_the_weights_of_another(scenes, whole, tmp_path):
+    export(whole[0], tmp_path / "start.safetensors", {})
+    still = replace(RECIPE, seed=5, steps=1, rate=0.0, rate_end=0.0)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    network = Training(still, scenes, folder, "cpu", lambda text: None, start=tmp_path / "start.safetensors").run()
+    begun = load_file(tmp_path / "start.safetensors")
+    for name, value in network.named_parameters():
+        assert torch.equal(value, begun[name].float()), name
+
+
 def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
     recipe = replace(RECIPE, steps=40, check_every=20)
     Training(recipe, scenes, tmp_path, "cpu", lambda text: None).run()

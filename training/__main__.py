@@ -16,6 +16,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of this training: log, checkpoint, weights")
     parser.add_argument("--scenes", type=Path, help="folder of the rendered scenes, shared by trainings (OUT/scenes)")
     parser.add_argument("--recipe", type=Path, help="TOML with settings of training/recipe.py")
+    parser.add_argument("--start", type=Path, help="weights to begin from, instead of nothing: another run's result")
     parser.add_argument("--seed", type=int, help="instead of the recipe's")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="processor threads to use")
     parser.add_argument("--device", default="", help="cpu or cuda; empty: cuda where there is one")
@@ -44,7 +45,7 @@ def main() -> int:
         size, seed = (part.height, part.width), recipe.scene_seed * 1000 + n
         render_store(scenes / part.name, part.count, size, seed, workers=options.threads, progress=_counted(part.name))
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    network = Training(recipe, scenes, options.out, device, _say).run(options.threads)
+    network = Training(recipe, scenes, options.out, device, _say, start=options.start).run(options.threads)
     calibration = fit_calibration(network, [open_store(scenes / part.name) for part in recipe.parts])
     _say(f"calibrated on training scenes: exponent {calibration.exponent:.3f}, spread times {calibration.spread:.3f}")
     network = calibrated(network, calibration)

@@ -16,6 +16,10 @@ def take_picture(light: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     height, width = light.shape[:2]
     scale = width / 320
     light = light * _vignette(height, width, rng) * rng.uniform(0.8, 1.25, 3).astype(np.float32)
+    if rng.random() < 0.5:
+        light = light * _stranger(height, width, rng)
+    if rng.random() < 0.5:
+        light = _recoloured(light, rng)
     light = _exposed(light, rng)
     if rng.random() < 0.4:
         # Glare: the lens scatters a little of all light over the whole picture.
@@ -58,14 +62,38 @@ def _vignette(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     return (1.0 - rng.uniform(0, 0.6) * square)[..., None].astype(np.float32)
 
 
+def _stranger(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """What no model of ours explains: smooth patches of the picture brighter or darker, by up to half, hardly coloured.
+
+    Real tissue is painted and lit in ways that we did not think of; who has seen only ours takes every such patch for
+    shape.
+    """
+    factor = np.zeros((height, width, 3), np.float32)
+    for _ in range(rng.integers(1, 3)):
+        cells = int(rng.integers(2, 12))
+        field = rng.normal(0, rng.uniform(0.05, 0.25), (cells, cells + 1, 1)) * (1 + rng.normal(0, 0.1, 3))
+        factor += cv2.resize(field.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.exp(factor)
+
+
+def _recoloured(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Colours mixed anew, now and then to nearly none: depth must not be read off the hue of our tissues."""
+    mix = np.eye(3) + rng.normal(0, 0.12, (3, 3))
+    if rng.random() < 0.2:
+        grey = rng.uniform(0.5, 1.0)
+        mix = (1 - grey) * mix + grey / 3
+    mix = np.clip(mix / mix.sum(1, keepdims=True), -0.2, 1.2).astype(np.float32)
+    return np.maximum(light @ mix.T, 0)
+
+
 def _exposed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Expose for a random share of the picture: in a third of them the near wall saturates, some are dark."""
     lit = brightest(light)
     lit = lit[lit > 0]
     if not lit.size:
         return light
-    level = np.exp(rng.normal(np.log(0.5), 0.55))
-    return light * np.float32(level / max(float(np.percentile(lit, rng.uniform(68, 97))), 1e-9))
+    level = np.exp(rng.normal(np.log(0.55), 0.5))
+    return light * np.float32(level / max(float(np.percentile(lit, rng.uniform(58, 96))), 1e-9))
 
 
 def _smoke(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors.torch import load_file
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from scopemap.depth.scopenet.network import ScopeNet
@@ -25,13 +26,20 @@ _LOG_COLUMNS = ("step", "seconds", "rate", "loss", "likelihood", "l1", "gradient
 
 
 class Training:
-    """One training of one recipe in one folder: `run` begins it, or goes on where it was stopped."""
+    """One training of one recipe in one folder: `run` begins it, or goes on where it was stopped.
 
-    def __init__(self, recipe: Recipe, scenes: Path, folder: Path, device: str, say: Say) -> None:
+    `start` names weights to begin from instead of the random ones of the recipe's seed.
+    """
+
+    def __init__(
+        self, recipe: Recipe, scenes: Path, folder: Path, device: str, say: Say, *, start: Path | None = None
+    ) -> None:
         self.recipe, self.folder, self.device, self._say = recipe, folder, device, say
         self._stores = {part.name: open_store(scenes / part.name) for part in (*recipe.parts, recipe.held_out)}
         torch.manual_seed(recipe.seed)
         self.network = ScopeNet().to(device, memory_format=torch.channels_last)
+        if start is not None:
+            self.network.load_state_dict(load_file(start))
         average = get_ema_multi_avg_fn(recipe.ema)
         self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)

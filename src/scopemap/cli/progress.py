@@ -37,7 +37,7 @@ def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[
             TextColumn("{task.fields[state]}"),
         )
         with Progress(*columns, console=Console(stderr=True)) as bar:
-            task, state = bar.add_task("", total=total, rate="", state=""), _State()
+            task, state = bar.add_task("", total=total, rate="", state=""), _State(total)
 
             def show(step: Step) -> None:
                 state.add(step)
@@ -49,8 +49,9 @@ def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[
 class _State:
     """Counts frames as they pass."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: int | None) -> None:
         self.started, self.done, self.lost, self.text = time.perf_counter(), 0, 0, ""
+        self._total = total
 
     @property
     def rate(self) -> float:
@@ -63,13 +64,16 @@ class _State:
             self.text = f"lost: {step.track.reason}"
         else:
             self.text = "ok" + (f", {self.lost} lost so far" if self.lost else "")
+        if self.done == self._total:
+            # Keyframes are adjusted, depth fused, files written: seconds to minutes in which no frame passes.
+            self.text += "; adjusting, fusing and writing"
 
 
 class _Lines:
     """One line now and then."""
 
     def __init__(self, total: int | None) -> None:
-        self._total, self._state, self._last = total, _State(), time.perf_counter()
+        self._total, self._state, self._last = total, _State(total), time.perf_counter()
 
     def __call__(self, step: Step) -> None:
         self._state.add(step)
