@@ -75,7 +75,9 @@ def test_progress_without_a_terminal_is_a_line_at_the_end(capfd: pytest.CaptureF
             observers[0](step)  # type: ignore[arg-type]
     out, err = capfd.readouterr()
     assert out == ""
-    assert re.fullmatch(r"frame 3 of 3: [\d.]+ frames/s, 0 s left, ok, 1 lost so far; adjusting, fusing and writing\n", err)
+    assert re.fullmatch(
+        r"frame 3 of 3: [\d.]+ frames/s, 0 s left, ok, 1 lost so far; adjusting, fusing and writing\n", err
+    )
 
 
 @pytest.mark.parametrize("total", [100, None])

@@ -141,6 +141,25 @@ def test_a_jump_is_not_believed() -> None:
     assert "jump" in track.reason
 
 
+@pytest.mark.parametrize(("share", "wanted"), [(0.7, True), (0.0, False)])
+def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: bool) -> None:
+    frames, _ = _sequence()
+    tracker = Tracker(SETTINGS.model_copy(update={"keyframe_agreement": share}))
+    first = tracker.track(frames[0])
+    tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+    tracker.track(frames[1])
+    assert not tracker.wants_keyframe()
+    half = frames[2].valid.copy()
+    half[:, half.shape[1] // 2 :] = False
+    track = tracker.track(replace(frames[2], valid=half))
+    assert track.status == "ok"
+    assert tracker.wants_keyframe() == wanted
+    # A new keyframe starts without a past.
+    known = replace(frames[2], T_world_camera=track.T_world_camera)
+    assert tracker.adopt(known, measured=True)
+    assert not tracker.wants_keyframe()
+
+
 def test_a_keyframe_without_depth_is_refused() -> None:
     frames, _ = _sequence()
     tracker = Tracker(SETTINGS)

@@ -48,7 +48,7 @@ class Recipe:
 
     seed: int = 0
     scene_seed: int = 1
-    steps: int = 3600
+    steps: int = 8000
     rate: float = 2e-3
     rate_end: float = 1e-5
     warm_up: int = 200

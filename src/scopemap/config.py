@@ -137,6 +137,13 @@ class OdometrySettings(Settings):
     keyframe_every: int = Field(
         10, ge=1, description="every n-th frame becomes a keyframe (the paper's first alpha: 2)"
     )
+    keyframe_agreement: float = Field(
+        0.7,
+        ge=0,
+        le=1,
+        description="a frame becomes a keyframe before its turn where it agrees with the last one in less than this "
+        "share of what the frame right after it did: a fast camera must not lose it; 0: off",
+    )
     levels: int = Field(5, ge=1, description="pyramid levels, factor 0.5")
     finest_level: int = Field(1, ge=0, description="0: full working size, 1: half")
     min_side_px: int = Field(16, ge=4, description="no level with a shorter side than this")
@@ -281,6 +288,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "networks.flow": "raft-large",
         "networks.perceptual": "lpips",
         "odometry.keyframe_every": 2,
+        "odometry.keyframe_agreement": 0.0,
         "odometry.finest_level": 0,
         "odometry.channels": "grey",
         "odometry.lamp_gamma": 0.0,

@@ -39,6 +39,7 @@ class Tracker:
         self._T_step = np.eye(4)
         self._frames_lost = 0
         self._frames_since_keyframe = 0
+        self._agreement: list[float] = []
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame, or say why there is none."""
@@ -55,11 +56,13 @@ class Tracker:
         if trouble:
             return self._lost(frame, trouble, alignment)
         self._remember(T_world_camera)
+        self._agreement.append(alignment.inlier_share * alignment.overlap)
         return _tracked(frame.index, "ok", "", T_world_camera, self._keyframe.index, alignment)
 
     def wants_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
-        return self._keyframe is None or self._frames_since_keyframe >= self.settings.keyframe_every
+        due = self._frames_since_keyframe >= self.settings.keyframe_every
+        return self._keyframe is None or due or self._fades()
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
@@ -73,8 +76,12 @@ class Tracker:
             return False
         pyramid = build_pyramid(frame, self.settings, trust_slope=measured)
         self._keyframe = _Keyframe(frame.index, frame.T_world_camera, pyramid, float(frame.depth_mm[known].mean()))
-        self._frames_since_keyframe = 0
+        self._frames_since_keyframe, self._agreement = 0, []
         return True
+
+    def _fades(self) -> bool:
+        """Whether the keyframe agrees much less with the last frame than with the first after it, however that was."""
+        return bool(self._agreement) and self._agreement[-1] < self.settings.keyframe_agreement * self._agreement[0]
 
     def _best(self, pyramid: list[View]) -> Alignment:
         keyframe = self._keyframe
