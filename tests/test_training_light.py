@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from drawn_buffers import WIDTH, sphere
 
+from training import sensor
 from training.light import INSTRUMENT, draw_light, shade
 from training.samples import make_sample
 from training.sensor import field_of_view, take_picture
@@ -88,6 +89,31 @@ def test_flipped_rays_still_belong_to_their_pixels():
         assert (sample.rays[:, 50:, 0] > 0).all()
         assert (sample.rays[:15, :, 1] < 0).all()
         assert np.linalg.norm(sample.rays, axis=-1) == pytest.approx(1, abs=1e-5)
+
+
+def test_colours_mixed_anew_leave_grey_grey_and_some_colours_none():
+    spreads = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        grey = np.full((2, 3, 3), 0.4, np.float32)
+        assert sensor._recoloured(grey, rng) == pytest.approx(grey, abs=1e-5)
+        red = np.full((2, 3, 3), [0.6, 0.2, 0.1], np.float32)
+        mixed = sensor._recoloured(red, np.random.default_rng(seed))
+        assert (mixed >= 0).all()
+        spreads.append(float(np.ptp(mixed[0, 0])))
+    assert min(spreads) < 0.2 < np.median(spreads)
+
+
+def test_strange_patches_are_smooth_and_darken_as_often_as_they_brighten():
+    factors = np.stack([sensor._stranger(64, 80, np.random.default_rng(seed)) for seed in range(40)])
+    assert factors.min() > 0.2
+    assert factors.max() < 5
+    assert np.log(factors).mean() == pytest.approx(0, abs=0.05)
+    assert 0.05 < np.log(factors).std() < 0.4
+    steps = np.abs(np.diff(np.log(factors), axis=2))
+    assert np.percentile(steps, 99) < 0.15
+    colour = np.ptp(np.log(factors), axis=-1)
+    assert colour.mean() < 0.3 * np.abs(np.log(factors)).mean()
 
 
 def test_pictures_are_bright_enough_and_some_saturate():

@@ -77,13 +77,13 @@ def _stranger(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _recoloured(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Colours mixed anew, now and then to nearly none: depth must not be read off the hue of our tissues."""
+    """Colours mixed anew, now and then to nearly none, grey left grey: depth must not be read off our tissues' hue."""
     mix = np.eye(3) + rng.normal(0, 0.12, (3, 3))
     if rng.random() < 0.2:
         grey = rng.uniform(0.5, 1.0)
         mix = (1 - grey) * mix + grey / 3
-    mix = np.clip(mix / mix.sum(1, keepdims=True), -0.2, 1.2).astype(np.float32)
-    return np.maximum(light @ mix.T, 0)
+    mix = np.clip(mix, -0.2, 1.2)
+    return np.maximum(light @ (mix / mix.sum(1, keepdims=True)).T.astype(np.float32), 0)
 
 
 def _exposed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
