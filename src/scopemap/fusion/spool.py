@@ -1,9 +1,10 @@
-"""Frames that wait to be fused, packed into a temporary file: an hour of video must not fill the memory."""
+"""Frames that wait to be fused, kept in a temporary file: an hour of video must not fill the memory."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +17,8 @@ from scopemap.frame import Frame
 # ln of millimetres in 16 bits: 0.0001 mm (uncertainties are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP, _LEAST_MM = 3e-4, 1e-4
 _MOST_CODE = 65535
+# Colours only paint the mesh: JPEG takes a fifth of the time and half of the room of what loses nothing.
+_COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
 class _Entry(NamedTuple):
@@ -43,44 +46,51 @@ class FrameSpool:
     def put(self, frame: Frame) -> None:
         """Keep a frame. Raises `InputError` where the temporary folder is full."""
         assert frame.depth_mm is not None
-        images = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), np.where(frame.valid, np.uint8(255), np.uint8(0))]
-        images += [_packed(mm) for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None]
-        codes = [cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes() for image in images]
+        parts = [
+            cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _COLOUR_QUALITY)[1].tobytes(),
+            np.packbits(frame.valid).tobytes(),
+            *(_packed(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
+        ]
         try:
-            self._file.write(b"".join(codes))
+            self._file.write(b"".join(parts))
         except OSError as error:
             raise InputError(
                 f"cannot keep frames to be fused in {tempfile.gettempdir()}: {error.strerror or error}"
             ) from None
-        sizes = [len(code) for code in codes]
+        sizes = [len(part) for part in parts]
         self._entries.append(_Entry(frame.index, frame.time_s, frame.camera, frame.T_world_camera, sizes))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames in the order they came; depths are exact to 0.015 %."""
+        """Yield the frames in the order they came; depths are exact to 0.015 %, colours to a few levels."""
         self._file.seek(0)
         for entry in self._entries:
-            bgr, valid, depth, *sigma = (self._image(size) for size in entry.sizes)
+            shape = (entry.camera.height, entry.camera.width)
+            colours, valid, depth, *sigma = (np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes)
             yield Frame(
                 entry.number,
                 entry.time_s,
-                cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB),
+                cv2.cvtColor(np.asarray(cv2.imdecode(colours, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB),
                 entry.camera,
-                valid > 0,
-                _unpacked(depth),
+                np.unpackbits(valid, count=shape[0] * shape[1]).reshape(shape).astype(bool),
+                _unpacked(depth, shape),
                 entry.T_world_camera,
-                depth_sigma_mm=_unpacked(sigma[0]) if sigma else None,
+                depth_sigma_mm=_unpacked(sigma[0], shape) if sigma else None,
             )
-
-    def _image(self, size: int) -> np.ndarray:
-        return np.asarray(cv2.imdecode(np.frombuffer(self._file.read(size), np.uint8), cv2.IMREAD_UNCHANGED))
 
 
 def _packed(mm: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
-        code = 1 + np.log(mm / _LEAST_MM) / _LOG_STEP
-    return np.where(np.isfinite(code), np.clip(np.rint(code), 1, _MOST_CODE), 0).astype(np.uint16)
+        code = np.float32(1.5 - np.log(_LEAST_MM) / _LOG_STEP) + np.log(mm) * np.float32(1 / _LOG_STEP)
+    return np.where(np.isfinite(code), np.clip(code, 1, _MOST_CODE), 0).astype(np.uint16)
 
 
-def _unpacked(code: np.ndarray) -> np.ndarray:
-    mm = _LEAST_MM * np.exp((code.astype(np.float32) - 1) * np.float32(_LOG_STEP))
-    return np.where(code > 0, mm, np.float32(np.nan))
+def _unpacked(code: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return _millimetres()[code.view(np.uint16).reshape(shape)]
+
+
+@cache
+def _millimetres() -> np.ndarray:
+    """Return the depth that each code stands for, (65536,) float32."""
+    mm = _LEAST_MM * np.exp((np.arange(_MOST_CODE + 1) - 1) * _LOG_STEP)
+    mm[0] = np.nan
+    return mm.astype(np.float32)
