@@ -55,8 +55,11 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         "track": (pipeline._tracker, "track"),
         "keyframe": (pipeline._tracker, "adopt"),
         "MAPIS": (pipeline._mapis, "refine"),
+        "wait to be fused": (pipeline._waiting, "put"),
         "fuse": (pipeline._volume, "integrate"),
     }
+    if pipeline._backend is not None:
+        parts["back end"] = (pipeline._backend, "adjust")
     for part, (owner, name) in parts.items():
         setattr(owner, name, timed(getattr(owner, name), part, seconds))
     previous = None
@@ -65,11 +68,11 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    per_frame = {
-        part: 1e3 * float(np.median(values[WARM_UP:])) for part, values in seconds.items() if part != "keyframe"
-    }
-    # Only every n-th frame is a keyframe: its cost is spread over all.
-    per_frame["keyframe"] = 1e3 * float(np.median(seconds["keyframe"][1:])) / config.odometry.keyframe_every
+    pipeline.adjust()
+    seldom = ("keyframe", "back end")
+    per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
+    # What does not happen at every frame is spread over all.
+    per_frame |= {part: 1e3 * sum(seconds[part]) / len(seconds["track"]) for part in seldom if part in seconds}
     return per_frame, (sequence.camera.width, sequence.camera.height)
 
 
@@ -105,7 +108,8 @@ def main() -> None:
         model = config.depth.model if config.depth.backend == "scopenet" else ""
         network = measure_network(options.input or Path(folder), options.frames, model)
     unit = per_frame.pop("DIS")
-    both = sum(per_frame[part] for part in ("track", "keyframe", "MAPIS", "fuse"))
+    counted = ("track", "keyframe", "MAPIS", "wait to be fused", "fuse")
+    both = sum(per_frame.get(part, 0.0) for part in counted)
     print(f"{width}x{height} px, median per frame; one DIS flow pair with its check: {unit:.1f} ms\n")
     print("| part | ms | in DIS pairs |\n|---|---|---|")
     for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + fuse**", both), *network.items()]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import wait
 from dataclasses import replace
 
 import cv2
@@ -10,7 +11,7 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.backend import Backend, Correction
+from scopemap.backend import Backend, Correction, links
 from scopemap.backend.links import Linker, corners
 from scopemap.config import BackendSettings
 from scopemap.flow import DisFlow
@@ -108,6 +109,37 @@ def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> N
     assert places[:, 1].max() < 150
     cells = places // 16
     assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+def test_keyframes_without_a_single_corner_are_no_harm() -> None:
+    speckled = np.random.default_rng(0).random(plane_scene.EVERYWHERE.shape) < 0.6
+    backend = Backend(BackendSettings())
+    for number in range(3):
+        backend.add(replace(_frame(number), valid=speckled))
+    correction = backend.adjust()
+    np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
+    assert "nothing linked" in correction.description
+
+
+def test_more_points_than_opencv_takes_columns_are_sampled() -> None:
+    flow = np.random.default_rng(0).normal(size=(180, 240, 2)).astype(np.float32)
+    pixel = np.tile([[3.0, 5.0], [10.0, 20.0], [-5.0, 2.0]], (12000, 1))
+    found = links._sampled(flow, pixel)
+    np.testing.assert_allclose(found[:2], [flow[5, 3], flow[20, 10]], atol=1e-5)
+    assert np.isnan(found[2]).all()
+    assert found.shape == (36000, 2)
+
+
+def test_what_goes_wrong_with_a_keyframe_is_heard_of_at_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: Linker, keyframe: Frame) -> None:
+        raise RuntimeError("flow broke")
+
+    monkeypatch.setattr(Linker, "add", broken)
+    backend = Backend(BackendSettings())
+    backend.add(_frame(0))
+    wait(backend._links)
+    with pytest.raises(RuntimeError, match="flow broke"):
+        backend.add(_frame(1))
 
 
 def test_outside_all_keyframes_the_nearest_correction_holds() -> None:

@@ -13,7 +13,7 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.pipeline import Estimators, Step
+from scopemap.pipeline import Estimators, Pipeline, Step
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
@@ -109,6 +109,15 @@ def test_the_run_says_what_the_back_end_did(run: _Run) -> None:
     assert any("keyframes adjusted" in note for note in notes)
     assert not any("back end" in note for note in run.tracked.provenance["notes"])
     assert run.adjusted.provenance["seconds"]["back end"] > 0
+
+
+def test_what_waited_is_fused_though_no_keyframe_ever_came(run: _Run) -> None:
+    config = with_true_depth(run.phantom, **SETTINGS)
+    pipeline = Pipeline(config, Estimators.create(config, open_sequence(run.phantom)))
+    pipeline._waiting.put(run.steps[0].frame)
+    assert pipeline.adjust() is None
+    assert len(pipeline._waiting) == 0
+    assert pipeline._volume.block_count > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:

@@ -13,7 +13,7 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -199,7 +199,7 @@ class BackendSettings(Settings):
         description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
         "predicted (measured depth tracks as well or better without)",
     )
-    gaps: tuple[int, ...] = Field(
+    gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         (1, 2, 3, 5, 8), min_length=1, description="keyframes are linked to those so many before them"
     )
     cell_px: int = Field(16, ge=4, description="one point in each cell of that size")

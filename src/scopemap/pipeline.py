@@ -87,10 +87,10 @@ class Estimators:
             create_perceptual(networks.perceptual, networks.device),
         )
 
-    def reach_mm(self, settings: DepthSettings) -> float:
-        """Return how far depth may reach, mm: as the settings say, or what the files can hold where it is measured."""
+    def reach_mm(self, settings: DepthSettings, room: float = 1.0) -> float:
+        """Return how far depth may reach, mm: `room` times the settings' word, or what files hold of measured depth."""
         measured_mm = self.depth.measured_reach_mm if isinstance(self.depth, FilesDepth) else None
-        return measured_mm or reach_mm(settings)
+        return measured_mm or room * reach_mm(settings)
 
     def provenance(self) -> dict[str, str]:
         """Return names, versions and hashes of the parts, and what fixed the scale."""
@@ -167,15 +167,15 @@ class Pipeline:
         return Step(frame, track, percept.raw_mm, refined)
 
     def adjust(self) -> Correction | None:
-        """Adjust all keyframes together after the last frame, and fuse what waited; None where there is no back end.
+        """Adjust all keyframes together after the last frame, and fuse what waited; None where nothing was adjusted.
 
         Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
         """
-        if self._backend is None or not self._backend.keyframes:
+        if self._backend is None:
             return None
-        correction = self._backend.adjust()
+        correction = self._backend.adjust() if self._backend.keyframes else None
         for frame in self._waiting.frames():
-            self._volume.integrate(correction.frame(frame))
+            self._volume.integrate(frame if correction is None else correction.frame(frame))
         self._waiting, self._backend = FrameSpool(), None
         return correction
 

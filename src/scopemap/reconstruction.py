@@ -168,11 +168,13 @@ class DepthWriter:
 
     def correct(self, records: list[FrameRecord], correction: Correction) -> None:
         """Write the depth of all tracked frames once more, with the scale that the back end gave it."""
-        for record in records:
+        for record in records if correction.taken else []:
             if record.track.status != "lost":
-                image = np.asarray(cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED))
-                units = np.where(image > 0, image * np.float32(correction.depth_factor(record.index)), np.nan)
-                self._write(record.index, units)
+                image = cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED)
+                if image is None:
+                    raise InputError(f"cannot read back {self._file(record.index)}: was it removed during the run?")
+                units = np.asarray(image) * np.float32(correction.depth_factor(record.index))
+                self._write(record.index, np.where(units > 0, units, np.nan))
 
     def _file(self, index: int) -> Path:
         return self._folder / f"{index:06d}.png"

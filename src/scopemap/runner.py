@@ -5,6 +5,7 @@ While frame i is tracked and fused in this thread, frame i+1 is read and goes th
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -48,7 +49,8 @@ def reconstruct(
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
     observers : called with each `Step` as it is done, its pose and depth as tracked: a back end has not spoken yet.
-    tracker : odometry that takes the place of ours; None: as `config.odometry` says.
+    tracker : odometry that takes the place of ours; None: as `config.odometry` says. Its keyframes are adjusted, too,
+        unless `config.backend.method` is "none".
 
     The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there.
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
@@ -60,7 +62,7 @@ def reconstruct(
     if out is not None:
         _refuse_own_input(Path(out), sequence, config)
         prepare_folder(Path(out), overwrite=overwrite)
-        writer = DepthWriter(Path(out), estimators.reach_mm(config.depth))
+        writer = DepthWriter(Path(out), _most_depth_mm(config, estimators))
         observers = (writer, *observers)
     sequence, clock = _with_best_camera(sequence, estimators), _Clock()
     config, exponent_note = _with_exponent(sequence, config, estimators, clock)
@@ -155,6 +157,12 @@ def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
     for source in [sequence.path, *([Path(folder)] if kind == "files" else [])]:
         if source.resolve().is_relative_to(out.resolve()):
             raise InputError(f"cannot write a run to {out}: its input {source} lies there; name another folder")
+
+
+def _most_depth_mm(config: Config, estimators: Estimators) -> float:
+    """How far depth may reach, mm, with room for the scale that a back end may give a frame (three deviations)."""
+    room = 1.0 if config.backend.method == "none" else math.exp(3 * config.backend.scale_sigma)
+    return estimators.reach_mm(config.depth, room)
 
 
 def _with_best_camera(sequence: Sequence, estimators: Estimators) -> Sequence:

@@ -111,9 +111,9 @@ class _System(NamedTuple):
 
 
 def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1e-3) -> Solution:
-    """Return the solution nearest to the tracked poses; never one of higher cost than where it began.
+    """Return the solution that the search finds from the tracked poses; without sightings everything stays as it is.
 
-    Sightings of points behind a camera count nothing there. Without sightings everything stays as it is.
+    A step is taken where it lowers the cost at the scale of residuals before it; that scale is then estimated anew.
     """
     count = len(problem.T_camera_world)
     state = _State(problem.T_camera_world.copy(), np.zeros(count), problem.points.log_depth.copy())
@@ -176,7 +176,7 @@ def _cauchy(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _cost(problem: Problem, state: _State, sigma: float) -> float:
     error, ahead = _errors(problem, _seen(problem, state)[0])
     points, priors = problem.points, problem.priors
-    # What walks out of sight must not be a way to save cost.
+    # A point behind a camera has no residual: it costs as much as one ten standard deviations off.
     square = np.where(ahead, (error**2).sum(1) / sigma**2, 100.0)
     depth = (state.u - points.log_depth - state.scale[points.host]) / points.sigma
     chain = sum(float(e @ (weight * e)) for _, e, weight in _chain(problem, state))

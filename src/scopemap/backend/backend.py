@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
@@ -28,7 +29,7 @@ class Backend:
         self.settings = settings
         self._linker = Linker(settings, DisFlow())
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
-        self._links: list[Future[None]] = []
+        self._links: deque[Future[None]] = deque()
         self._index: list[int] = []
         self._T_world_camera: list[np.ndarray] = []
         self._camera: PinholeCamera | None = None
@@ -45,6 +46,9 @@ class Backend:
         self._index.append(keyframe.index)
         self._T_world_camera.append(keyframe.T_world_camera)
         self._camera = keyframe.camera
+        # What went wrong with earlier keyframes is heard of now, not after the last frame.
+        while self._links and self._links[0].done():
+            self._links.popleft().result()
         self._links.append(self._worker.submit(self._linker.add, keyframe))
 
     def adjust(self) -> Correction:
@@ -54,8 +58,9 @@ class Backend:
         """
         if self._camera is None:
             raise ValueError("nothing to adjust: no keyframe was added")
-        for link in self._links:
-            link.result()
+        while self._links:
+            self._links.popleft().result()
+        self._worker.shutdown()
         camera, settings = self._camera, self.settings
         T_world_camera = np.stack(self._T_world_camera)
         priors = Priors(settings.scale_sigma, math.radians(settings.turn_sigma_deg), settings.way_sigma_share)

@@ -14,7 +14,7 @@ import numpy as np
 
 from scopemap.backend.adjustment import Points, Sightings
 from scopemap.config import BackendSettings
-from scopemap.flow import FlowEstimator, pair_flow
+from scopemap.flow import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
 
@@ -59,7 +59,9 @@ class Linker:
         share = sigma_share(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         rays = np.column_stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))])
         sigma = np.hypot(np.nan_to_num(share, nan=0.0), self.settings.depth_share)
-        self._points.append(Points(np.full(len(rows), self._keyframes), rays, np.log(depth_mm), sigma))
+        self._points.append(
+            Points(np.full(len(rows), self._keyframes), rays, np.log(depth_mm.astype(np.float64)), sigma)
+        )
         new = _Keyframe(self._keyframes, keyframe.rgb, keyframe.valid, places, self._count)
         for past in self._recent:
             if new.number - past.number in self.settings.gaps:
@@ -81,9 +83,9 @@ class Linker:
         return Sightings(point[order], keyframe[order], pixel[order])
 
     def _link(self, past: _Keyframe, new: _Keyframe) -> None:
-        flow = pair_flow(self._flow, past.rgb, new.rgb, self.settings.consistency_px)
-        self._see(new, past, flow.to_previous, flow.to_current)
-        self._see(past, new, flow.to_current, flow.to_previous)
+        to_new, to_past = self._flow.estimate_both(past.rgb, new.rgb)
+        self._see(new, past, to_past, to_new)
+        self._see(past, new, to_new, to_past)
 
     def _see(self, host: _Keyframe, other: _Keyframe, forth: np.ndarray, back: np.ndarray) -> None:
         """Note where points of `host` are seen in `other`, where the way back ends where it began."""
@@ -104,15 +106,16 @@ class Linker:
 def corners(frame: Frame, cell_px: int) -> np.ndarray:
     """Return pixels (n, 2) int x, y: the most corner-like one with depth of each cell of `cell_px` x `cell_px`.
 
-    The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every cell with usable
-    tissue gives one, however weak: where corners are few, edges and shades are better than nothing.
+    The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every whole cell with
+    usable tissue gives one, however weak, unless it is quite flat: where corners are few, edges and shades are better
+    than nothing.
     """
     assert frame.depth_mm is not None
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     # On brightness relative to its surround: far tissue is dark, not featureless.
     level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
-    usable = frame.valid & np.isfinite(frame.depth_mm)
+    usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
     # A patch that touches a mask's edge has a corner that is not the tissue's.
     usable = cv2.erode(usable.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0) > 0
     strength = np.where(usable, strength, -1.0)
@@ -126,6 +129,13 @@ def corners(frame: Frame, cell_px: int) -> np.ndarray:
 
 
 def _sampled(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Flow (n, 2) at pixels (n, 2), bilinear; NaN outside."""
-    x, y = (pixel[:, axis].astype(np.float32)[None] for axis in (0, 1))
-    return cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)[0]
+    """Flow (n, 2) at pixels (n, 2), bilinear; NaN outside. Not OpenCV's remap, which refuses none and very many."""
+    height, width = flow.shape[:2]
+    inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)
+    place = np.where(inside, pixel, 0.0)
+    corner = np.clip(np.floor(place).astype(int), 0, [width - 2, height - 2])
+    x, y = corner.T
+    a, b = (place - corner).T[..., None]
+    top = (1 - a) * flow[y, x] + a * flow[y, x + 1]
+    bottom = (1 - a) * flow[y + 1, x] + a * flow[y + 1, x + 1]
+    return np.where(inside, (1 - b) * top + b * bottom, np.nan)

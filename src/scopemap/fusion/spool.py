@@ -1,4 +1,4 @@
-"""Frames that wait to be fused, kept in a temporary file: an hour of video must not fill the memory."""
+"""Frames that wait to be fused, kept in a temporary file (4 bytes a pixel): long videos must not fill the memory."""
 
 from __future__ import annotations
 
@@ -53,9 +53,11 @@ class FrameSpool:
         ]
         try:
             self._file.write(b"".join(parts))
+            self._file.flush()
         except OSError as error:
             raise InputError(
-                f"cannot keep frames to be fused in {tempfile.gettempdir()}: {error.strerror or error}"
+                f"cannot keep frames to be fused in {tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR "
+                "to a folder with room, or backend.method=none"
             ) from None
         sizes = [len(part) for part in parts]
         self._entries.append(_Entry(frame.index, frame.time_s, frame.camera, frame.T_world_camera, sizes))
