@@ -57,7 +57,10 @@ class DepthSettings(Settings):
         description="anchor = factor: nearest tissue of frame 1 at 1000 mm over this (an ablation)",
     )
     reanchor_every: int = Field(
-        0, ge=0, description="ask a metric anchor again every n-th frame (best a multiple of keyframe_every); 0: once"
+        0,
+        ge=0,
+        description="ask a metric anchor again every n-th frame (best a multiple of keyframe_every, with "
+        "keyframe_agreement 0); 0: once",
     )
     near_far_mm: tuple[float, float] | None = Field(None, description="nearest and farthest tissue in frame 1, mm")
     fit_shift: bool = Field(True, description="fit scale and shift to the anchor; False: the paper's baseline only")
@@ -142,7 +145,7 @@ class OdometrySettings(Settings):
         ge=0,
         le=1,
         description="a frame becomes a keyframe before its turn where it agrees with the last one in less than this "
-        "share of what the frame right after it did: a fast camera must not lose it; 0: off",
+        "share of what the first one tracked against it did: a fast camera must not lose it; 0: off",
     )
     levels: int = Field(5, ge=1, description="pyramid levels, factor 0.5")
     finest_level: int = Field(1, ge=0, description="0: full working size, 1: half")
