@@ -29,7 +29,10 @@ from scopemap.trajectory import read_trajectory
 
 COLOUR = ["Steinbruecker (Open3D)", "Park (Open3D)"]
 CLOUDS = ["Point-to-point ICP (Open3D)", "Point-to-plane ICP (Open3D)"]
-PLAIN = {"mapis__frame_scale": "none", "mapis__blend": "none", "fusion__enabled": False, "networks__flow": "none"}
+PLAIN = {
+    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
+    **{"backend__method": "none", "fusion__enabled": False},
+}
 CAMERA = PinholeCamera(140.0, 140.0, 79.5, 63.5, 160, 128)
 
 

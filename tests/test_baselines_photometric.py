@@ -26,7 +26,10 @@ from scopemap.reconstruction import Reconstruction
 from scopemap.runner import reconstruct
 from scopemap.trajectory import read_trajectory
 
-PLAIN = {"mapis__frame_scale": "none", "mapis__blend": "none", "fusion__enabled": False, "networks__flow": "none"}
+PLAIN = {
+    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
+    **{"backend__method": "none", "fusion__enabled": False},
+}
 CAMERA = PinholeCamera(40.0, 40.0, 31.5, 23.5, 64, 48)
 
 
