@@ -16,6 +16,8 @@ from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.se3 import se3, so3_exp, transform
 
+SETTINGS = FusionSettings(voxel_mm=1.0)
+
 CAMERA = PinholeCamera(200.6, 200.5, 167.0, 136.7, 337, 270)
 RADIUS_MM = 20.0
 REACH_MM = 100.0
@@ -40,8 +42,8 @@ def tube_frame(index: int) -> Frame:
 def main(count: int) -> None:
     """Fuse `count` frames and print the figures."""
     frames = [tube_frame(index) for index in range(count)]
-    TsdfVolume(FusionSettings()).integrate(frames[0])
-    volume, times_ms = TsdfVolume(FusionSettings()), []
+    TsdfVolume(SETTINGS).integrate(frames[0])
+    volume, times_ms = TsdfVolume(SETTINGS), []
     for frame in frames:
         start = time.perf_counter()
         volume.integrate(frame)

@@ -23,6 +23,7 @@ from scopemap.cli.options import parse_settings
 from scopemap.config import Config
 from scopemap.datasets import open_sequence
 from scopemap.flow import DisFlow, pair_flow
+from scopemap.fusion import TsdfVolume
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 
@@ -56,7 +57,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         "keyframe": (pipeline._tracker, "adopt"),
         "MAPIS": (pipeline._mapis, "refine"),
         "wait to be fused": (pipeline._waiting, "put"),
-        "fuse": (pipeline._volume, "integrate"),
+        "fuse": (TsdfVolume, "integrate"),
     }
     if pipeline._backend is not None:
         parts["back end"] = (pipeline._backend, "adjust")
@@ -68,7 +69,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    pipeline.adjust()
+    pipeline.fuse(pipeline.adjust())
     seldom = ("keyframe", "back end")
     per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
     # What does not happen at every frame is spread over all.

@@ -21,7 +21,7 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
-LENIENT = FusionSettings(max_depth_mm=150.0, min_weight=0.2)
+LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, min_weight=0.2)
 GREY = (120, 110, 100)
 
 
@@ -174,7 +174,8 @@ def test_weight_follows_its_formula() -> None:
 
 
 def test_min_weight_needs_a_second_look() -> None:
-    volume, frame = TsdfVolume(FusionSettings(min_weight=1.0)), plane_frame(np.array([0.0, 0.0, 1.0]), 40.0)
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, min_weight=1.0))
+    frame = plane_frame(np.array([0.0, 0.0, 1.0]), 40.0)
     volume.integrate(frame)
     assert len(volume.extract_mesh().faces) == 0
     volume.integrate(frame)

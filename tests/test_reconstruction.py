@@ -257,7 +257,7 @@ def test_what_cannot_be_written_is_an_input_error(run: _Run, tmp_path: Path) -> 
 
 
 def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) -> None:
-    """Measured depth is known however far it is: ten centimetres of phantom, taken as ten metres."""
+    """Measured depth is known however far it is: ten centimetres of phantom, taken as ten metres, in larger voxels."""
     config = with_true_depth(run.phantom, depth__files_scale_mm=0.15)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config, out=tmp_path / "out")
     scale_mm = json.loads((tmp_path / "out" / "depth" / "depth.json").read_text())["scale_mm"]
@@ -265,8 +265,15 @@ def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) ->
     depth = cv2.imread(str(tmp_path / "out" / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED) * scale_mm
     assert (depth > 0).mean() > 0.9
     assert np.median(depth) > 1000
+    assert result.provenance["warnings"] == []
+    assert result.config.fusion.voxel_mm == pytest.approx(100 * run.result.config.fusion.voxel_mm, rel=0.1)
+    assert np.ptp(result.mesh.vertices, axis=0).max() > 1000
+
+
+def test_what_is_too_far_for_a_stated_reach_is_told(run: _Run) -> None:
+    config = with_true_depth(run.phantom, fusion__max_depth_mm=20.0)
+    result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
     assert any("raise fusion.max_depth_mm and fusion.voxel_mm" in text for text in result.provenance["warnings"])
-    assert run.result.provenance["warnings"] == []
 
 
 def test_overwrite_spares_a_folder_that_is_no_run(run: _Run, tmp_path: Path) -> None:

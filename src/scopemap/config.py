@@ -220,12 +220,12 @@ class BackendSettings(Settings):
 
 
 class FusionSettings(Settings):
-    """Volumetric fusion; voxel and truncation as Endo-Depth-and-Motion uses on the same kind of data."""
+    """Volumetric fusion. Sizes that are not set follow the scene: see `scopemap.fusion.sizes`."""
 
     enabled: bool = True
-    voxel_mm: float = Field(1.0, ge=0.05)
-    truncation_mm: float = Field(5.0, ge=0.05)
-    max_depth_mm: float = Field(100.0, gt=0, description="depth beyond this is not fused")
+    voxel_mm: float | None = Field(None, ge=0.05, description="by default from the clip's median depth")
+    truncation_mm: float | None = Field(None, ge=0.05, description="by default 5 voxels")
+    max_depth_mm: float | None = Field(None, gt=0, description="depth beyond this is not fused; by default 200 voxels")
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     depth_sigma_share: float = Field(
         0.2, gt=0, description="as odometry's; no pixel counts more than without an uncertainty; large: off"
@@ -299,12 +299,17 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.start": "identity",
         "smoothing.method": "wema",
         "backend.method": "none",
+        "fusion.voxel_mm": 1.0,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
     },
     "realtime": {
         "networks.flow": "dis",
         "networks.perceptual": "structure",
         "odometry.max_iterations": 15,
         "fusion.voxel_mm": 1.5,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
         "fusion.every": 2,
         "backend.method": "none",
     },

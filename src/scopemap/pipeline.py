@@ -3,9 +3,10 @@
     frame -> mask -> raw depth -> track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS)
           -> smooth (WEMA) -> fuse (TSDF)
 
-With a back end, fusion waits until the last frame is tracked: all keyframes are adjusted together first. The `paper`
-preset has none, and refines before it tracks. Nothing here reads or writes files, looks at the clock, draws or prints:
-that is the runner's work. `perceive` is what needs no motion, so it may run a frame ahead of `step`.
+Fusion waits until the last frame is tracked where there is a back end, which adjusts all keyframes together first, and
+where the voxels are to follow the scene. The `paper` preset does neither, and refines before it tracks. Nothing here
+reads or writes files, looks at the clock, draws or prints: that is the runner's work. `perceive` is what needs no
+motion, so it may run a frame ahead of `step`.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import numpy as np
 import trimesh
 
 from scopemap.backend import Backend, Correction
-from scopemap.config import Config, DepthSettings
+from scopemap.config import Config, DepthSettings, FusionSettings
 from scopemap.datasets import Sequence
 from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.flow import FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Frame
-from scopemap.fusion import FrameSpool, TsdfVolume
+from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import pull
 from scopemap.masking import Masker, is_constant
@@ -122,7 +123,8 @@ class Pipeline:
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
         self._backend = Backend(config.backend) if config.backend.method == "full" else None
-        self._volume = TsdfVolume(config.fusion)
+        waits = self._backend is not None or follows_scene(config.fusion)
+        self._volume = None if waits else TsdfVolume(config.fusion)
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
@@ -167,21 +169,37 @@ class Pipeline:
         return Step(frame, track, percept.raw_mm, refined)
 
     def adjust(self) -> Correction | None:
-        """Adjust all keyframes together after the last frame, and fuse what waited; None where nothing was adjusted.
+        """Adjust all keyframes together after the last frame; None where nothing was adjusted.
 
         Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
         """
-        if self._backend is None:
-            return None
-        correction = self._backend.adjust() if self._backend.keyframes else None
+        return self._backend.adjust() if self._backend is not None and self._backend.keyframes else None
+
+    def fuse(self, correction: Correction | None = None) -> None:
+        """Fuse what waited, in voxels that suit it, as `adjust` corrected it."""
+        if self._waiting.typical_mm is None:
+            return
+        volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, self._waiting.typical_mm))
         for frame in self._waiting.frames():
-            self._volume.integrate(frame if correction is None else correction.frame(frame))
-        self._waiting, self._backend = FrameSpool(), None
-        return correction
+            volume.integrate(frame if correction is None else correction.frame(frame))
+        self._waiting, self._volume = FrameSpool(), volume
+
+    @property
+    def fusion_settings(self) -> FusionSettings:
+        """The settings of fusion, with the sizes that were chosen once anything is fused."""
+        fusion = self.config.fusion
+        return fusion if self._volume is None else with_sizes(fusion, self._volume.sizes)
+
+    @property
+    def fusion_note(self) -> list[str]:
+        """What to say of sizes that nobody set; nothing where there is nothing to say."""
+        if self._volume is None or not follows_scene(self.config.fusion):
+            return []
+        return [f"fusion: {described(self._volume.sizes)}"]
 
     def surface(self) -> trimesh.Trimesh:
         """Return the surface of all fused frames, world mm; may be empty."""
-        return self._volume.extract_mesh()
+        return trimesh.Trimesh() if self._volume is None else self._volume.extract_mesh()
 
     def _keyed(self, track: Track, frame: Frame, *, measured: bool) -> Track:
         """Make the frame a keyframe where one is due; a first frame that cannot be one fixes no world and is lost."""
@@ -227,8 +245,8 @@ class Pipeline:
 
     def _fuse(self, frame: Frame) -> None:
         if self.config.fusion.enabled and self._fusable % self.config.fusion.every == 0:
-            if self._backend is None:
-                self._volume.integrate(frame)
-            else:
+            if self._volume is None:
                 self._waiting.put(frame)
+            else:
+                self._volume.integrate(frame)
         self._fusable += 1

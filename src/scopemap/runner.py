@@ -52,7 +52,8 @@ def reconstruct(
     tracker : odometry that takes the place of ours; None: as `config.odometry` says. Its keyframes are adjusted, too,
         unless `config.backend.method` is "none".
 
-    The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there.
+    The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there, and so
+    is the size of the voxels.
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
     """
     config = config or Config()
@@ -80,12 +81,15 @@ def reconstruct(
         records = corrected(records, correction)
         if writer is not None:
             clock.timed("depth corrected", writer.correct, records, correction)
+    clock.timed("fuse", pipeline.fuse, correction)
+    config = config.model_copy(update={"fusion": pipeline.fusion_settings})
     mesh = clock.timed("mesh", pipeline.surface)
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
     provenance["notes"] += exponent_note
     provenance["warnings"] += distances.warnings(config.fusion)
     provenance["notes"] += [] if correction is None else [correction.description]
+    provenance["notes"] += pipeline.fusion_note
     result = Reconstruction(sequence.camera, records, mesh, config, provenance)
     if out is not None:
         result.save(Path(out))
@@ -120,7 +124,7 @@ class _Distances:
 
     def warnings(self, settings: FusionSettings) -> list[str]:
         """Return what there is to say of all frames so far."""
-        if not settings.enabled or not self._medians_mm:
+        if not settings.enabled or not self._medians_mm or settings.max_depth_mm is None:
             return []
         median_mm = float(np.median(self._medians_mm))
         if median_mm <= settings.max_depth_mm:

@@ -1,7 +1,8 @@
 """Volumetric fusion: posed depth frames to one coloured triangle mesh."""
 
 from scopemap.fusion.mesh import save_mesh
+from scopemap.fusion.sizes import Sizes, choose_sizes, described, follows_scene, with_sizes
 from scopemap.fusion.spool import FrameSpool
 from scopemap.fusion.volume import TsdfVolume
 
-__all__ = ["FrameSpool", "TsdfVolume", "save_mesh"]
+__all__ = ["FrameSpool", "Sizes", "TsdfVolume", "choose_sizes", "described", "follows_scene", "save_mesh", "with_sizes"]

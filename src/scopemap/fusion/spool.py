@@ -29,6 +29,7 @@ class _Entry(NamedTuple):
     camera: PinholeCamera
     T_world_camera: np.ndarray | None
     sizes: list[int]
+    median_mm: float
 
 
 class FrameSpool:
@@ -42,6 +43,12 @@ class FrameSpool:
     def __len__(self) -> int:
         """Return how many frames wait."""
         return len(self._entries)
+
+    @property
+    def typical_mm(self) -> float | None:
+        """Median of the frames' median depths, mm; None where no depth is known."""
+        medians_mm = [entry.median_mm for entry in self._entries if np.isfinite(entry.median_mm)]
+        return float(np.median(medians_mm)) if medians_mm else None
 
     def put(self, frame: Frame) -> None:
         """Keep a frame. Raises `InputError` where the temporary folder is full."""
@@ -60,7 +67,9 @@ class FrameSpool:
                 "to a folder with room, or backend.method=none"
             ) from None
         sizes = [len(part) for part in parts]
-        self._entries.append(_Entry(frame.index, frame.time_s, frame.camera, frame.T_world_camera, sizes))
+        self._entries.append(
+            _Entry(frame.index, frame.time_s, frame.camera, frame.T_world_camera, sizes, _median_mm(frame))
+        )
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames in the order they came; depths are exact to 0.015 %, colours to a few levels."""
@@ -78,6 +87,14 @@ class FrameSpool:
                 entry.T_world_camera,
                 depth_sigma_mm=_unpacked(sigma[0], shape) if sigma else None,
             )
+
+
+def _median_mm(frame: Frame) -> float:
+    """Median of the known depth in a frame's usable pixels, mm; NaN where there is none."""
+    assert frame.depth_mm is not None
+    some_mm = frame.depth_mm[::4, ::4][frame.valid[::4, ::4]]
+    some_mm = some_mm[np.isfinite(some_mm)]
+    return float(np.median(some_mm)) if some_mm.size else float("nan")
 
 
 def _packed(mm: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ class _Piece:
     faces: np.ndarray
 
 
-def extract_surface(blocks: VoxelBlocks, settings: FusionSettings) -> trimesh.Trimesh:
+def extract_surface(blocks: VoxelBlocks, settings: FusionSettings, voxel_mm: float) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 
     Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole, and so does the
@@ -46,20 +46,18 @@ def extract_surface(blocks: VoxelBlocks, settings: FusionSettings) -> trimesh.Tr
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
-    pieces = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, settings) for corner in corners]
+    pieces = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
     mesh = _weld([piece for piece in pieces if piece is not None])
     vertices, faces, colours = _without_floaters(*mesh, settings.min_component_share)
-    return trimesh.Trimesh(
-        vertices * settings.voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False
-    )
+    return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False)
 
 
-def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, settings: FusionSettings) -> _Piece | None:
+def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min_weight: float) -> _Piece | None:
     chunk = Voxels(*(array[(slice(_CHUNK + 1),) * 3] for array in blocks.dense(corner, _CHUNK_BLOCKS + 1)))
-    smallest = _SMALLEST_DISTANCE_VOXELS * settings.voxel_mm
+    smallest = _SMALLEST_DISTANCE_VOXELS * voxel_mm
     tsdf = np.where(np.abs(chunk.tsdf) < smallest, np.copysign(np.float32(smallest), chunk.tsdf), chunk.tsdf)
-    known = chunk.weight >= max(settings.min_weight, np.finfo(np.float32).tiny)
-    cells = _crossed_cells(tsdf, known, _LARGEST_SPREAD_VOXELS * settings.voxel_mm)
+    known = chunk.weight >= max(min_weight, np.finfo(np.float32).tiny)
+    cells = _crossed_cells(tsdf, known, _LARGEST_SPREAD_VOXELS * voxel_mm)
     if not cells.any():
         return None
     # scikit-image reads the mask of a cell at the cell's last corner.

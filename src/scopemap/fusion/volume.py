@@ -10,6 +10,7 @@ import trimesh
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion.blocks import VoxelBlocks
+from scopemap.fusion.sizes import Sizes, choose_sizes
 from scopemap.fusion.surface import extract_surface
 from scopemap.fusion.tsdf import (
     BLOCK,
@@ -29,10 +30,15 @@ _LEAST_INCIDENCE = 0.05
 
 
 class TsdfVolume:
-    """An unbounded truncated signed distance field that grows with the frames fused into it."""
+    """An unbounded truncated signed distance field that grows with the frames fused into it.
 
-    def __init__(self, settings: FusionSettings) -> None:
+    sizes : of voxels, truncation and reach; by default those of the settings, which must then name `voxel_mm`
+    (`ValueError` otherwise).
+    """
+
+    def __init__(self, settings: FusionSettings, sizes: Sizes | None = None) -> None:
         self.settings = settings
+        self.sizes = sizes or choose_sizes(settings)
         self._blocks = VoxelBlocks()
 
     @property
@@ -48,17 +54,17 @@ class TsdfVolume:
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or out of reach.
         """
         depth_mm, T_world_camera = self._checked(frame)
-        camera, settings = frame.camera, self.settings
+        camera, settings, reach_mm = frame.camera, self.settings, self.sizes.max_depth_mm
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         view = View(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         steepest = max(settings.min_incidence, _LEAST_INCIDENCE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
-        grid = Grid(settings.voxel_mm, settings.truncation_mm, step)
+        grid = Grid(self.sizes.voxel_mm, self.sizes.truncation_mm, step)
         with np.errstate(invalid="ignore"):
-            usable = frame.valid & (depth_mm > 0) & (depth_mm <= settings.max_depth_mm)
+            usable = frame.valid & (depth_mm > 0) & (depth_mm <= reach_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, view, step, settings.min_incidence, settings.max_depth_mm)
+        surface = measure_surface(inverse_depth, view, step, settings.min_incidence, reach_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
         surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
         keys = np.unique(touched_blocks(surface.inverse_depth, view, grid))
@@ -67,15 +73,15 @@ class TsdfVolume:
 
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
-        return extract_surface(self._blocks, self.settings)
+        return extract_surface(self._blocks, self.settings, self.sizes.voxel_mm)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         for name in ("depth_mm", "T_world_camera"):
             if getattr(frame, name) is None:
                 raise ValueError(f"fusing frame {frame.index}: it has no {name}; fuse tracked frames with depth only")
         depth_mm, T_world_camera = np.asarray(frame.depth_mm, np.float32), np.asarray(frame.T_world_camera, np.float64)
-        reach_mm = (KEY_OFFSET - 1) * BLOCK * self.settings.voxel_mm
-        reach_mm -= 4 * self.settings.max_depth_mm + self.settings.truncation_mm
+        reach_mm = (KEY_OFFSET - 1) * BLOCK * self.sizes.voxel_mm
+        reach_mm -= 4 * self.sizes.max_depth_mm + self.sizes.truncation_mm
         if not np.all(np.abs(T_world_camera[:3]) <= reach_mm):
             raise ValueError(
                 f"fusing frame {frame.index}: its pose is not finite or over {reach_mm:.0f} mm from the origin; "

@@ -44,7 +44,7 @@ class PipelineMethod:
         result = reconstruct(task.sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
         frames, seconds = len(result.records), result.provenance["seconds"]
         # What comes after the last frame belongs to all of them.
-        afterwards = sum(seconds.get(part, 0.0) for part in ("back end", "depth corrected"))
+        afterwards = sum(seconds.get(part, 0.0) for part in ("back end", "depth corrected", "fuse"))
         return Timing(
             ms_per_frame=1e3 * ((finished[-1] - finished[0]) / max(frames - 1, 1) + afterwards / frames),
             track_ms_per_frame=1e3 * tracker.seconds / frames,
