@@ -127,6 +127,26 @@ def test_frame_scale_corrects_a_wrong_factor_exactly(kind: Any, factor: float) -
     np.testing.assert_allclose(refined.depth_mm, DEPTH, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("pull", "least", "most"), [(0.0, 6.0, 8.0), (0.1, 1.2, 2.0)])
+def test_a_chain_that_little_holds_does_not_run_away(pull: float, least: float, most: float) -> None:
+    """A motion that is wrong says at each frame that all went 2 mm away, in three tenths of the image."""
+    mapis = _mapis(frame_scale="robust", blend="none", scale_pull=pull)
+    consistent = np.zeros(SHAPE, bool)
+    consistent[:, : round(0.3 * SHAPE[1])] = True
+    link = Correspondence(_link().to_previous, consistent, _link().distance)
+    flat, away = np.full(SHAPE, 40.0, np.float32), se3(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    mapis.refine(flat, "depth", CAMERA, None, None)
+    scales = [mapis.refine(flat, "depth", CAMERA, link, away).scale for _ in range(120)]
+    assert least < scales[-1] < most
+
+
+def test_a_chain_that_all_holds_is_left_alone() -> None:
+    mapis = _mapis(frame_scale="robust", blend="none")
+    mapis.refine(DEPTH, "depth", CAMERA, None, None)
+    scales = [mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None).scale for _ in range(100)]
+    np.testing.assert_allclose(scales, 0.5, rtol=1e-4)
+
+
 def test_scale_with_the_motion_keeps_an_approach_and_without_cancels_it() -> None:
     flat = np.full(SHAPE, 40.0, np.float32)
     for motion, depth_mm in ((APPROACH, 35.0), (None, 40.0)):

@@ -101,6 +101,13 @@ class MapisSettings(Settings):
     frame_scale: Literal["auto", "none", "robust"] = Field(
         "auto", description="robust scale of each frame against the warped previous depth; auto: not for measured depth"
     )
+    scale_pull: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="share of ln of that scale that is given up per frame which nothing links to the one before it; "
+        "less, by the square, where more of it is linked; 0: off",
+    )
     blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = Field(
         "auto", description="weight of the warped depth; auto: linear, none for measured depth"
     )
@@ -168,6 +175,14 @@ class OdometrySettings(Settings):
     )
     depth_sigma_share: float = Field(
         0.05, gt=0, description="relative error that all depth has anyhow: more uncertain pixels count less; large: off"
+    )
+    depth_share: float = Field(
+        1.0,
+        ge=0,
+        description="weight of the distance to the frame's own depth where that is measured, point to plane; 0: off",
+    )
+    least_depth_sigma: float = Field(
+        1e-3, gt=0, description="least standard deviation of that distance, share of the keyframe's mean depth"
     )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
@@ -296,6 +311,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.channels": "grey",
         "odometry.lamp_gamma": 0.0,
         "odometry.gain_bias": False,
+        "odometry.depth_share": 0.0,
         "odometry.start": "identity",
         "smoothing.method": "wema",
         "backend.method": "none",

@@ -95,8 +95,10 @@ class Mapis:
             self._scale, link = 1.0, None
         share = sigma_share(raw_mm, sigma_mm)
         warped_mm, warped_share = self._warped(camera, link, T_current_previous, share)
+        overlap = float(np.isfinite(warped_mm).mean())
         if self._scales(kind):
-            self._scale = robust_scale(raw_mm, warped_mm, self._scale)
+            found = robust_scale(raw_mm, warped_mm, self._scale)
+            self._scale = found if link is None or self._carried is None else self._held(found, overlap)
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm, refined_share = scaled_mm, share
         blend = self._blend(kind)
@@ -106,7 +108,6 @@ class Mapis:
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_share = blended_share(weight, warped_share, share)
         self._carried = _Carried(depth_mm, refined_share) if self.settings.recursive else _Carried(scaled_mm, share)
-        overlap = float(np.isfinite(warped_mm).mean())
         return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
 
     def links(self, kind: DepthKind) -> bool:
@@ -120,6 +121,13 @@ class Mapis:
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
+
+    def _held(self, scale: float, overlap: float) -> float:
+        """Pull a chain of scales back to the estimator's own the more, the less of the image holds it.
+
+        The links' errors add up, and where tissue rushes by they have a sign: depth would grow or shrink without end.
+        """
+        return float(scale ** (1 - self.settings.scale_pull * (1 - overlap) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
         if self.settings.blend != "auto":

@@ -1,4 +1,4 @@
-"""The photometric residual and its normal equations, fused: one pass over the pixels, nothing per pixel is stored.
+"""The residuals of tracking and their normal equations, fused: one pass over the pixels, nothing per pixel is stored.
 
 For a reference pixel p with depth, X = depth * ray(p) and X' = T_current_reference X, each channel c of the images has
 
@@ -11,6 +11,11 @@ m . X = 1 it is cos' / cos = (1 + m . R^T t) |X| / |X'|, and m is read off the g
 normalised channel is blind to light: it has neither gain nor bias nor fall-off. Parameters of the normal equations, in
 this order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference,
 gain, bias.
+
+Where the current depth D is measured, too, a geometric residual joins them, the distance from X' to the tangent plane
+of D where it lands, over `unit_mm` (point to plane: Chen and Medioni, 1992, with projective data association):
+
+    r_d(p) = (D(project(X')) - z') / (|grad (D(project(X')) - z')| unit_mm)
 
 One thread on purpose: a pass is a few milliseconds of work at most, the other core has the networks to do, and waking
 threads some fifty times a frame was many times slower than one thread on a busy machine.
@@ -26,6 +31,8 @@ from numba import njit
 PARAMETERS = 8
 _PAIRS = PARAMETERS * (PARAMETERS + 1) // 2
 _SUMS = _PAIRS + PARAMETERS + 2  # upper triangle, gradient, cost, weight
+_ONE_SURFACE = 0.1  # relative spread of four neighbouring depths that is still one surface
+_SAME_PLACE = 0.1  # relative difference of depths that may be the same tissue
 
 
 class View(NamedTuple):
@@ -37,7 +44,7 @@ class View(NamedTuple):
     weight : (H, W) float32, 0 where a pixel must not be used; the current image's 0 or 1.
     slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = parallel to the image,
     or unknown.
-    depth_mm : (H, W) float32, NaN = unknown (only the reference's is read).
+    depth_mm : (H, W) float32, NaN = unknown (the current's is read for the geometric residual only).
     intrinsics : (4,) float64 fx, fy, cx, cy in px of this level.
     """
 
@@ -56,6 +63,7 @@ class Loss(NamedTuple):
     sigma : (C,) float64, robust standard deviation s of each channel's residuals. threshold : in units of s.
     share : (C,) float64, how much each channel counts.
     lit : (C,) bool, whether gain, bias and the lamp apply to the channel. gamma : exponent of the lamp, 0 = no lamp.
+    depth_sigma, depth_share : the same of the geometric residual; share 0: none.
     """
 
     sigma: np.ndarray
@@ -63,6 +71,8 @@ class Loss(NamedTuple):
     share: np.ndarray
     lit: np.ndarray
     gamma: float
+    depth_sigma: float = 1.0
+    depth_share: float = 0.0
 
 
 class NormalEquations(NamedTuple):
@@ -128,6 +138,40 @@ def _tilt(reference, T, row, column):  # type: ignore[no-untyped-def]
     return 0.0, 0.0, 0.0, 1.0  # a plane seen from its edge or from behind: its tilt says nothing
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _gap(current, moved, place):  # type: ignore[no-untyped-def]
+    """Distance of X' from the tangent plane of the current depth, mm, and its derivative by X'; NaN across an edge.
+
+    moved : X'. place : where it lands, in its cell and the cell (column, row).
+    """
+    (x, y, z), (a, b, i, j), depth = moved, place, current.depth_mm
+    d00, d10, d01, d11 = float(depth[j, i]), float(depth[j, i + 1]), float(depth[j + 1, i]), float(depth[j + 1, i + 1])
+    nearest, farthest = min(d00, d10, d01, d11), max(d00, d10, d01, d11)
+    # The comparison fails where any of them is unknown.
+    if not (
+        farthest - nearest < _ONE_SURFACE * nearest and abs(d00 + d11 + d10 + d01 - 4.0 * z) < 4.0 * _SAME_PLACE * z
+    ):
+        return np.nan, 0.0, 0.0, 0.0
+    D, du, dv = _bilinear(depth, a, b, i, j)
+    gx, gy = du * current.intrinsics[0] / z, dv * current.intrinsics[1] / z
+    gz = -(gx * x + gy * y) / z - 1.0
+    length = np.sqrt(gx * gx + gy * gy + gz * gz)
+    return (D - z) / length, gx / length, gy / length, gz / length
+
+
+@njit(cache=True, nogil=True)
+def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: ignore[no-untyped-def]
+    """Return the geometric residual (H, W) float32 on the reference's grid, NaN where there is none."""
+    h, w = reference.weight.shape
+    out = np.full((h, w), np.nan, np.float32)
+    for row in range(h):
+        for column in range(w):
+            x, y, z, a, b, i, j, _, weight = _land(reference, current, T_current_reference, row, column)
+            if weight > 0.0:
+                out[row, column] = _gap(current, (x, y, z), (a, b, i, j))[0] / unit_mm
+    return out
+
+
 @njit(cache=True, nogil=True)
 def residual_images(reference, current, T_current_reference, affine, loss):  # type: ignore[no-untyped-def]
     """Return residuals (C, H, W) float32 on the reference's grid, NaN where a pixel is not used."""
@@ -147,6 +191,15 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
                     expected = affine[0] * lamp * expected + affine[1]
                 out[c, row, column] = value - expected
     return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
+    """Cost and information of a residual."""
+    size, information = abs(r), weight / (s * s)
+    if size <= threshold * s:
+        return 0.5 * information * r * r, information
+    return information * threshold * s * (size - 0.5 * threshold * s), information * threshold * s / size
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -175,6 +228,16 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
             distance = x * x + y * y + z * z
             mx, my, mz, lift = _tilt(reference, T, row, column)
             lamp = ((square / distance) ** 1.5 * lift) ** loss.gamma
+            if loss.depth_share > 0.0:
+                gap, nx, ny, nz = _gap(current, (x, y, z), (a, b, i, j))
+                if np.isfinite(gap):
+                    r, s = gap / unit_mm, loss.depth_sigma
+                    cost, information = _huber(r, s, loss.threshold, loss.depth_share * weight)
+                    sums[_SUMS - 2] += cost
+                    turn = 1.0 / unit_mm
+                    J[0], J[1], J[2] = turn * (y * nz - z * ny), turn * (z * nx - x * nz), turn * (x * ny - y * nx)
+                    J[3], J[4], J[5] = nx, ny, nz
+                    _add(sums, J, r, information, PARAMETERS - 2)
             # -d ln(lamp) / dX', for translations; the lamp sits in the camera's centre: turning changes nothing.
             kx = loss.gamma * (3.0 * x / distance - mx / lift)
             ky = loss.gamma * (3.0 * y / distance - my / lift)
@@ -192,13 +255,8 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
                     J[6], J[7] = -shown, -1.0
                 else:
                     r = value - shown
-                size, s = abs(r), loss.sigma[c]
-                information = loss.share[c] * weight / (s * s)
-                if size <= loss.threshold * s:
-                    sums[_SUMS - 2] += 0.5 * information * r * r
-                else:
-                    sums[_SUMS - 2] += information * loss.threshold * s * (size - 0.5 * loss.threshold * s)
-                    information *= loss.threshold * s / size
+                cost, information = _huber(r, loss.sigma[c], loss.threshold, loss.share[c] * weight)
+                sums[_SUMS - 2] += cost
                 gx, gy = du * fx, dv * fy
                 gz = -(gx * x + gy * y) / z
                 J[0], J[1], J[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx

@@ -14,7 +14,7 @@ import numpy as np
 from scopemap.config import OdometrySettings
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 from scopemap.odometry.dogleg import Options, Problem, Quadratic, minimise
-from scopemap.odometry.residuals import PARAMETERS, Loss, View, normal_equations, residual_images
+from scopemap.odometry.residuals import PARAMETERS, Loss, View, depth_residuals, normal_equations, residual_images
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
 _MAD_TO_SIGMA = 1.4826
@@ -81,6 +81,12 @@ def _align_level(
 ) -> tuple[Motion, int]:
     start = _residuals(reference, current, motion, settings)
     loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
+    if settings.depth_share > 0 and np.isfinite(current.depth_mm).any():
+        gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
+        gaps = gaps[np.isfinite(gaps)]
+        if gaps.size:
+            sigma = max(_robust_sigma(gaps, least=0.0), settings.least_depth_sigma)
+            loss = loss._replace(depth_sigma=sigma, depth_share=settings.depth_share)
     least_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
         [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
@@ -103,8 +109,8 @@ def _align_level(
     return solution.state, solution.iterations
 
 
-def _robust_sigma(residuals: np.ndarray) -> float:
+def _robust_sigma(residuals: np.ndarray, least: float = 1e-3) -> float:
     """Standard deviation from the median absolute value; a small floor keeps flat images from dividing by zero."""
     if residuals.size == 0:
-        return 1e-3
-    return max(float(_MAD_TO_SIGMA * np.median(np.abs(residuals))), 1e-3)
+        return least
+    return max(float(_MAD_TO_SIGMA * np.median(np.abs(residuals))), least)

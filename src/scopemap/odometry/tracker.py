@@ -23,6 +23,7 @@ class _Keyframe:
     T_world_camera: np.ndarray
     pyramid: list[View]
     depth_mm: float  # mean
+    measured: bool
 
 
 class Tracker:
@@ -48,8 +49,9 @@ class Tracker:
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
         if self._keyframe is None:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
-        # The keyframe's points are moved: the depth of the frame itself has no say.
-        pyramid = build_pyramid(replace(frame, depth_mm=None, depth_sigma_mm=None), self.settings)
+        # The keyframe's points are moved: the depth of the frame itself has no say, unless it was measured.
+        depth_mm = frame.depth_mm if self._keyframe.measured else None
+        pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
         alignment = self._best(pyramid)
         T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
         trouble = self._trouble(alignment, T_world_camera)
@@ -75,7 +77,8 @@ class Tracker:
         if known.mean() < self.settings.min_valid_share:
             return False
         pyramid = build_pyramid(frame, self.settings, trust_slope=measured)
-        self._keyframe = _Keyframe(frame.index, frame.T_world_camera, pyramid, float(frame.depth_mm[known].mean()))
+        mean_mm = float(frame.depth_mm[known].mean())
+        self._keyframe = _Keyframe(frame.index, frame.T_world_camera, pyramid, mean_mm, measured)
         self._frames_since_keyframe, self._agreement = 0, []
         return True
 
