@@ -140,3 +140,21 @@ def test_fields_of_view_leave_most_of_the_picture():
     shares = [field_of_view(96, 128, np.random.default_rng(n)).mean() for n in range(100)]
     assert min(shares) > 0.3
     assert max(shares) == 1.0
+
+
+def test_nothing_strange_is_drawn_where_nothing_strange_is_wanted(monkeypatch):
+    drawn = []
+
+    def counted(light, *others):
+        drawn.append(len(others))
+        return 1.0 if len(others) == 2 else light
+
+    for name in ("_stranger", "_recoloured"):
+        monkeypatch.setattr(sensor, name, counted)
+    light = np.full((48, 64, 3), 1.0, np.float32)
+    for strange, least, most in ((False, 0, 0), (True, 10, 50)):
+        drawn.clear()
+        for n in range(40):
+            take_picture(light, np.random.default_rng(n), strange=strange)
+        for effect in (1, 2):
+            assert least <= drawn.count(effect) <= most

@@ -1,6 +1,7 @@
 """The training loop on a handful of drawn scenes: it learns, goes on where it was stopped, exports what it learnt."""
 
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -17,10 +18,10 @@ from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.depth.scopenet.network import TYPICAL_LOG_MM, ScopeNet
 from training.buffers import create_store, open_store, thinned
 from training.calibrate import calibrated, fit_calibration
-from training.evaluate import score_pictures
+from training.evaluate import Look, score_pictures
 from training.export import export
 from training.recipe import Part, Recipe, Use
-from training.report import write_report
+from training.report import LOOKS, main, write_report
 from training.train import Training
 
 SMALL = Part("small", WIDTH, HEIGHT, 4)
@@ -78,6 +79,26 @@ def test_a_training_can_begin_from_the_weights_of_another(scenes, whole, tmp_pat
         assert torch.equal(value, begun[name].float()), name
 
 
+@pytest.mark.parametrize("fixed", [True, False])
+def test_statistics_stay_those_of_use_where_they_are_to(scenes, whole, tmp_path, fixed):
+    export(whole[0], tmp_path / "start.safetensors", {})
+    recipe = replace(RECIPE, seed=5, steps=2, fixed_statistics=fixed)
+    assert Recipe.read(_written(tmp_path / "recipe.toml", recipe)).fixed_statistics is fixed
+    folder = tmp_path / "run"
+    folder.mkdir()
+    network = Training(recipe, scenes, folder, "cpu", lambda text: None, start=tmp_path / "start.safetensors").run()
+    begun = load_file(tmp_path / "start.safetensors")
+    means = [name for name in begun if name.endswith("running_mean")]
+    assert all(torch.equal(network.state_dict()[name], begun[name].float()) for name in means) is fixed
+    weights = [name for name, _ in network.named_parameters() if name.endswith("0.weight")]
+    assert not any(torch.equal(network.state_dict()[name], begun[name].float()) for name in weights)
+
+
+def _written(file, recipe):
+    file.write_text(recipe.toml(), encoding="utf-8")
+    return file
+
+
 def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
     recipe = replace(RECIPE, steps=40, check_every=20)
     Training(recipe, scenes, tmp_path, "cpu", lambda text: None).run()
@@ -128,8 +149,23 @@ def test_the_report_says_every_kind_that_was_there(whole, scenes):
     network, folder = whole
     said = []
     write_report(network, open_store(scenes / "held-out"), folder, said.append)
-    assert [line.split()[0] for line in said] == ["all", "colon"]
+    assert [line.split()[0] for line in said] == ["held-out", "all", "colon"] * len(LOOKS)
+    table = json.loads((folder / "held_out.json").read_text())
+    assert list(table) == list(LOOKS)
+    assert table["whole size"]["all"]["pictures"] == HELD_OUT.count
+    assert table["whole size"]["all"] != table["whole size, nothing strange"]["all"]
     assert (folder / "curves.png").stat().st_size > 1000
+
+
+def test_figures_of_a_weights_file_are_those_of_its_training(scenes, whole, tmp_path):
+    network, folder = whole
+    export(network, tmp_path / "net.safetensors", {})
+    main(["--model", str(tmp_path / "net.safetensors"), "--scenes", str(scenes / "held-out"), "--out", str(tmp_path)])
+    write_report(network, open_store(scenes / "held-out"), folder, lambda text: None)
+    ours, theirs = (json.loads((f / "held_out.json").read_text())["half size"]["all"] for f in (tmp_path, folder))
+    # Half precision is all the difference.
+    assert ours["abs_rel"] == pytest.approx(theirs["abs_rel"], rel=1e-2)
+    assert ours["pictures"] == theirs["pictures"]
 
 
 def test_a_constant_is_right_about_a_sphere_but_for_its_size(tmp_path):
@@ -139,7 +175,7 @@ def test_a_constant_is_right_about_a_sphere_but_for_its_size(tmp_path):
 
     store = create_store(tmp_path, 1, (HEIGHT, WIDTH))
     store.put(0, sphere(30.0))
-    score = score_pictures(Constant(), store)[0]
+    score = score_pictures(Constant(), store, Look())[0]
     assert score.abs_rel == pytest.approx(0, abs=1e-5)
     assert score.delta == 1
     assert score.unscaled == pytest.approx(0.1, abs=1e-3)

@@ -9,7 +9,7 @@ import torch
 from scipy.stats import spearmanr
 
 from scopemap.depth.scopenet.network import ScopeNet
-from training.buffers import Store
+from training.buffers import Store, thinned
 from training.samples import make_sample
 
 _SEED = 77
@@ -59,14 +59,22 @@ class Summary:
         return cls(**means, pooled_rank=_rank(errors, spreads), pictures=len(scores))
 
 
+@dataclass(frozen=True)
+class Look:
+    """How held-out scenes are looked at: every `stride`-th pixel, and with what nothing explains or without it."""
+
+    stride: int = 1
+    strange: bool = True
+
+
 def score_pictures(
-    network: ScopeNet, store: Store, device: str = "cpu", limit: int | None = None
+    network: ScopeNet, store: Store, look: Look, device: str = "cpu", limit: int | None = None
 ) -> list[PictureScore]:
     """Return the score of every held-out picture, drawn by a fixed seed, rays known as the trainer tells them."""
 
     def score(index: int) -> PictureScore | None:
-        buffers, rng = store[index], np.random.default_rng((_SEED, index))
-        sample = make_sample(buffers, rng)
+        buffers, rng = thinned(store[index], look.stride), np.random.default_rng((_SEED, index))
+        sample = make_sample(buffers, rng, strange=look.strange)
         with torch.inference_mode():
             planes = torch.from_numpy(sample.planes)[None].to(device, memory_format=torch.channels_last)
             log_distance, log_spread = network(planes)[0].float().cpu().numpy()
@@ -92,9 +100,9 @@ def score_pictures(
     return [found for found in map(score, indices) if found is not None]
 
 
-def evaluate(network: ScopeNet, store: Store, device: str = "cpu", limit: int | None = None) -> Summary:
+def evaluate(network: ScopeNet, store: Store, look: Look, device: str = "cpu", limit: int | None = None) -> Summary:
     """Return the means over the held-out pictures, or over `limit` of them spread evenly."""
-    return Summary.of(score_pictures(network, store, device, limit))
+    return Summary.of(score_pictures(network, store, look, device, limit))
 
 
 def _rank(errors: np.ndarray, spreads: np.ndarray) -> float:

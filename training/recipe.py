@@ -42,7 +42,8 @@ class Recipe:
     seed : of the network's start and of every draw while training. scene_seed : of the scenes.
     steps : updates. rate, rate_end : learning rate after the warm-up and at the end (cosine). warm_up : steps.
     decay : weight decay. ema : decay of the averaged weights. clip : largest norm of the gradient.
-    check_every : steps between validations and checkpoints. parts : what is rendered. uses : what of it
+    fixed_statistics : normalise by the statistics that are used after training, not by each batch's; for weights to
+    start from. check_every : steps between validations and checkpoints. parts : what is rendered. uses : what of it
     is shown when. held_out : scenes that only validation sees.
     """
 
@@ -55,6 +56,7 @@ class Recipe:
     decay: float = 0.02
     ema: float = 0.998
     clip: float = 1.0
+    fixed_statistics: bool = False
     check_every: int = 300
     parts: tuple[Part, ...] = (Part("small", 160, 128, 18000), Part("large", 320, 256, 1500))
     # Coarse pictures first: the shape of a whole picture is learnt four times as fast from a quarter of its pixels.
@@ -63,7 +65,7 @@ class Recipe:
         Use("small", 1, 16, 0.6, 0.6, 1.0),
         Use("large", 1, 4, 0.4, 0.6, 1.0),
     )
-    held_out: Part = Part("held-out", 160, 128, 300)
+    held_out: Part = Part("held-out", 320, 256, 300)
 
     def uses_at(self, step: int) -> list[Use]:
         """Return the uses that take part in a step."""
@@ -73,7 +75,7 @@ class Recipe:
     def toml(self) -> str:
         """Return all settings as TOML that `read` reads back."""
         tables = {"parts": self.parts, "uses": self.uses, "held_out": (self.held_out,)}
-        lines = [f"{f.name} = {getattr(self, f.name)}" for f in fields(self) if f.name not in tables]
+        lines = [f"{f.name} = {json.dumps(getattr(self, f.name))}" for f in fields(self) if f.name not in tables]
         for name, rows in tables.items():
             for row in rows:
                 lines += [f"[[{name}]]", *(f"{key} = {json.dumps(value)}" for key, value in asdict(row).items())]

@@ -55,9 +55,9 @@ class Batch:
     rays: np.ndarray
 
 
-def make_sample(buffers: Buffers, rng: np.random.Generator) -> Sample:
-    """Return a random picture of a scene; equal generators give equal samples."""
-    rgb, field = take_picture(shade(buffers, draw_light(rng), _bounce(rng)), rng)
+def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = True) -> Sample:
+    """Return a random picture of a scene; equal generators give equal samples. `strange` : see `take_picture`."""
+    rgb, field = take_picture(shade(buffers, draw_light(rng), _bounce(rng)), rng, strange=strange)
     valid = field & np.isfinite(buffers.log_distance)
     if rng.random() < _MASKED_SHARE:
         height, width = field.shape

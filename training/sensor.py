@@ -8,18 +8,20 @@ import numpy as np
 from training.light import brightest
 
 
-def take_picture(light: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def take_picture(light: np.ndarray, rng: np.random.Generator, *, strange: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture (H, W, 3) uint8 sRGB of linear light (H, W, 3), and its field of view (H, W) bool.
 
-    Each effect is drawn on its own: most pictures have a few, some have none.
+    Each effect is drawn on its own: most pictures have a few, some have none. With `strange` half of them also have
+    what no light or tissue explains, and half have their colours mixed anew.
     """
     height, width = light.shape[:2]
     scale = width / 320
     light = light * _vignette(height, width, rng) * rng.uniform(0.8, 1.25, 3).astype(np.float32)
-    if rng.random() < 0.5:
-        light = light * _stranger(height, width, rng)
-    if rng.random() < 0.5:
-        light = _recoloured(light, rng)
+    if strange:
+        if rng.random() < 0.5:
+            light = light * _stranger(height, width, rng)
+        if rng.random() < 0.5:
+            light = _recoloured(light, rng)
     light = _exposed(light, rng)
     if rng.random() < 0.4:
         # Glare: the lens scatters a little of all light over the whole picture.

@@ -16,12 +16,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from scopemap.depth.scopenet.network import ScopeNet
 from training.buffers import open_store
-from training.evaluate import evaluate
+from training.evaluate import Look, evaluate
 from training.losses import Weights, loss_parts, total
 from training.recipe import Recipe
 from training.samples import Batch, make_batch
 
 Say = Callable[[str], None]
+# On the way every second pixel does.
+_CHECKED = Look(stride=2)
 _LOG_COLUMNS = ("step", "seconds", "rate", "loss", "likelihood", "l1", "gradient", "normal", "scale", "held_out")
 
 
@@ -77,7 +79,7 @@ class Training:
         for group in self._optimiser.param_groups:
             group["lr"] = self._rate()
         planes = torch.from_numpy(batch.planes).to(self.device, memory_format=torch.channels_last)
-        self.network.train()
+        self._to_training()
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=self._half):
             prediction = self.network(planes)
         truth, rays = (torch.from_numpy(array).to(self.device) for array in (batch.log_distance, batch.rays))
@@ -90,6 +92,13 @@ class Training:
         self.averaged.update_parameters(self.network)
         return {"loss": float(loss.detach())} | {name: float(value.detach()) for name, value in parts.items()}
 
+    def _to_training(self) -> None:
+        self.network.train()
+        if self.recipe.fixed_statistics:
+            for part in self.network.modules():
+                if isinstance(part, torch.nn.BatchNorm2d):
+                    part.eval()
+
     def _rate(self) -> float:
         recipe = self.recipe
         if self._step < recipe.warm_up:
@@ -98,9 +107,8 @@ class Training:
         return recipe.rate_end + (recipe.rate - recipe.rate_end) * 0.5 * (1 + math.cos(math.pi * way))
 
     def _check(self, sums: list[dict[str, float]], seconds: float) -> None:
-        held_out = evaluate(
-            self.averaged.module.eval(), self._stores[self.recipe.held_out.name], self.device, limit=120
-        )
+        store = self._stores[self.recipe.held_out.name]
+        held_out = evaluate(self.averaged.module.eval(), store, _CHECKED, self.device, limit=120)
         mean = {name: float(np.mean([entry[name] for entry in sums])) for name in sums[0]}
         row = {"step": self._step, "seconds": seconds, "rate": self._rate(), "held_out": held_out.abs_rel} | mean
         file = self.folder / "log.csv"
