@@ -79,26 +79,6 @@ def test_a_training_can_begin_from_the_weights_of_another(scenes, whole, tmp_pat
         assert torch.equal(value, begun[name].float()), name
 
 
-@pytest.mark.parametrize("fixed", [True, False])
-def test_statistics_stay_those_of_use_where_they_are_to(scenes, whole, tmp_path, fixed):
-    export(whole[0], tmp_path / "start.safetensors", {})
-    recipe = replace(RECIPE, seed=5, steps=2, fixed_statistics=fixed)
-    assert Recipe.read(_written(tmp_path / "recipe.toml", recipe)).fixed_statistics is fixed
-    folder = tmp_path / "run"
-    folder.mkdir()
-    network = Training(recipe, scenes, folder, "cpu", lambda text: None, start=tmp_path / "start.safetensors").run()
-    begun = load_file(tmp_path / "start.safetensors")
-    means = [name for name in begun if name.endswith("running_mean")]
-    assert all(torch.equal(network.state_dict()[name], begun[name].float()) for name in means) is fixed
-    weights = [name for name, _ in network.named_parameters() if name.endswith("0.weight")]
-    assert not any(torch.equal(network.state_dict()[name], begun[name].float()) for name in weights)
-
-
-def _written(file, recipe):
-    file.write_text(recipe.toml(), encoding="utf-8")
-    return file
-
-
 def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
     recipe = replace(RECIPE, steps=40, check_every=20)
     Training(recipe, scenes, tmp_path, "cpu", lambda text: None).run()

@@ -42,8 +42,7 @@ class Recipe:
     seed : of the network's start and of every draw while training. scene_seed : of the scenes.
     steps : updates. rate, rate_end : learning rate after the warm-up and at the end (cosine). warm_up : steps.
     decay : weight decay. ema : decay of the averaged weights. clip : largest norm of the gradient.
-    fixed_statistics : normalise by the statistics that are used after training, not by each batch's; for weights to
-    start from. check_every : steps between validations and checkpoints. parts : what is rendered. uses : what of it
+    check_every : steps between validations and checkpoints. parts : what is rendered. uses : what of it
     is shown when. held_out : scenes that only validation sees.
     """
 
@@ -56,7 +55,6 @@ class Recipe:
     decay: float = 0.02
     ema: float = 0.998
     clip: float = 1.0
-    fixed_statistics: bool = False
     check_every: int = 300
     parts: tuple[Part, ...] = (Part("small", 160, 128, 18000), Part("large", 320, 256, 1500))
     # Coarse pictures first: the shape of a whole picture is learnt four times as fast from a quarter of its pixels.

@@ -79,7 +79,7 @@ class Training:
         for group in self._optimiser.param_groups:
             group["lr"] = self._rate()
         planes = torch.from_numpy(batch.planes).to(self.device, memory_format=torch.channels_last)
-        self._to_training()
+        self.network.train()
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=self._half):
             prediction = self.network(planes)
         truth, rays = (torch.from_numpy(array).to(self.device) for array in (batch.log_distance, batch.rays))
@@ -91,13 +91,6 @@ class Training:
         self._optimiser.step()
         self.averaged.update_parameters(self.network)
         return {"loss": float(loss.detach())} | {name: float(value.detach()) for name, value in parts.items()}
-
-    def _to_training(self) -> None:
-        self.network.train()
-        if self.recipe.fixed_statistics:
-            for part in self.network.modules():
-                if isinstance(part, torch.nn.BatchNorm2d):
-                    part.eval()
 
     def _rate(self) -> float:
         recipe = self.recipe
