@@ -185,6 +185,12 @@ class OdometrySettings(Settings):
         1e-3, gt=0, description="least standard deviation of that distance, share of the keyframe's mean depth"
     )
     gain_bias: bool = Field(True, description="estimate gain and bias of each frame pair")
+    flow_contradiction: float = Field(
+        2.0,
+        ge=0,
+        description="flow from the frame before decides where a pose errs against it by more than this many times what "
+        "the best motion does, and a pixel; where depth is predicted; 0: off",
+    )
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
@@ -312,6 +318,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.lamp_gamma": 0.0,
         "odometry.gain_bias": False,
         "odometry.depth_share": 0.0,
+        "odometry.flow_contradiction": 0.0,
         "odometry.start": "identity",
         "smoothing.method": "wema",
         "backend.method": "none",

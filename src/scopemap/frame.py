@@ -17,6 +17,23 @@ TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "pre
 
 
 @dataclass(frozen=True)
+class SeenAgain:
+    """Points of the frame before, where optical flow finds them in this one.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64, in the camera of the frame before. pixels : (N, 2) float64 x, y in this frame.
+    """
+
+    points_mm: np.ndarray
+    pixels: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_shape("SeenAgain.points_mm", self.points_mm, (None, 3))
+        check_shape("SeenAgain.pixels", self.pixels, (len(self.points_mm), 2))
+
+
+@dataclass(frozen=True)
 class Frame:
     """One rectified image of the sequence and what the stages have found out about it.
 
@@ -31,6 +48,7 @@ class Frame:
     T_world_camera : (4, 4) float64, takes a point in the camera to the world; None until tracked.
     name : the file's own name, or "".
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: nothing is said of it.
+    seen_again : what flow carries over from the frame before; None where there is none, or nothing is known of it.
     """
 
     index: int
@@ -42,6 +60,7 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
+    seen_again: SeenAgain | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

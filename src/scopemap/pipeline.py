@@ -23,10 +23,10 @@ from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anch
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.flow import FlowEstimator, create_flow, pair_flow
-from scopemap.frame import Frame
+from scopemap.frame import Frame, SeenAgain
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
-from scopemap.geometry.warp import pull
+from scopemap.geometry.warp import carried_points, pull
 from scopemap.masking import Masker, is_constant
 from scopemap.odometry import FrameTracker, Track, Tracker, create_smoother
 from scopemap.perceptual import PerceptualDistance, create_perceptual
@@ -128,6 +128,7 @@ class Pipeline:
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
+        self._last_mm: np.ndarray | None = None
         self._fusable = 0
 
     def perceive(self, frame: Frame) -> Percept:
@@ -151,7 +152,12 @@ class Pipeline:
             # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
             self._backend = None
         refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
-        raw = replace(percept.frame, depth_mm=percept.raw_mm, depth_sigma_mm=percept.raw_sigma_mm)
+        raw = replace(
+            percept.frame,
+            depth_mm=percept.raw_mm,
+            depth_sigma_mm=percept.raw_sigma_mm,
+            seen_again=self._seen_again(percept),
+        )
         track = self._tracker.track(raw)
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
@@ -165,7 +171,7 @@ class Pipeline:
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
-        self._last = track
+        self._last, self._last_mm = track, refined.depth_mm
         return Step(frame, track, percept.raw_mm, refined)
 
     def adjust(self) -> Correction | None:
@@ -225,6 +231,13 @@ class Pipeline:
         distance = self.estimators.perceptual.compare(rgb, frame.rgb)
         values = np.full_like(distance.map, distance.score) if settings.perceptual_score else distance.map
         return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values)
+
+    def _seen_again(self, percept: Percept) -> SeenAgain | None:
+        """Return points of the frame before where flow finds them in this one; None where either is not known."""
+        link = percept.link
+        if link is None or self._last is None or self._last_mm is None or self._last.status == "lost":
+            return None
+        return carried_points(self._last_mm, link.to_previous, link.consistent, percept.frame.camera)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
         return self._mapis.refine(

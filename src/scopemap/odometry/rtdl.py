@@ -58,6 +58,13 @@ def align(reference: list[View], current: list[View], start: np.ndarray, setting
         iterations += steps
     # Inverting by transposing doubles a deviation from a rotation each time round: cut it off at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
+    return judged(reference, current, motion, settings, iterations)
+
+
+def judged(
+    reference: list[View], current: list[View], motion: Motion, settings: OdometrySettings, iterations: int = 0
+) -> Alignment:
+    """Return what two pyramids say of a motion, as it is."""
     residuals = _residuals(reference[0], current[0], motion, settings)
     used = residuals[-1][np.isfinite(residuals[-1])]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())

@@ -9,9 +9,10 @@ import numpy as np
 from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
 from scopemap.odometry.pyramid import build_pyramid
 from scopemap.odometry.residuals import View
-from scopemap.odometry.rtdl import Alignment, align
+from scopemap.odometry.rtdl import Alignment, Motion, align, judged
 from scopemap.odometry.track import Track
 
 _LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go on
@@ -30,7 +31,8 @@ class Tracker:
     """Tracks frames against keyframes (METHOD section WEMA-RTDL).
 
     The first usable frame fixes the world. Where a frame is lost, the record says so and why, and the next one starts
-    from the last pose that is known, or from where the last motion would have led: whichever fits better.
+    from the last pose that is known, or from where the last motion would have led: whichever fits better. Where a frame
+    brings points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
@@ -41,6 +43,7 @@ class Tracker:
         self._frames_lost = 0
         self._frames_since_keyframe = 0
         self._agreement: list[float] = []
+        self._flow_decided = False
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame, or say why there is none."""
@@ -53,18 +56,22 @@ class Tracker:
         depth_mm = frame.depth_mm if self._keyframe.measured else None
         pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
         alignment = self._best(pyramid)
+        by_flow = self._by_flow(frame, pyramid, alignment)
+        self._flow_decided = by_flow is not None
+        alignment = by_flow or alignment
         T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
         trouble = self._trouble(alignment, T_world_camera)
         if trouble:
             return self._lost(frame, trouble, alignment)
         self._remember(T_world_camera)
         self._agreement.append(alignment.inlier_share * alignment.overlap)
-        return _tracked(frame.index, "ok", "", T_world_camera, self._keyframe.index, alignment)
+        reason = "flow decided" if self._flow_decided else ""
+        return _tracked(frame.index, "ok", reason, T_world_camera, self._keyframe.index, alignment)
 
     def wants_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
         due = self._frames_since_keyframe >= self.settings.keyframe_every
-        return self._keyframe is None or due or self._fades()
+        return self._keyframe is None or due or self._flow_decided or self._fades()
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
@@ -93,6 +100,28 @@ class Tracker:
         found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
         return max(found, key=lambda alignment: alignment.inlier_share * alignment.overlap)
 
+    def _by_flow(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment | None:
+        """Return what takes the alignment's place where flow from the frame before contradicts it, else None."""
+        keyframe, seen, factor = self._keyframe, frame.seen_again, self.settings.flow_contradiction
+        if keyframe is None or seen is None or factor == 0 or self._frames_lost:
+            return None
+        flow = pose_by_flow(seen, frame.camera)
+        if flow is None:
+            return None
+        T_last_keyframe = inverse(self._T_world_last) @ keyframe.T_world_camera
+
+        def contradicted(found: Alignment) -> bool:
+            T_current_last = found.motion.T_current_reference @ inverse(T_last_keyframe)
+            return flow_error_px(seen, frame.camera, T_current_last) > factor * flow.error_px + 1
+
+        if not contradicted(alignment):
+            return None
+        start = flow.T_current_previous @ T_last_keyframe
+        again = align(keyframe.pyramid, pyramid, start, self.settings)
+        if not contradicted(again):
+            return again
+        return judged(keyframe.pyramid, pyramid, Motion(start, np.array([1.0, 0.0])), self.settings)
+
     def _guesses(self) -> list[np.ndarray]:
         """Poses to start from: one while all is well, both the last and the extrapolated one after a loss."""
         steps = min(1 + self._frames_lost, _LONGEST_EXTRAPOLATION)
@@ -111,7 +140,7 @@ class Tracker:
             return "the alignment diverged"
         if alignment.overlap < settings.min_valid_share:
             return f"only {alignment.overlap:.0%} of the keyframe is in view"
-        if alignment.inlier_share < settings.min_inlier_share:
+        if alignment.inlier_share < settings.min_inlier_share and not self._flow_decided:
             return f"only {alignment.inlier_share:.0%} of the pixels agree with the keyframe"
         T_step = inverse(self._T_world_last) @ T_world_camera
         turn = float(rotation_angle_rad(T_step[:3, :3]))
@@ -128,6 +157,7 @@ class Tracker:
 
     def _lost(self, frame: Frame, reason: str, alignment: Alignment | None = None) -> Track:
         self._frames_lost += 1
+        self._flow_decided = False
         keyframe = self._keyframe.index if self._keyframe else frame.index
         return _tracked(frame.index, "lost", reason, self._T_world_last, keyframe, alignment)
 

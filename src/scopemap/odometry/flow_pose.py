@@ -1,0 +1,88 @@
+"""The motion that optical flow asks for: points of the frame before, seen again, against where they would be.
+
+Photometric tracking is precise where it starts close by. Tissue that rushes past at tens of pixels a frame is beyond
+its reach, and it settles somewhere without a word; flow bridges such gaps, if coarsely. So flow has the last word where
+a photometric pose contradicts it, and none elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scopemap.camera import PinholeCamera
+from scopemap.frame import SeenAgain
+from scopemap.geometry.se3 import se3_exp
+
+_LEAST_POINTS = 50
+_STEPS = 30
+_SMALL_STEP = 1e-5
+_MEDIAN_TO_SIGMA_2D = 1 / 1.1774  # of the length of a normal vector in the plane
+_LEAST_SIGMA_PX = 0.1
+
+
+@dataclass(frozen=True)
+class FlowPose:
+    """What flow says of the motion since the frame before.
+
+    Attributes
+    ----------
+    T_current_previous : (4, 4). error_px : median distance of the points from where they are seen, px; large where no
+    motion explains most of them.
+    """
+
+    T_current_previous: np.ndarray
+    error_px: float
+
+
+def pose_by_flow(seen: SeenAgain, camera: PinholeCamera) -> FlowPose | None:
+    """Return the motion that brings the points to where they are seen, or None where they are too few to tell.
+
+    Gauss-Newton from standing still, with Cauchy weights whose scale is the robust deviation of the errors at each
+    step: what moves by itself, and what flow got wrong, fades out.
+    """
+    if len(seen.points_mm) < _LEAST_POINTS:
+        return None
+    T, unit_mm = np.eye(4), float(np.median(seen.points_mm[:, 2]))
+    for _ in range(_STEPS):
+        errors, jacobians, ahead = _linearised(seen, camera, T, unit_mm)
+        if ahead.sum() < _LEAST_POINTS:
+            return None
+        square = (errors**2).sum(1)
+        weight = np.where(ahead, 1 / (1 + square / (2 * _sigma_px(square[ahead])) ** 2), 0.0)
+        weighted = jacobians * weight[:, None, None]
+        hessian = np.einsum("nij,nik->jk", weighted, jacobians)
+        gradient = np.einsum("nij,ni->j", weighted, errors)
+        step = -np.linalg.lstsq(hessian, gradient, rcond=1e-12)[0]
+        T = se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T
+        if not np.isfinite(T).all():
+            return None
+        if np.linalg.norm(step) < _SMALL_STEP:
+            break
+    return FlowPose(T, flow_error_px(seen, camera, T))
+
+
+def flow_error_px(seen: SeenAgain, camera: PinholeCamera, T_current_previous: np.ndarray) -> float:
+    """Return the median distance of the points, moved by a motion (4, 4), from where flow sees them, px."""
+    errors, _, ahead = _linearised(seen, camera, T_current_previous, 1.0)
+    return float(np.median(np.where(ahead, np.linalg.norm(errors, axis=1), np.inf)))
+
+
+def _sigma_px(square: np.ndarray) -> float:
+    return max(_MEDIAN_TO_SIGMA_2D * float(np.sqrt(np.median(square))), _LEAST_SIGMA_PX)
+
+
+def _linearised(
+    seen: SeenAgain, camera: PinholeCamera, T: np.ndarray, unit_mm: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors (N, 2) px, derivatives (N, 2, 6) by a twist in rad and `unit_mm`, and which points (N,) are ahead."""
+    moved = seen.points_mm @ T[:3, :3].T + T[:3, 3]
+    ahead = moved[:, 2] > 1e-3 * np.linalg.norm(moved, axis=1)
+    x, y, z = moved[:, 0], moved[:, 1], np.where(ahead, moved[:, 2], 1.0)
+    u, v, zero = camera.fx / z, camera.fy / z, np.zeros(len(z))
+    by_point = np.stack([np.stack([u, zero, -u * x / z], -1), np.stack([zero, v, -v * y / z], -1)], 1)
+    projected = np.stack([u * x + camera.cx, v * y + camera.cy], 1)
+    # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
+    jacobians = np.concatenate([np.cross(moved[:, None], by_point), unit_mm * by_point], -1)
+    return projected - seen.pixels, jacobians, ahead

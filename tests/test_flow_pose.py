@@ -1,0 +1,148 @@
+"""Flow's say in tracking: exact motions come back, outliers fade, and a pose that flow contradicts is not believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config, OdometrySettings
+from scopemap.frame import Frame, SeenAgain
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.geometry.warp import carried_points
+from scopemap.odometry import Tracker
+from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
+
+CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
+TWIST = np.array([0.05, -0.08, 0.1, 2.0, -1.5, 4.0])
+
+
+def _seen(T: np.ndarray, count: int = 400, wild: float = 0.0, noise_px: float = 0.0, seed: int = 0) -> SeenAgain:
+    random = np.random.default_rng(seed)
+    pixels = random.uniform([5, 5], [155, 123], (count, 2))
+    points = CAMERA.unproject(pixels) * random.uniform(20, 60, (count, 1))
+    seen = CAMERA.project(points @ T[:3, :3].T + T[:3, 3]) + random.normal(0, noise_px, (count, 2))
+    lost = random.random(count) < wild
+    seen[lost] += random.uniform(-40, 40, (int(lost.sum()), 2))
+    return SeenAgain(points, seen)
+
+
+def _off(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    error = inverse(true) @ T
+    return float(np.linalg.norm(error[:3, 3])), float(np.degrees(rotation_angle_rad(error[:3, :3])))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6), st.integers(0, 2**16))
+def test_a_motion_that_explains_all_is_found_exactly(share: list[float], seed: int) -> None:
+    T = se3_exp(np.array(share) * [0.15, 0.15, 0.15, 4.0, 4.0, 4.0])
+    found = pose_by_flow(_seen(T, seed=seed), CAMERA)
+    assert found is not None
+    assert max(_off(found.T_current_previous, T)) < 1e-4
+    assert found.error_px < 1e-3
+
+
+def test_a_third_that_moves_by_itself_fades_out() -> None:
+    T = se3_exp(TWIST)
+    seen = _seen(T, wild=0.33, noise_px=0.3)
+    found = pose_by_flow(seen, CAMERA)
+    assert found is not None
+    way_mm, turn_deg = _off(found.T_current_previous, T)
+    assert way_mm < 0.15
+    assert turn_deg < 0.15
+    assert found.error_px == pytest.approx(flow_error_px(seen, CAMERA, found.T_current_previous))
+    assert flow_error_px(seen, CAMERA, np.eye(4)) > 10 * found.error_px
+
+
+def test_few_points_and_points_behind_say_nothing() -> None:
+    assert pose_by_flow(_seen(np.eye(4), count=49), CAMERA) is None
+    behind = _seen(np.eye(4))
+    assert pose_by_flow(replace(behind, points_mm=-behind.points_mm), CAMERA) is None
+    assert flow_error_px(replace(behind, points_mm=-behind.points_mm), CAMERA, np.eye(4)) == np.inf
+
+
+def test_points_are_carried_from_where_flow_begins() -> None:
+    """A wall, and a camera that moved 3 mm to the right: all is seen fx 3 / 40 px farther left."""
+    depth_mm = np.full((128, 160), 40.0, np.float32)
+    depth_mm[:, 100:] = np.nan
+    to_previous = np.zeros((128, 160, 2), np.float32)
+    to_previous[..., 0] = CAMERA.fx * 3 / 40
+    consistent = np.zeros((128, 160), bool)
+    consistent[10:90, 20:140] = True
+    seen = carried_points(depth_mm, to_previous, consistent, CAMERA)
+    assert 300 < len(seen.points_mm) < 3000
+    moved = CAMERA.project(seen.points_mm - [3.0, 0.0, 0.0])
+    np.testing.assert_allclose(moved, seen.pixels, atol=1e-4)
+    assert seen.pixels[:, 0].min() == 20
+    assert seen.pixels[:, 0].max() < 100
+    found = pose_by_flow(seen, CAMERA)
+    assert found is not None
+    np.testing.assert_allclose(found.T_current_previous[:3, 3], [-3.0, 0.0, 0.0], atol=1e-3)
+    nothing = carried_points(depth_mm, to_previous, np.zeros((128, 160), bool), CAMERA)
+    assert len(nothing.points_mm) == 0
+
+
+def _wall(shift_px: int, index: int, seen: SeenAgain | None = None, soft_px: float = 0.0) -> Frame:
+    """A wall of noise 40 mm away, white or soft, shifted by whole pixels."""
+    noise = np.random.default_rng(3).normal(0, 1, (128, 400))
+    if soft_px:
+        noise = cv2.GaussianBlur(noise, (0, 0), soft_px)
+    texture = np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
+    rgb = np.repeat(texture[:, 100 + shift_px : 260 + shift_px, None], 3, -1)
+    valid = np.ones((128, 160), bool)
+    return Frame(index, index / 30, rgb, CAMERA, valid, np.full((128, 160), 40.0, np.float32), seen_again=seen)
+
+
+def _tracked(frame: Frame, soft_px: float = 0.0, **changes: float) -> tuple[Tracker, float, str, str]:
+    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0, **changes))
+    first = _wall(0, 0, soft_px=soft_px)
+    tracker.track(first)
+    tracker.adopt(replace(first, T_world_camera=np.eye(4)), measured=False)
+    track = tracker.track(frame)
+    return tracker, float(track.T_world_camera[0, 3]), track.status, track.reason
+
+
+WAY_MM = 40 * 40 / CAMERA.fx  # of 40 px
+
+
+def _truly(T_current_previous: np.ndarray) -> SeenAgain:
+    pixels = np.stack(np.meshgrid(np.arange(10, 150, 5), np.arange(10, 118, 5)), -1).reshape(-1, 2).astype(float)
+    points = CAMERA.unproject(pixels) * 40.0
+    return SeenAgain(points, CAMERA.project(points @ T_current_previous[:3, :3].T + T_current_previous[:3, 3]))
+
+
+def test_flow_decides_where_the_image_alone_goes_astray() -> None:
+    """White noise that moves by a quarter of the image is out of any pyramid's reach."""
+    moved = np.eye(4)
+    moved[0, 3] = -WAY_MM
+    frame = _wall(40, 1, _truly(moved))
+    tracker, way_mm, status, reason = _tracked(frame)
+    assert (status, reason) == ("ok", "flow decided")
+    assert way_mm == pytest.approx(WAY_MM, abs=0.1)
+    assert tracker.wants_keyframe()
+    for silent in (_tracked(frame, flow_contradiction=0), _tracked(replace(frame, seen_again=None))):
+        assert silent[2] == "lost" or abs(silent[1] - WAY_MM) > 1
+        assert silent[3] != "flow decided"
+
+
+def test_flow_has_no_say_where_it_agrees_or_is_in_disarray() -> None:
+    near = np.eye(4)
+    near[0, 3] = -2 * 40 / CAMERA.fx
+    plain = _tracked(_wall(2, 1, soft_px=3), soft_px=3)
+    assert plain[1] == pytest.approx(-near[0, 3], abs=0.1)
+    assert plain[2] == "ok"
+    agreeing = _tracked(_wall(2, 1, _truly(near), soft_px=3), soft_px=3)
+    assert agreeing[1:] == plain[1:]
+    random = np.random.default_rng(0)
+    seen = _truly(near)
+    disarray = SeenAgain(seen.points_mm, random.uniform([0, 0], [160, 128], seen.pixels.shape))
+    assert _tracked(_wall(2, 1, disarray, soft_px=3), soft_px=3)[1:] == plain[1:]
+
+
+def test_the_paper_listens_to_no_flow() -> None:
+    assert Config.load("paper").odometry.flow_contradiction == 0
