@@ -29,7 +29,7 @@ def _seen(T: np.ndarray, count: int = 400, wild: float = 0.0, noise_px: float = 
     seen = CAMERA.project(points @ T[:3, :3].T + T[:3, 3]) + random.normal(0, noise_px, (count, 2))
     lost = random.random(count) < wild
     seen[lost] += random.uniform(-40, 40, (int(lost.sum()), 2))
-    return SeenAgain(points, seen)
+    return SeenAgain(points, seen, 0.8)
 
 
 def _off(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -78,13 +78,15 @@ def test_points_are_carried_from_where_flow_begins() -> None:
     assert 300 < len(seen.points_mm) < 3000
     moved = CAMERA.project(seen.points_mm - [3.0, 0.0, 0.0])
     np.testing.assert_allclose(moved, seen.pixels, atol=1e-4)
+    # What lies in the consistent window and on the known part of the wall, of the whole image.
+    assert seen.share == pytest.approx(80 * (100 - CAMERA.fx * 3 / 40 - 20) / (128 * 160), rel=0.05)
     assert seen.pixels[:, 0].min() == 20
     assert seen.pixels[:, 0].max() < 100
     found = pose_by_flow(seen, CAMERA)
     assert found is not None
     np.testing.assert_allclose(found.T_current_previous[:3, 3], [-3.0, 0.0, 0.0], atol=1e-3)
     nothing = carried_points(depth_mm, to_previous, np.zeros((128, 160), bool), CAMERA)
-    assert len(nothing.points_mm) == 0
+    assert len(nothing.points_mm) == nothing.share == 0
 
 
 def _wall(shift_px: int, index: int, seen: SeenAgain | None = None, soft_px: float = 0.0) -> Frame:
@@ -110,10 +112,10 @@ def _tracked(frame: Frame, soft_px: float = 0.0, **changes: float) -> tuple[Trac
 WAY_MM = 40 * 40 / CAMERA.fx  # of 40 px
 
 
-def _truly(T_current_previous: np.ndarray) -> SeenAgain:
+def _truly(T_current_previous: np.ndarray, share: float = 0.8) -> SeenAgain:
     pixels = np.stack(np.meshgrid(np.arange(10, 150, 5), np.arange(10, 118, 5)), -1).reshape(-1, 2).astype(float)
     points = CAMERA.unproject(pixels) * 40.0
-    return SeenAgain(points, CAMERA.project(points @ T_current_previous[:3, :3].T + T_current_previous[:3, 3]))
+    return SeenAgain(points, CAMERA.project(points @ T_current_previous[:3, :3].T + T_current_previous[:3, 3]), share)
 
 
 def test_flow_decides_where_the_image_alone_goes_astray() -> None:
@@ -125,7 +127,8 @@ def test_flow_decides_where_the_image_alone_goes_astray() -> None:
     assert (status, reason) == ("ok", "flow decided")
     assert way_mm == pytest.approx(WAY_MM, abs=0.1)
     assert tracker.wants_keyframe()
-    for silent in (_tracked(frame, flow_contradiction=0), _tracked(replace(frame, seen_again=None))):
+    few = replace(frame, seen_again=_truly(moved, share=0.09))
+    for silent in (_tracked(frame, flow_contradiction=0), _tracked(replace(frame, seen_again=None)), _tracked(few)):
         assert silent[2] == "lost" or abs(silent[1] - WAY_MM) > 1
         assert silent[3] != "flow decided"
 
@@ -140,8 +143,17 @@ def test_flow_has_no_say_where_it_agrees_or_is_in_disarray() -> None:
     assert agreeing[1:] == plain[1:]
     random = np.random.default_rng(0)
     seen = _truly(near)
-    disarray = SeenAgain(seen.points_mm, random.uniform([0, 0], [160, 128], seen.pixels.shape))
+    disarray = SeenAgain(seen.points_mm, random.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
     assert _tracked(_wall(2, 1, disarray, soft_px=3), soft_px=3)[1:] == plain[1:]
+
+
+def test_a_flow_that_jumps_does_not_lose_what_the_image_finds() -> None:
+    far = np.eye(4)
+    far[0, 3] = -30.0  # most of the mean depth in one frame
+    plain = _tracked(_wall(2, 1, soft_px=3), soft_px=3)
+    jumping = _tracked(_wall(2, 1, _truly(far), soft_px=3), soft_px=3)
+    assert jumping[1:] == plain[1:]
+    assert plain[2] == "ok"
 
 
 def test_the_paper_listens_to_no_flow() -> None:

@@ -191,6 +191,9 @@ class OdometrySettings(Settings):
         description="flow from the frame before decides where a pose errs against it by more than this many times what "
         "the best motion does, and a pixel; where depth is predicted; 0: off",
     )
+    flow_least_share: float = Field(
+        0.1, ge=0, le=1, description="flow has no say where less of a frame is linked to the one before it"
+    )
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")

@@ -23,10 +23,12 @@ class SeenAgain:
     Attributes
     ----------
     points_mm : (N, 3) float64, in the camera of the frame before. pixels : (N, 2) float64 x, y in this frame.
+    share : of this frame's pixels that flow and depth could be trusted in; the points are some of them.
     """
 
     points_mm: np.ndarray
     pixels: np.ndarray
+    share: float
 
     def __post_init__(self) -> None:
         check_shape("SeenAgain.points_mm", self.points_mm, (None, 3))

@@ -79,7 +79,8 @@ def carried_points(
     depth_mm = depth_previous_mm[nearest[:, 1], nearest[:, 0]]
     known = np.isfinite(depth_mm)
     points_mm = camera.unproject(there[known]) * depth_mm[known, None]
-    return SeenAgain(points_mm.astype(np.float64), np.column_stack([columns, rows])[known].astype(np.float64))
+    pixels = np.column_stack([columns, rows])[known].astype(np.float64)
+    return SeenAgain(points_mm.astype(np.float64), pixels, step**2 * len(pixels) / consistent.size)
 
 
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:

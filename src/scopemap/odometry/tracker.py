@@ -57,10 +57,12 @@ class Tracker:
         pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
         alignment = self._best(pyramid)
         by_flow = self._by_flow(frame, pyramid, alignment)
-        self._flow_decided = by_flow is not None
-        alignment = by_flow or alignment
-        T_world_camera = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
-        trouble = self._trouble(alignment, T_world_camera)
+        # Where flow itself leads to nowhere, there is nothing to be said against the image alone.
+        self._flow_decided = by_flow is not None and not self._trouble(by_flow, by_flow=True)
+        if by_flow is not None and self._flow_decided:
+            alignment = by_flow
+        T_world_camera = self._T_world_camera(alignment)
+        trouble = self._trouble(alignment, by_flow=self._flow_decided)
         if trouble:
             return self._lost(frame, trouble, alignment)
         self._remember(T_world_camera)
@@ -105,6 +107,8 @@ class Tracker:
         keyframe, seen, factor = self._keyframe, frame.seen_again, self.settings.flow_contradiction
         if keyframe is None or seen is None or factor == 0 or self._frames_lost:
             return None
+        if seen.share < self.settings.flow_least_share:
+            return None
         flow = pose_by_flow(seen, frame.camera)
         if flow is None:
             return None
@@ -133,14 +137,19 @@ class Tracker:
             return [self._keyframe.T_world_camera]
         return [onward if self.settings.start == "velocity" else self._T_world_last]
 
-    def _trouble(self, alignment: Alignment, T_world_camera: np.ndarray) -> str:
+    def _T_world_camera(self, alignment: Alignment) -> np.ndarray:
         assert self._keyframe is not None
-        settings = self.settings
+        return self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
+
+    def _trouble(self, alignment: Alignment, *, by_flow: bool) -> str:
+        """Return why a pose cannot be believed, or ""; flow follows tissue through blur and glare, where values do not."""
+        assert self._keyframe is not None
+        settings, T_world_camera = self.settings, self._T_world_camera(alignment)
         if not np.isfinite(T_world_camera).all():
             return "the alignment diverged"
         if alignment.overlap < settings.min_valid_share:
             return f"only {alignment.overlap:.0%} of the keyframe is in view"
-        if alignment.inlier_share < settings.min_inlier_share and not self._flow_decided:
+        if alignment.inlier_share < settings.min_inlier_share and not by_flow:
             return f"only {alignment.inlier_share:.0%} of the pixels agree with the keyframe"
         T_step = inverse(self._T_world_last) @ T_world_camera
         turn = float(rotation_angle_rad(T_step[:3, :3]))
