@@ -142,7 +142,7 @@ class Tracker:
         return self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
 
     def _trouble(self, alignment: Alignment, *, by_flow: bool) -> str:
-        """Return why a pose cannot be believed, or ""; flow follows tissue through blur and glare, where values do not."""
+        """Return why a pose cannot be believed, or ""; flow follows tissue where grey values cannot."""
         assert self._keyframe is not None
         settings, T_world_camera = self.settings, self._T_world_camera(alignment)
         if not np.isfinite(T_world_camera).all():
