@@ -156,5 +156,25 @@ def test_a_flow_that_jumps_does_not_lose_what_the_image_finds() -> None:
     assert plain[2] == "ok"
 
 
+def test_many_decisions_leave_a_pose_a_pose() -> None:
+    """Each new keyframe begins with what is left of the last one's errors."""
+    moved = np.eye(4)
+    moved[0, 3] = -WAY_MM
+    turned = se3_exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])) @ moved
+    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0))
+    random = np.random.default_rng(0)
+    track = tracker.track(_wall(0, 0))
+    decided = 0
+    for n in range(1, 46):
+        noise = random.integers(0, 255, (128, 160, 1), np.uint8).repeat(3, -1)
+        frame = replace(_wall(0, n, _truly(turned)), rgb=noise)
+        tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=False)
+        track = tracker.track(frame)
+        decided += track.reason == "flow decided"
+        R = track.T_world_camera[:3, :3]
+        assert np.abs(R.T @ R - np.eye(3)).max() < 1e-12
+    assert decided > 35
+
+
 def test_the_paper_listens_to_no_flow() -> None:
     assert Config.load("paper").odometry.flow_contradiction == 0

@@ -52,6 +52,17 @@ def test_settings_state_what_was_used_and_read_back(tmp_path: Path) -> None:
     assert not follows_scene(read)
 
 
+def test_what_is_too_far_to_be_kept_is_unknown() -> None:
+    spool = FrameSpool()
+    spool.put(wall(50_000.0))
+    spool.put(wall(20_000.0))
+    far, near = spool.frames()
+    assert far.depth_mm is not None
+    assert near.depth_mm is not None
+    assert np.isnan(far.depth_mm).all()
+    np.testing.assert_allclose(near.depth_mm, 20_000.0, rtol=2e-4)
+
+
 def test_the_typical_depth_is_the_median_over_frames_of_what_is_usable() -> None:
     spool = FrameSpool()
     assert spool.typical_mm is None
@@ -62,7 +73,7 @@ def test_the_typical_depth_is_the_median_over_frames_of_what_is_usable() -> None
     assert spool.typical_mm == pytest.approx(12.0)
 
 
-@pytest.mark.parametrize("factor", [0.1, 30.0])
+@pytest.mark.parametrize("factor", [0.03, 30.0])
 def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: Path, factor: float) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=6)
     quick = {"networks__flow": "dis", "networks__perceptual": "structure"}
@@ -75,6 +86,11 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
     )
     assert same.config.fusion.voxel_mm is not None
     assert other.config.fusion.voxel_mm == pytest.approx(factor * same.config.fusion.voxel_mm, rel=0.05)
+    # What a result states is what makes it again.
+    (tmp_path / "config.toml").write_text(other.config.toml(), encoding="utf-8")
+    again = reconstruct(open_sequence(phantom), Config.load(file=tmp_path / "config.toml"))
+    assert again.config == other.config
+    assert len(again.mesh.vertices) == pytest.approx(len(other.mesh.vertices), rel=0.001)
     assert len(other.mesh.vertices) == pytest.approx(len(same.mesh.vertices), rel=0.15)
     assert other.mesh.area == pytest.approx(factor**2 * same.mesh.area, rel=0.1)
     assert any(f"voxels of {other.config.fusion.voxel_mm:g} mm" in note for note in other.provenance["notes"])

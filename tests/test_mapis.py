@@ -140,10 +140,16 @@ def test_a_chain_that_little_holds_does_not_run_away(pull: float, least: float, 
     assert least < scales[-1] < most
 
 
-def test_a_chain_that_all_holds_is_left_alone() -> None:
-    mapis = _mapis(frame_scale="robust", blend="none")
+@pytest.mark.parametrize("round_view", [False, True])
+def test_a_chain_that_all_holds_is_left_alone(round_view: bool) -> None:
+    """All that shows tissue: what lies outside a round field of view could not be linked anyway."""
+    mapis, link = _mapis(frame_scale="robust", blend="none"), _link()
+    if round_view:
+        v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+        inside = np.hypot(u - 32, v - 24) < 24
+        link = Correspondence(link.to_previous, inside, link.distance, float(inside.mean()))
     mapis.refine(DEPTH, "depth", CAMERA, None, None)
-    scales = [mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None).scale for _ in range(100)]
+    scales = [mapis.refine(2 * DEPTH, "depth", CAMERA, link, None).scale for _ in range(100)]
     np.testing.assert_allclose(scales, 0.5, rtol=1e-4)
 
 

@@ -105,8 +105,8 @@ class MapisSettings(Settings):
         0.1,
         ge=0,
         le=1,
-        description="share of ln of that scale that is given up per frame which nothing links to the one before it; "
-        "less, by the square, where more of it is linked; 0: off",
+        description="share of ln of that scale that is given up at a frame of which next to nothing is linked to the "
+        "one before it; less, by the square, where more of what is usable is linked; 0: off",
     )
     blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = Field(
         "auto", description="weight of the warped depth; auto: linear, none for measured depth"
@@ -189,7 +189,7 @@ class OdometrySettings(Settings):
         2.0,
         ge=0,
         description="flow from the frame before decides where a pose errs against it by more than this many times what "
-        "the best motion does, and a pixel; where depth is predicted; 0: off",
+        "the best motion does, and a pixel; only where MAPIS links frames, as it does for predicted depth; 0: off",
     )
     flow_least_share: float = Field(
         0.1, ge=0, le=1, description="flow has no say where less of a frame is linked to the one before it"
@@ -247,7 +247,7 @@ class FusionSettings(Settings):
     """Volumetric fusion. Sizes that are not set follow the scene: see `scopemap.fusion.sizes`."""
 
     enabled: bool = True
-    voxel_mm: float | None = Field(None, ge=0.05, description="by default from the clip's median depth")
+    voxel_mm: float | None = Field(None, ge=0.01, description="by default from the clip's median depth")
     truncation_mm: float | None = Field(None, ge=0.05, description="by default 5 voxels")
     max_depth_mm: float | None = Field(None, gt=0, description="depth beyond this is not fused; by default 200 voxels")
     half_weight_mm: float | None = Field(

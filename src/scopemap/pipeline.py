@@ -147,7 +147,7 @@ class Pipeline:
         return Percept(frame, raw.depth_mm, estimate.kind, link, just_fitted, raw.sigma_mm)
 
     def step(self, percept: Percept) -> Step:
-        """Track a frame, make its depth consistent, fuse it or let it wait for the back end."""
+        """Track a frame, make its depth consistent, fuse it or let it wait until all are tracked."""
         if percept.kind == "measured":
             # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
             self._backend = None
@@ -164,7 +164,9 @@ class Pipeline:
             known = percept if track.status != "lost" else replace(percept, link=None)
             refined = self._refine(known, self._motion(track))
         frame = replace(percept.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
-        track = self._keyed(track, frame, measured=percept.kind == "measured")
+        # Measured depth that was scaled or blended is not what the next frame measures.
+        measured = percept.kind == "measured" and not self._mapis.links("measured")
+        track = self._keyed(track, frame, measured=measured)
         if track.status == "lost":
             self._mapis.forget()
             self._smooth.forget()
@@ -230,12 +232,15 @@ class Pipeline:
         rgb = pull(past.rgb, flow.to_previous) if settings.compare_warped else past.rgb
         distance = self.estimators.perceptual.compare(rgb, frame.rgb)
         values = np.full_like(distance.map, distance.score) if settings.perceptual_score else distance.map
-        return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values)
+        return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values, float(frame.valid.mean()))
 
     def _seen_again(self, percept: Percept) -> SeenAgain | None:
         """Return points of the frame before where flow finds them in this one; None where either is not known."""
         link = percept.link
         if link is None or self._last is None or self._last_mm is None or self._last.status == "lost":
+            return None
+        if self.estimators.flow.name == "none":
+            # It holds that nothing moves, which is not for it to say.
             return None
         return carried_points(self._last_mm, link.to_previous, link.consistent, percept.frame.camera)
 

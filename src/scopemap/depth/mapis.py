@@ -33,11 +33,13 @@ class Correspondence:
     ----------
     to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, where it can be trusted.
     distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant where one score was asked for.
+    usable_share : of the current image that shows tissue, so could be linked.
     """
 
     to_previous: np.ndarray
     consistent: np.ndarray
     distance: np.ndarray
+    usable_share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ class Mapis:
         overlap = float(np.isfinite(warped_mm).mean())
         if self._scales(kind):
             found = robust_scale(raw_mm, warped_mm, self._scale)
-            self._scale = found if link is None or self._carried is None else self._held(found, overlap)
+            linked = link is not None and self._carried is not None
+            self._scale = self._held(found, overlap / max(link.usable_share, 1e-6)) if linked and link else found
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm, refined_share = scaled_mm, share
         blend = self._blend(kind)
@@ -122,12 +125,12 @@ class Mapis:
         frame_scale = self.settings.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
-    def _held(self, scale: float, overlap: float) -> float:
-        """Pull a chain of scales back to the estimator's own the more, the less of the image holds it.
+    def _held(self, scale: float, linked_share: float) -> float:
+        """Pull a chain of scales back to the estimator's own the more, the less of the tissue in view holds it.
 
         The links' errors add up, and where tissue rushes by they have a sign: depth would grow or shrink without end.
         """
-        return float(scale ** (1 - self.settings.scale_pull * (1 - overlap) ** 2))
+        return float(scale ** (1 - self.settings.scale_pull * max(1 - linked_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
         if self.settings.blend != "auto":

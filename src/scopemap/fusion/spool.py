@@ -64,7 +64,7 @@ class FrameSpool:
         except OSError as error:
             raise InputError(
                 f"cannot keep frames to be fused in {tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR "
-                "to a folder with room, or backend.method=none"
+                "to a folder with room, or backend.method=none and fusion.voxel_mm: then nothing waits"
             ) from None
         sizes = [len(part) for part in parts]
         self._entries.append(
@@ -100,7 +100,8 @@ def _median_mm(frame: Frame) -> float:
 def _packed(mm: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         code = np.float32(1.5 - np.log(_LEAST_MM) / _LOG_STEP) + np.log(mm) * np.float32(1 / _LOG_STEP)
-    return np.where(np.isfinite(code), np.clip(code, 1, _MOST_CODE), 0).astype(np.uint16)
+    # What lies beyond is unknown, not at the end.
+    return np.where(np.isfinite(code) & (code < _MOST_CODE + 1), np.maximum(code, 1), 0).astype(np.uint16)
 
 
 def _unpacked(code: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

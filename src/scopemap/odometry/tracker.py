@@ -8,7 +8,7 @@ import numpy as np
 
 from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
 from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
 from scopemap.odometry.pyramid import build_pyramid
 from scopemap.odometry.residuals import View
@@ -109,20 +109,21 @@ class Tracker:
             return None
         if seen.share < self.settings.flow_least_share:
             return None
-        flow = pose_by_flow(seen, frame.camera)
-        if flow is None:
-            return None
         T_last_keyframe = inverse(self._T_world_last) @ keyframe.T_world_camera
 
-        def contradicted(found: Alignment) -> bool:
+        def error_px(found: Alignment) -> float:
             T_current_last = found.motion.T_current_reference @ inverse(T_last_keyframe)
-            return flow_error_px(seen, frame.camera, T_current_last) > factor * flow.error_px + 1
+            return flow_error_px(seen, frame.camera, T_current_last)
 
-        if not contradicted(alignment):
+        # Nothing within a pixel is contradicted, so flow need not be asked for its own motion.
+        if error_px(alignment) <= 1 or (flow := pose_by_flow(seen, frame.camera)) is None:
             return None
-        start = flow.T_current_previous @ T_last_keyframe
+        most_px = factor * flow.error_px + 1
+        if error_px(alignment) <= most_px:
+            return None
+        start = orthonormalised(flow.T_current_previous @ T_last_keyframe)
         again = align(keyframe.pyramid, pyramid, start, self.settings)
-        if not contradicted(again):
+        if error_px(again) <= most_px:
             return again
         return judged(keyframe.pyramid, pyramid, Motion(start, np.array([1.0, 0.0])), self.settings)
 
@@ -139,7 +140,9 @@ class Tracker:
 
     def _T_world_camera(self, alignment: Alignment) -> np.ndarray:
         assert self._keyframe is not None
-        return self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
+        T = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
+        # A keyframe's own deviation from a rotation would be doubled by the next one's, and so on.
+        return orthonormalised(T) if np.isfinite(T).all() else T
 
     def _trouble(self, alignment: Alignment, *, by_flow: bool) -> str:
         """Return why a pose cannot be believed, or ""; flow follows tissue where grey values cannot."""
