@@ -25,13 +25,13 @@ def wall(depth_mm: float, index: int = 0) -> Frame:
 
 
 def test_a_hand_s_breadth_has_the_voxels_of_endo_depth_and_motion() -> None:
-    assert choose_sizes(FusionSettings(), 60.0) == (1.0, 5.0, 200.0, 50.0)
+    assert choose_sizes(FusionSettings(), 60.0) == (1.0, 5.0, 200.0)
 
 
 def test_what_is_set_stays_and_the_rest_follows_it() -> None:
-    assert choose_sizes(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0, 25.0)
-    assert choose_sizes(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0, 15.0)
-    assert choose_sizes(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0, 15.0)
+    assert choose_sizes(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0)
+    assert choose_sizes(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0)
+    assert choose_sizes(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
 
 
 def test_a_volume_without_sizes_is_refused() -> None:
@@ -46,8 +46,7 @@ def test_settings_state_what_was_used_and_read_back(tmp_path: Path) -> None:
     fusion = with_sizes(FusionSettings(), choose_sizes(FusionSettings(), 10.0))
     (tmp_path / "config.toml").write_text(Config(fusion=fusion).toml(), encoding="utf-8")
     read = Config.load(file=tmp_path / "config.toml").fusion
-    assert (read.voxel_mm, read.truncation_mm, read.max_depth_mm, read.half_weight_mm) == (0.17, 0.85, 34.0, 8.5)
-    assert choose_sizes(read) == choose_sizes(FusionSettings(), 10.0)
+    assert (read.voxel_mm, read.truncation_mm, read.max_depth_mm) == (0.17, 0.85, 34.0)
     assert follows_scene(FusionSettings())
     assert not follows_scene(read)
 

@@ -250,9 +250,6 @@ class FusionSettings(Settings):
     voxel_mm: float | None = Field(None, ge=0.01, description="by default from the clip's median depth")
     truncation_mm: float | None = Field(None, ge=0.05, description="by default 5 voxels")
     max_depth_mm: float | None = Field(None, gt=0, description="depth beyond this is not fused; by default 200 voxels")
-    half_weight_mm: float | None = Field(
-        None, gt=0, description="distance at which tissue counts half; by default 50 voxels, or half of a stated reach"
-    )
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     depth_sigma_share: float = Field(
         0.2, gt=0, description="as odometry's; no pixel counts more than without an uncertainty; large: off"

@@ -15,24 +15,16 @@ VOXELS_PER_DISTANCE = 60
 _VOXELS_PER_TRUNCATION = 5
 # So far away a voxel is still larger than a pixel, and a tube that narrows the view is seen for most of its length.
 _VOXELS_PER_REACH = 200
-_VOXELS_PER_HALF_WEIGHT = 50
 # Below this no endoscope resolves anything, and memory would be spent on noise.
 _LEAST_VOXEL_MM = 0.01
 
 
 class Sizes(NamedTuple):
-    """Sizes of fusion, mm.
-
-    Attributes
-    ----------
-    voxel_mm : edge of a voxel. truncation_mm : how far from the surface the field is kept. max_depth_mm : up to which
-    depth is fused. half_weight_mm : distance at which tissue counts half of what it does at the lens.
-    """
+    """Edge of a voxel, how far from the surface the field is kept, and up to which depth is fused, mm."""
 
     voxel_mm: float
     truncation_mm: float
     max_depth_mm: float
-    half_weight_mm: float
 
 
 def follows_scene(settings: FusionSettings) -> bool:
@@ -51,14 +43,10 @@ def choose_sizes(settings: FusionSettings, typical_mm: float | None = None) -> S
             raise ValueError("fusing without fusion.voxel_mm: the scene's typical depth must be known")
         # Two digits: nobody needs more, and a clip cut elsewhere gives the same.
         voxel_mm = float(f"{max(typical_mm / VOXELS_PER_DISTANCE, _LEAST_VOXEL_MM):.2g}")
-    half_weight_mm = (
-        settings.max_depth_mm / 2 if settings.max_depth_mm else round(_VOXELS_PER_HALF_WEIGHT * voxel_mm, 4)
-    )
     return Sizes(
         voxel_mm,
         settings.truncation_mm or round(_VOXELS_PER_TRUNCATION * voxel_mm, 4),
         settings.max_depth_mm or round(_VOXELS_PER_REACH * voxel_mm, 4),
-        settings.half_weight_mm or half_weight_mm,
     )
 
 

@@ -79,13 +79,13 @@ def _slope(inverse_depth: np.ndarray, row: int, col: int, along_columns: bool, l
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def measure_surface(
-    inverse_depth: np.ndarray, view: View, largest_step: float, min_incidence: float, half_weight_mm: float
+    inverse_depth: np.ndarray, view: View, largest_step: float, min_incidence: float, reach_mm: float
 ) -> Surface:
     """Return tangent plane and weight of every pixel of `inverse_depth` (H, W) float32, 1/mm, NaN = unknown.
 
     On the plane n.X = 1 the inverse depth is n.(x, y, 1), so its slopes give n, and 1/|n| is the plane's distance from
-    the camera. Weight = cos(incidence) / (1 + (distance / half_weight_mm)^2): 1 for a wall met head-on at the lens,
-    falling with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
+    the camera. Weight = cos(incidence) / (1 + (2 distance / reach)^2): 1 for a wall met head-on at the lens, falling
+    with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
     """
     height, width = inverse_depth.shape
     kept = np.full((height, width), np.nan, np.float32)
@@ -105,7 +105,7 @@ def measure_surface(
             if plane >= min_incidence * distance:
                 kept[row, col] = here
                 plane_mm[row, col] = plane
-                weight[row, col] = plane / distance / (1.0 + (distance / half_weight_mm) ** 2)
+                weight[row, col] = plane / distance / (1.0 + (2.0 * distance / reach_mm) ** 2)
     return Surface(kept, plane_mm, weight)
 
 

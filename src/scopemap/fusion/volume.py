@@ -54,17 +54,17 @@ class TsdfVolume:
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or out of reach.
         """
         depth_mm, T_world_camera = self._checked(frame)
-        camera, settings, sizes = frame.camera, self.settings, self.sizes
+        camera, settings, reach_mm = frame.camera, self.settings, self.sizes.max_depth_mm
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         view = View(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         steepest = max(settings.min_incidence, _LEAST_INCIDENCE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
-        grid = Grid(sizes.voxel_mm, sizes.truncation_mm, step)
+        grid = Grid(self.sizes.voxel_mm, self.sizes.truncation_mm, step)
         with np.errstate(invalid="ignore"):
-            usable = frame.valid & (depth_mm > 0) & (depth_mm <= sizes.max_depth_mm)
+            usable = frame.valid & (depth_mm > 0) & (depth_mm <= reach_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, view, step, settings.min_incidence, sizes.half_weight_mm)
+        surface = measure_surface(inverse_depth, view, step, settings.min_incidence, reach_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
         surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
         keys = np.unique(touched_blocks(surface.inverse_depth, view, grid))
