@@ -79,6 +79,11 @@ def test_two_scales_and_grey_values_alone() -> None:
     ours = OdometrySettings()
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start", "keyframe_every", "min_inlier_share"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
+    assert SETTINGS.depth_share == SETTINGS.flow_contradiction == SETTINGS.keyframe_agreement == 0
+    # A part that our tracker gets later must not slip in by its default: what is not named there has no effect on it,
+    # or says when an image is empty.
+    unnamed = {"flow_least_share", "grey_share", "least_depth_sigma", "min_side_px", "normalise_sigma_px", "radius"}
+    assert set(OdometrySettings.model_fields) - SETTINGS.model_fields_set == unnamed | {"min_valid_share"}
 
 
 def test_it_has_no_verdict_on_its_result_but_an_empty_image_is_lost() -> None:

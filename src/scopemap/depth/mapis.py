@@ -99,9 +99,9 @@ class Mapis:
         warped_mm, warped_share = self._warped(camera, link, T_current_previous, share)
         overlap = float(np.isfinite(warped_mm).mean())
         if self._scales(kind):
-            found = robust_scale(raw_mm, warped_mm, self._scale)
-            linked = link is not None and self._carried is not None
-            self._scale = self._held(found, overlap / max(link.usable_share, 1e-6)) if linked and link else found
+            self._scale = robust_scale(raw_mm, warped_mm, self._scale)
+            if link is not None and self._carried is not None:
+                self._scale = self._held(self._scale, overlap / max(link.usable_share, 1e-6))
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm, refined_share = scaled_mm, share
         blend = self._blend(kind)

@@ -21,6 +21,7 @@ from scopemap.odometry import FrameTracker, Tracker
 
 SETTINGS = OdometrySettings(
     keyframe_every=2,
+    keyframe_agreement=0.0,
     levels=2,
     finest_level=0,
     rotation_first=True,
@@ -30,6 +31,9 @@ SETTINGS = OdometrySettings(
     channels="grey",
     lamp_gamma=0.0,
     gain_bias=False,
+    depth_sigma_share=1e9,  # all depth counts alike
+    depth_share=0.0,
+    flow_contradiction=0.0,
     start="identity",
     min_inlier_share=0.0,
     max_step=1e9,  # never reached
