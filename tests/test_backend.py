@@ -67,7 +67,7 @@ def test_points_are_seen_where_the_plane_says() -> None:
     linker = Linker(BackendSettings(gaps=(1, 2)), DisFlow())
     for number in (0, 1, 2):
         linker.add(_frame(number))
-    points, sightings = linker.points(), linker.sightings()
+    points, sightings = linker.collected()
     assert (np.diff(points.host) >= 0).all()
     assert (np.diff(sightings.point) >= 0).all()
     hosts = points.host[sightings.point]
@@ -90,8 +90,8 @@ def test_keyframes_that_are_not_named_by_the_gaps_are_not_linked() -> None:
     linker = Linker(BackendSettings(gaps=(2,)), DisFlow())
     for number in (0, 1, 2):
         linker.add(_frame(number))
-    sightings, host = linker.sightings(), linker.points().host
-    assert set(np.abs(host[sightings.point] - sightings.keyframe)) == {2}
+    points, sightings = linker.collected()
+    assert set(np.abs(points.host[sightings.point] - sightings.keyframe)) == {2}
 
 
 def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> None:

@@ -80,9 +80,11 @@ def test_two_scales_and_grey_values_alone() -> None:
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start", "keyframe_every", "min_inlier_share"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
     assert SETTINGS.depth_share == SETTINGS.flow_contradiction == SETTINGS.keyframe_agreement == 0
+    assert SETTINGS.least_detail == SETTINGS.remembered_keyframes == 0
     # A part that our tracker gets later must not slip in by its default: what is not named there has no effect on it,
     # or says when an image is empty.
     unnamed = {"flow_least_share", "grey_share", "least_depth_sigma", "min_side_px", "normalise_sigma_px", "radius"}
+    unnamed |= {"doubtful_inlier_share", "least_landmarks"}
     assert set(OdometrySettings.model_fields) - SETTINGS.model_fields_set == unnamed | {"min_valid_share"}
 
 

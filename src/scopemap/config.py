@@ -194,6 +194,12 @@ class OdometrySettings(Settings):
     flow_least_share: float = Field(
         0.1, ge=0, le=1, description="flow has no say where less of a frame is linked to the one before it"
     )
+    least_detail: float = Field(
+        0.6, ge=0, description="a frame that shows less of the usual detail, and agrees badly, is lost; 0: off"
+    )
+    doubtful_inlier_share: float = Field(0.6, ge=0, le=1, description="less than that agrees badly")
+    remembered_keyframes: int = Field(10, ge=0, description="among which a lost camera is looked for; 0: off")
+    least_landmarks: int = Field(20, ge=6, description="that must agree on where the camera was found again")
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
@@ -231,6 +237,9 @@ class BackendSettings(Settings):
     )
     cell_px: int = Field(16, ge=4, description="one point in each cell of that size")
     consistency_px: float = Field(1.0, gt=0, description="largest error of flow there and back")
+    loop_landmarks: int = Field(
+        25, ge=0, description="that must agree where a keyframe shows an old place; 0: no loops"
+    )
     depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     turn_sigma_deg: float = Field(3.0, gt=0, description="how far tracked turns between keyframes are trusted")
@@ -322,6 +331,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "odometry.gain_bias": False,
         "odometry.depth_share": 0.0,
         "odometry.flow_contradiction": 0.0,
+        "odometry.least_detail": 0.0,
+        "odometry.remembered_keyframes": 0,
         "odometry.start": "identity",
         "smoothing.method": "wema",
         "backend.method": "none",

@@ -70,13 +70,17 @@ class Priors:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is adjusted: intrinsics (4,) fx, fy, cx, cy, px; T_camera_world (K, 4, 4) as tracked; the rest as named."""
+    """What is adjusted: intrinsics (4,) fx, fy, cx, cy, px; T_camera_world (K, 4, 4) as tracked; the rest as named.
+
+    start : poses T_camera_world (K, 4, 4) and ln of the depth scales (K,) to begin from; None: from what was tracked.
+    """
 
     intrinsics: np.ndarray
     T_camera_world: np.ndarray
     points: Points
     sightings: Sightings
     priors: Priors
+    start: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ class _System(NamedTuple):
 
 
 def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1e-3) -> Solution:
-    """Return the solution that the search finds from the tracked poses; without sightings everything stays as it is.
+    """Return the solution that the search finds from the start; without sightings everything stays as it was tracked.
 
     A step is taken where it lowers the cost at the scale of residuals before it; that scale is then estimated anew.
     """
@@ -119,6 +123,9 @@ def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1
     state = _State(problem.T_camera_world.copy(), np.zeros(count), problem.points.log_depth.copy())
     if not len(problem.sightings.point) or count < 2:
         return Solution(state.T, state.scale, state.u, float("nan"), 0)
+    if problem.start is not None:
+        T, scale = problem.start
+        state = _State(T.copy(), scale.copy(), state.u + scale[problem.points.host])
     damping, iterations = 1e-4, 0
     sigma = _sigma_px(problem, state)
     cost = _cost(problem, state, sigma)

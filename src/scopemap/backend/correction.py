@@ -19,7 +19,8 @@ class Correction:
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the world as
     tracked around a keyframe to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
     sigma_px : robust standard deviation of what remains between keyframes, px; NaN where nothing linked them.
-    taken : False where that was too much, and nothing is changed.
+    taken : False where that was too much, and nothing is changed. loops : pairs of keyframes, far apart in time,
+    that were found to show the same place.
     """
 
     index: np.ndarray
@@ -27,6 +28,7 @@ class Correction:
     log_scale: np.ndarray
     sigma_px: float = float("nan")
     taken: bool = True
+    loops: int = 0
 
     @property
     def description(self) -> str:
@@ -39,9 +41,10 @@ class Correction:
                 "where they should: tissue that moves by itself, or another focal length"
             )
         turn_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
+        closed = f", {self.loops} loops closed" if self.loops else ""
         return (
-            f"back end: {len(self.index)} keyframes adjusted, turned by up to {turn_deg:.1f} deg; points seen again "
-            f"lie {self.sigma_px:.2f} px from where they should"
+            f"back end: {len(self.index)} keyframes adjusted, turned by up to {turn_deg:.1f} deg{closed}; points seen "
+            f"again lie {self.sigma_px:.2f} px from where they should"
         )
 
     def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 
 from scopemap.backend.adjustment import Points, Sightings
+from scopemap.backend.loops import Loop
+from scopemap.camera import PinholeCamera
 from scopemap.config import BackendSettings
 from scopemap.flow import FlowEstimator
 from scopemap.frame import Frame
@@ -48,39 +50,57 @@ class Linker:
         self._points: list[Points] = []
         self._sightings: list[_Sighting] = []
         self._count = self._keyframes = 0
+        self._camera: PinholeCamera | None = None
 
     def add(self, keyframe: Frame) -> None:
         """Take a keyframe with depth: choose its points, find them in earlier keyframes, and theirs in it."""
         assert keyframe.depth_mm is not None
         places = corners(keyframe, self.settings.cell_px)
         rows, columns = places[:, 1], places[:, 0]
-        camera = keyframe.camera
-        depth_mm = keyframe.depth_mm[rows, columns]
+        self._camera = keyframe.camera
+        log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
         share = sigma_share(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
-        rays = np.column_stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))])
-        sigma = np.hypot(np.nan_to_num(share, nan=0.0), self.settings.depth_share)
-        self._points.append(
-            Points(np.full(len(rows), self._keyframes), rays, np.log(depth_mm.astype(np.float64)), sigma)
-        )
-        new = _Keyframe(self._keyframes, keyframe.rgb, keyframe.valid, places, self._count)
+        first = self._host(self._keyframes, places, log_depth, np.nan_to_num(share, nan=0.0))
+        new = _Keyframe(self._keyframes, keyframe.rgb, keyframe.valid, places, first)
         for past in self._recent:
             if new.number - past.number in self.settings.gaps:
                 self._link(past, new)
         self._recent.append(new)
         self._keyframes += 1
-        self._count += len(rows)
 
-    def points(self) -> Points:
-        """Return all points so far, sorted by host."""
-        parts = self._points
-        return Points(*(np.concatenate([getattr(part, name) for part in parts]) for name in Points.__annotations__))
+    def close(self, loop: Loop) -> None:
+        """Take the landmarks of a loop as points that one keyframe hosts and the other sees, both ways."""
+        for host, other, places, log_depth, pixels in (
+            (loop.past, loop.new, loop.pixels_past, loop.log_depth_past, loop.pixels_new),
+            (loop.new, loop.past, loop.pixels_new, loop.log_depth_new, loop.pixels_past),
+        ):
+            known = np.isfinite(log_depth)
+            first = self._host(host, places[known], log_depth[known], np.zeros(known.sum()))
+            number = first + np.arange(known.sum())
+            self._sightings.append(_Sighting(number, np.full(len(number), other), pixels[known]))
 
-    def sightings(self) -> Sightings:
-        """Return all sightings so far, sorted by point."""
+    def collected(self) -> tuple[Points, Sightings]:
+        """Return all points so far, sorted by host, and all sightings of them, sorted by point."""
+        points = Points(*(np.concatenate([getattr(p, n) for p in self._points]) for n in Points.__annotations__))
         empty = _Sighting(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
         point, keyframe, pixel = (np.concatenate(parts) for parts in zip(empty, *self._sightings, strict=True))
-        order = np.argsort(point, kind="stable")
-        return Sightings(point[order], keyframe[order], pixel[order])
+        by_host = np.argsort(points.host, kind="stable")
+        place = np.empty_like(by_host)
+        place[by_host] = np.arange(len(by_host))
+        order = np.argsort(place[point], kind="stable")
+        sorted_points = Points(*(getattr(points, name)[by_host] for name in Points.__annotations__))
+        return sorted_points, Sightings(place[point][order], keyframe[order], pixel[order])
+
+    def _host(self, keyframe: int, places: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:
+        """Add points at pixels (n, 2) of a keyframe, of depth uncertain by `share`; return the first one's number."""
+        camera, first = self._camera, self._count
+        assert camera is not None
+        x, y = np.asarray(places, dtype=np.float64).reshape(-1, 2).T
+        rays = np.column_stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(len(x))])
+        sigma = np.hypot(share, self.settings.depth_share)
+        self._points.append(Points(np.full(len(x), keyframe), rays, log_depth, sigma))
+        self._count += len(x)
+        return first
 
     def _link(self, past: _Keyframe, new: _Keyframe) -> None:
         to_new, to_past = self._flow.estimate_both(past.rgb, new.rgb)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from scopemap.config import OdometrySettings
 from scopemap.frame import Frame
+from scopemap.geometry.landmarks import Landmarks, find_landmarks, locate
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
+from scopemap.odometry.clarity import Clarity
 from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
 from scopemap.odometry.pyramid import build_pyramid
 from scopemap.odometry.residuals import View
@@ -20,36 +24,50 @@ _LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go
 
 @dataclass(frozen=True)
 class _Keyframe:
-    index: int
+    frame: Frame
     T_world_camera: np.ndarray
     pyramid: list[View]
     depth_mm: float  # mean
     measured: bool
+
+    @property
+    def index(self) -> int:
+        return self.frame.index
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """Looked for when first asked for: most clips never need them."""
+        return find_landmarks(self.frame)
 
 
 class Tracker:
     """Tracks frames against keyframes (METHOD section WEMA-RTDL).
 
     The first usable frame fixes the world. Where a frame is lost, the record says so and why, and the next one starts
-    from the last pose that is known, or from where the last motion would have led: whichever fits better. Where a frame
-    brings points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide.
+    from the last pose that is known, from where the last motion would have led, or from where the landmarks of a recent
+    keyframe say that it is: whichever fits best, and that keyframe is tracked against from there. Where a frame brings
+    points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
         self.settings = settings
         self._keyframe: _Keyframe | None = None
+        self._remembered: deque[_Keyframe] = deque(maxlen=settings.remembered_keyframes)
+        self._clarity = Clarity()
         self._T_world_last = np.eye(4)
         self._T_step = np.eye(4)
         self._frames_lost = 0
         self._frames_since_keyframe = 0
         self._agreement: list[float] = []
-        self._flow_decided = False
+        self._flow_decided = self._unclear = False
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame, or say why there is none."""
         self._frames_since_keyframe += 1
         if frame.valid.mean() < self.settings.min_valid_share:
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
+        detail = self._clarity.against_recent(frame)
+        self._unclear = detail < self.settings.least_detail
         if self._keyframe is None:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
         # The keyframe's points are moved: the depth of the frame itself has no say, unless it was measured.
@@ -58,22 +76,33 @@ class Tracker:
         alignment = self._best(pyramid)
         by_flow = self._by_flow(frame, pyramid, alignment)
         # Where flow itself leads to nowhere, there is nothing to be said against the image alone.
-        self._flow_decided = by_flow is not None and not self._trouble(by_flow, by_flow=True)
+        self._flow_decided = by_flow is not None and not self._trouble(self._keyframe, by_flow, by_flow=True)
         if by_flow is not None and self._flow_decided:
             alignment = by_flow
-        T_world_camera = self._T_world_camera(alignment)
-        trouble = self._trouble(alignment, by_flow=self._flow_decided)
+        if self._veiled(detail, alignment):
+            return self._lost(frame, f"only {detail:.0%} of the usual detail: blur, smoke or fluid", alignment)
+        trouble, reason = self._trouble(self._keyframe, alignment, by_flow=self._flow_decided), ""
+        if trouble or self._frames_lost:
+            found = self._found_again(frame, pyramid)
+            if found is not None and (trouble or _agreement(found[1]) > _agreement(alignment)):
+                self._keyframe, alignment = found
+                self._flow_decided, self._agreement = False, []
+                trouble, reason = "", "found again"
         if trouble:
             return self._lost(frame, trouble, alignment)
+        T_world_camera = self._T_world_camera(self._keyframe, alignment)
         self._remember(T_world_camera)
-        self._agreement.append(alignment.inlier_share * alignment.overlap)
-        reason = "flow decided" if self._flow_decided else ""
+        self._agreement.append(_agreement(alignment))
+        reason = "flow decided" if self._flow_decided else reason
         return _tracked(frame.index, "ok", reason, T_world_camera, self._keyframe.index, alignment)
 
     def wants_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
+        if self._keyframe is None:
+            return True
         due = self._frames_since_keyframe >= self.settings.keyframe_every
-        return self._keyframe is None or due or self._flow_decided or self._fades()
+        # What an unclear frame says of its depth is no better than what it shows.
+        return (due or self._flow_decided or self._fades()) and not self._unclear
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
@@ -87,7 +116,8 @@ class Tracker:
             return False
         pyramid = build_pyramid(frame, self.settings, trust_slope=measured)
         mean_mm = float(frame.depth_mm[known].mean())
-        self._keyframe = _Keyframe(frame.index, frame.T_world_camera, pyramid, mean_mm, measured)
+        self._keyframe = _Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured)
+        self._remembered.append(self._keyframe)
         self._frames_since_keyframe, self._agreement = 0, []
         return True
 
@@ -100,7 +130,20 @@ class Tracker:
         assert keyframe is not None
         starts = [inverse(T) @ keyframe.T_world_camera for T in self._guesses()]
         found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
-        return max(found, key=lambda alignment: alignment.inlier_share * alignment.overlap)
+        return max(found, key=_agreement)
+
+    def _found_again(self, frame: Frame, pyramid: list[View]) -> tuple[_Keyframe, Alignment] | None:
+        """Return the remembered keyframe whose landmarks lead to the best alignment, and that; None where none does."""
+        if not self._remembered:
+            return None
+        current, found = find_landmarks(replace(frame, depth_mm=None)), []
+        for keyframe in self._remembered:
+            place = locate(keyframe.landmarks, current, frame.camera, self.settings.least_landmarks)
+            if place is not None:
+                alignment = align(keyframe.pyramid, pyramid, place.T_current_reference, self.settings)
+                if not self._trouble(keyframe, alignment, by_flow=False):
+                    found.append((keyframe, alignment))
+        return max(found, key=lambda pair: _agreement(pair[1]), default=None)
 
     def _by_flow(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment | None:
         """Return what takes the alignment's place where flow from the frame before contradicts it, else None."""
@@ -138,16 +181,16 @@ class Tracker:
             return [self._keyframe.T_world_camera]
         return [onward if self.settings.start == "velocity" else self._T_world_last]
 
-    def _T_world_camera(self, alignment: Alignment) -> np.ndarray:
-        assert self._keyframe is not None
-        T = self._keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
-        # A keyframe's own deviation from a rotation would be doubled by the next one's, and so on.
-        return orthonormalised(T) if np.isfinite(T).all() else T
+    def _veiled(self, detail: float, alignment: Alignment) -> bool:
+        """Whether a frame shows too little detail, as a share of what is usual, for its alignment to be believed."""
+        least = self.settings.least_detail
+        doubtful = alignment.inlier_share < self.settings.doubtful_inlier_share
+        # Below half of that even agreement says nothing: smoke agrees with smoke.
+        return detail < (least if doubtful else least / 2)
 
-    def _trouble(self, alignment: Alignment, *, by_flow: bool) -> str:
+    def _trouble(self, keyframe: _Keyframe, alignment: Alignment, *, by_flow: bool) -> str:
         """Return why a pose cannot be believed, or ""; flow follows tissue where grey values cannot."""
-        assert self._keyframe is not None
-        settings, T_world_camera = self.settings, self._T_world_camera(alignment)
+        settings, T_world_camera = self.settings, self._T_world_camera(keyframe, alignment)
         if not np.isfinite(T_world_camera).all():
             return "the alignment diverged"
         if alignment.overlap < settings.min_valid_share:
@@ -156,10 +199,16 @@ class Tracker:
             return f"only {alignment.inlier_share:.0%} of the pixels agree with the keyframe"
         T_step = inverse(self._T_world_last) @ T_world_camera
         turn = float(rotation_angle_rad(T_step[:3, :3]))
-        way = float(np.linalg.norm(T_step[:3, 3])) / self._keyframe.depth_mm
+        way = float(np.linalg.norm(T_step[:3, 3])) / keyframe.depth_mm
         if max(turn, way) > settings.max_step * (1 + self._frames_lost):
             return f"a jump of {np.degrees(turn):.0f} deg and {way:.2f} mean depths"
         return ""
+
+    @staticmethod
+    def _T_world_camera(keyframe: _Keyframe, alignment: Alignment) -> np.ndarray:
+        T = keyframe.T_world_camera @ inverse(alignment.motion.T_current_reference)
+        # A keyframe's own deviation from a rotation would be doubled by the next one's, and so on.
+        return orthonormalised(T) if np.isfinite(T).all() else T
 
     def _remember(self, T_world_camera: np.ndarray) -> None:
         T_step = inverse(self._T_world_last) @ T_world_camera
@@ -172,6 +221,10 @@ class Tracker:
         self._flow_decided = False
         keyframe = self._keyframe.index if self._keyframe else frame.index
         return _tracked(frame.index, "lost", reason, self._T_world_last, keyframe, alignment)
+
+
+def _agreement(alignment: Alignment) -> float:
+    return alignment.inlier_share * alignment.overlap
 
 
 def _tracked(

@@ -1,0 +1,81 @@
+"""Landmarks on a textured plane whose truth is a closed form, and what is not known again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+
+from scopemap.frame import Frame
+from scopemap.geometry.landmarks import find_landmarks, locate, matches
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
+
+HERE = plane_scene.pose()
+# Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.
+THERE = plane_scene.pose(at_mm=(30.0, 8.0, 6.0), turn_rad=(0.08, -0.12, 0.35))
+
+
+def _frame(T_world_camera: np.ndarray, index: int = 0) -> Frame:
+    view = plane_scene.see(T_world_camera)
+    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
+
+
+def test_a_far_view_is_placed_by_its_landmarks() -> None:
+    known, seen = find_landmarks(_frame(HERE)), find_landmarks(replace(_frame(THERE), depth_mm=None))
+    located = locate(known, seen, CAMERA, least=20)
+    assert located is not None
+    off = located.T_current_reference @ inverse(HERE) @ THERE
+    assert rotation_angle_rad(off[:3, :3]) < np.radians(0.5)
+    assert np.linalg.norm(off[:3, 3]) < 0.5
+    # The pairs are where the truth says.
+    T = inverse(THERE) @ HERE
+    moved = known.points_mm[located.pairs[:, 0]] @ T[:3, :3].T + T[:3, 3]
+    away = np.linalg.norm(CAMERA.project(moved) - seen.pixels[located.pairs[:, 1]], axis=1)
+    assert np.median(away) < 0.5
+    assert len(located.pairs) >= 20
+
+
+def test_landmarks_carry_the_point_that_their_pixel_shows() -> None:
+    frame = _frame(THERE)
+    landmarks = find_landmarks(frame)
+    assert len(landmarks.pixels) > 100
+    np.testing.assert_allclose(CAMERA.project(landmarks.points_mm), landmarks.pixels, atol=1e-6)
+    column, row = np.rint(landmarks.pixels).astype(int).T
+    assert frame.depth_mm is not None
+    np.testing.assert_allclose(landmarks.points_mm[:, 2], frame.depth_mm[row, column])
+    np.testing.assert_allclose(np.linalg.norm(landmarks.descriptors, axis=1), 1.0, atol=1e-5)
+
+
+def test_what_is_not_usable_is_no_landmark() -> None:
+    half = plane_scene.EVERYWHERE.copy()
+    half[:, 120:] = False
+    assert find_landmarks(replace(_frame(HERE), valid=half)).pixels[:, 0].max() < 120
+    flat = replace(_frame(HERE), rgb=np.full((CAMERA.height, CAMERA.width, 3), 99, np.uint8))
+    nothing = find_landmarks(flat)
+    assert nothing.pixels.shape == (0, 2)
+    assert matches(nothing, find_landmarks(_frame(HERE))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("what", ["another place", "no depth", "too many asked for"])
+def test_nothing_is_placed_without_evidence(what: str) -> None:
+    known, least = _frame(HERE), 20
+    seen = find_landmarks(_frame(THERE))
+    if what == "another place":
+        noise = np.random.default_rng(3).integers(0, 255, known.rgb.shape, dtype=np.uint8)
+        known = replace(known, rgb=noise)
+    elif what == "no depth":
+        known = replace(known, depth_mm=None)
+    else:
+        least = 10_000
+    assert locate(find_landmarks(known), seen, CAMERA, least) is None
+
+
+def test_the_same_frames_are_placed_the_same_way_twice() -> None:
+    known, seen = find_landmarks(_frame(HERE)), find_landmarks(_frame(THERE))
+    one, other = (locate(known, seen, CAMERA, least=20) for _ in range(2))
+    assert one is not None
+    assert other is not None
+    np.testing.assert_array_equal(one.T_current_reference, other.T_current_reference)

@@ -1,0 +1,133 @@
+"""Loops: a camera that comes back, on a textured plane, and a graph whose drift is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+
+from scopemap.backend import Backend
+from scopemap.backend.loops import Loop, LoopFinder
+from scopemap.backend.pose_graph import spread_loops
+from scopemap.config import BackendSettings
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+
+# Out to the side and back again, never nearer than a picture's width to where it began until the end.
+OUT = [plane_scene.pose(at_mm=(9.0 * n, 1.5 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
+POSES = [*OUT, *OUT[-2::-1]]
+COUNT = len(POSES)
+SETTINGS = BackendSettings(gaps=(1, 2))
+
+
+def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
+    view = plane_scene.see(POSES[number])
+    T = view.T_world_camera if T_tracked is None else T_tracked
+    depth_mm = (factor * view.depth_mm).astype(np.float32)
+    return Frame(10 * number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm, T)
+
+
+def _drifting() -> list[np.ndarray]:
+    """Poses whose every step errs alike, by some 0.6 degrees and 1 mm."""
+    step, poses = se3_exp(np.array([0.004, -0.004, 0.008, 0.6, 0.6, -0.5])), [POSES[0]]
+    for before, here in pairwise(POSES):
+        poses.append(poses[-1] @ inverse(before) @ here @ step)
+    return poses
+
+
+def _off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    off = inverse(pose) @ true
+    return float(rotation_angle_rad(off[:3, :3])), float(np.linalg.norm(off[:3, 3]))
+
+
+def test_a_place_is_known_again_and_placed_where_it_is() -> None:
+    finder = LoopFinder(SETTINGS)
+    loops = [loop for number in range(COUNT) for loop in finder.add(_frame(number, factor=1.0 + 0.02 * number))]
+    assert any(loop.past == 0 and loop.new == COUNT - 1 for loop in loops)
+    for loop in loops:
+        assert loop.new - loop.past > 2
+        T = inverse(POSES[loop.new]) @ POSES[loop.past]
+        scale_past, scale_new = 1 + 0.02 * loop.past, 1 + 0.02 * loop.new
+        turn, _ = _off(loop.T_new_past, T)
+        assert turn < np.radians(1.0)
+        np.testing.assert_allclose(loop.T_new_past[:3, 3], scale_past * T[:3, 3], atol=1.0)
+        assert loop.log_ratio == pytest.approx(np.log(scale_new / scale_past), abs=0.03)
+
+
+def test_a_camera_that_only_goes_on_closes_no_loop() -> None:
+    finder = LoopFinder(BackendSettings(gaps=(1,)))
+    for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):
+        view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
+        frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
+        assert not [loop for loop in finder.add(frame) if loop.past == 0]
+
+
+def test_the_graph_takes_drift_of_poses_and_of_scale_away() -> None:
+    # The depth of keyframe k is too large by exp(0.02 k), and so is every way tracked from it.
+    scale = np.exp(0.02 * np.arange(COUNT))
+    tracked = [POSES[0]]
+    for k in range(COUNT - 1):
+        step = inverse(POSES[k]) @ POSES[k + 1]
+        step[:3, 3] *= scale[k]
+        tracked.append(tracked[-1] @ step)
+    loops = []
+    for past in range(3):
+        new = COUNT - 1 - past
+        T = inverse(POSES[new]) @ POSES[past]
+        T[:3, 3] *= scale[past]
+        loops.append(replace(_said(past, new, T), log_ratio=float(np.log(scale[new] / scale[past]))))
+    graph = spread_loops(np.stack(tracked), loops, depth_mm=50.0)
+    before, after = (_off(poses[-1], POSES[-1])[1] for poses in (tracked, graph.T_world_camera))
+    assert before > 5
+    assert after < 0.05 * before
+    assert graph.log_scale[0] == 0
+    np.testing.assert_allclose(graph.log_scale[-1], -np.log(scale[-1]), atol=0.05)
+    np.testing.assert_array_equal(graph.T_world_camera[0], tracked[0])
+
+
+def _said(past: int, new: int, T_new_past: np.ndarray) -> Loop:
+    return Loop(past, new, T_new_past, 0.0, *(np.zeros((0, 2)),) * 4)
+
+
+def test_a_loop_that_denies_most_of_the_way_is_not_believed() -> None:
+    poses = np.stack(OUT)
+    graph = spread_loops(poses, [_said(0, len(OUT) - 1, np.eye(4))], depth_mm=20.0)
+    assert graph.believed == 0
+    np.testing.assert_allclose(graph.T_world_camera, poses, atol=1e-9)
+
+
+def test_one_false_loop_gives_way_to_others() -> None:
+    poses = np.stack(POSES)
+    true = [_said(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
+    false = se3_exp(np.array([0.0, 0.3, 0.0, 20.0, 0.0, 0.0])) @ true[0].T_new_past
+    graph = spread_loops(poses, [*true, _said(0, COUNT - 1, false)], depth_mm=50.0)
+    assert graph.believed == 5
+    assert max(_off(a, b)[1] for a, b in zip(graph.T_world_camera, poses, strict=True)) < 1.0
+
+
+@pytest.mark.parametrize("closing", [True, False])
+def test_the_back_end_closes_loops_where_it_may(closing: bool) -> None:
+    tracked = _drifting()
+    settings = SETTINGS if closing else SETTINGS.model_copy(update={"loop_landmarks": 0})
+    backend = Backend(settings)
+    for number in range(COUNT):
+        backend.add(_frame(number, tracked[number]))
+    correction = backend.adjust()
+    _, before = _off(tracked[-1], POSES[-1])
+    _, after = _off(correction.pose(10 * (COUNT - 1), tracked[-1]), POSES[-1])
+    assert before > 10
+    assert (correction.loops > 0) == closing
+    assert ("loops closed" in correction.description) == closing
+    if closing:
+        assert after < 0.3
+
+
+def test_loops_of_keyframes_without_depth_are_none() -> None:
+    finder = LoopFinder(SETTINGS)
+    for number in range(COUNT):
+        frame = _frame(number)
+        assert not finder.add(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
