@@ -11,12 +11,13 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.backend import Backend, Correction, links
-from scopemap.backend.links import Linker, corners
+from scopemap.backend import Backend, Correction
+from scopemap.backend.links import Linker
 from scopemap.config import BackendSettings
 from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool
+from scopemap.geometry.corners import corners, sampled_at
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 
 POSES = [
@@ -124,7 +125,7 @@ def test_keyframes_without_a_single_corner_are_no_harm() -> None:
 def test_more_points_than_opencv_takes_columns_are_sampled() -> None:
     flow = np.random.default_rng(0).normal(size=(180, 240, 2)).astype(np.float32)
     pixel = np.tile([[3.0, 5.0], [10.0, 20.0], [-5.0, 2.0]], (12000, 1))
-    found = links._sampled(flow, pixel)
+    found = sampled_at(flow, pixel)
     np.testing.assert_allclose(found[:2], [flow[5, 3], flow[20, 10]], atol=1e-5)
     assert np.isnan(found[2]).all()
     assert found.shape == (36000, 2)

@@ -80,7 +80,9 @@ def test_two_scales_and_grey_values_alone() -> None:
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start", "keyframe_every", "min_inlier_share"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
     assert SETTINGS.depth_share == SETTINGS.flow_contradiction == SETTINGS.keyframe_agreement == 0
-    assert SETTINGS.least_detail == SETTINGS.remembered_keyframes == 0
+    assert SETTINGS.min_correlation == -1
+    assert SETTINGS.corner_depth_share == 0
+    assert SETTINGS.least_detail == SETTINGS.remembered_keyframes == SETTINGS.new_map_after == 0
     # A part that our tracker gets later must not slip in by its default: what is not named there has no effect on it,
     # or says when an image is empty.
     unnamed = {"flow_least_share", "grey_share", "least_depth_sigma", "min_side_px", "normalise_sigma_px", "radius"}

@@ -39,6 +39,6 @@ def test_good_poses_agree_with_the_flow(phantom: Path, capsys: pytest.CaptureFix
 def test_standing_still_is_as_far_off_as_tissue_moves(
     phantom: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Tracker, "_T_world_camera", lambda self, alignment: np.eye(4))
+    monkeypatch.setattr(Tracker, "_T_world_camera", staticmethod(lambda keyframe, alignment: np.eye(4)))
     moved_px, off_px = _said(phantom, capsys)
     assert off_px == pytest.approx(moved_px, abs=0.06)  # one digit and two are said

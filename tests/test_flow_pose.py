@@ -16,7 +16,7 @@ from scopemap.frame import Frame, SeenAgain
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.geometry.warp import carried_points
 from scopemap.odometry import Tracker
-from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
+from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow, refined_by_corners
 
 CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
 TWIST = np.array([0.05, -0.08, 0.1, 2.0, -1.5, 4.0])
@@ -128,7 +128,13 @@ def test_flow_decides_where_the_image_alone_goes_astray() -> None:
     assert way_mm == pytest.approx(WAY_MM, abs=0.1)
     assert tracker.wants_keyframe()
     few = replace(frame, seen_again=_truly(moved, share=0.09))
-    for silent in (_tracked(frame, flow_contradiction=0), _tracked(replace(frame, seen_again=None)), _tracked(few)):
+    # Landmarks would find the way as well.
+    alone = {"remembered_keyframes": 0}
+    for silent in (
+        _tracked(frame, flow_contradiction=0, **alone),
+        _tracked(replace(frame, seen_again=None), **alone),
+        _tracked(few, **alone),
+    ):
         assert silent[2] == "lost" or abs(silent[1] - WAY_MM) > 1
         assert silent[3] != "flow decided"
 
@@ -161,7 +167,8 @@ def test_many_decisions_leave_a_pose_a_pose() -> None:
     moved = np.eye(4)
     moved[0, 3] = -WAY_MM
     turned = se3_exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])) @ moved
-    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0))
+    # What correlates with nothing would be lost.
+    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0, min_correlation=-1))
     random = np.random.default_rng(0)
     track = tracker.track(_wall(0, 0))
     decided = 0
@@ -178,3 +185,61 @@ def test_many_decisions_leave_a_pose_a_pose() -> None:
 
 def test_the_paper_listens_to_no_flow() -> None:
     assert Config.load("paper").odometry.flow_contradiction == 0
+
+
+def _corners(T_current_host: np.ndarray, depth_error: np.ndarray | float = 1.0, host: int = 0) -> SeenAgain:
+    """Corners on a rough wall, seen where a motion takes them, lifted by a depth that is wrong by a factor."""
+    rng = np.random.default_rng(5)
+    pixels = rng.uniform([10, 10], [150, 118], (300, 2))
+    points = CAMERA.unproject(pixels) * rng.uniform(30, 60, (300, 1))
+    seen = CAMERA.project(points @ T_current_host[:3, :3].T + T_current_host[:3, 3])
+    return SeenAgain(points * np.reshape(depth_error, (-1, 1)), seen, 0.9, host)
+
+
+def test_corners_set_a_pose_right() -> None:
+    true = se3_exp(np.array([0.02, -0.03, 0.05, 2.0, -1.0, 1.5]))
+    start = se3_exp(np.array([0.01, 0.01, -0.01, 0.5, 0.5, -0.5])) @ true
+    found = refined_by_corners(_corners(true), CAMERA, start, 0.2)
+    assert found is not None
+    np.testing.assert_allclose(found, true, atol=1e-6)
+
+
+def test_wrong_depth_bends_a_turn_less_where_it_is_expected() -> None:
+    true = se3_exp(np.array([0.02, -0.03, 0.05, 4.0, -2.0, 1.5]))
+
+    def turn_off(share: float, seed: int) -> float:
+        seen = _corners(true, np.exp(np.random.default_rng(seed).normal(0, 0.25, 300)))
+        found = refined_by_corners(seen, CAMERA, true, share)
+        assert found is not None
+        return float(rotation_angle_rad((found @ inverse(true))[:3, :3]))
+
+    expecting, trusting = (np.mean([turn_off(share, seed) for seed in range(20)]) for share in (0.2, 1e-6))
+    assert expecting < 0.8 * trusting
+
+
+def test_corners_that_move_by_themselves_fade_out() -> None:
+    true = se3_exp(np.array([0.0, 0.01, 0.0, 1.0, 0.5, 0.0]))
+    seen = _corners(true)
+    pixels = seen.pixels.copy()
+    pixels[:60] += [9.0, -6.0]
+    found = refined_by_corners(replace(seen, pixels=pixels), CAMERA, true, 0.2)
+    assert found is not None
+    np.testing.assert_allclose(found, true, atol=0.05)
+
+
+def test_too_few_corners_say_nothing() -> None:
+    seen = _corners(np.eye(4))
+    few = SeenAgain(seen.points_mm[:49], seen.pixels[:49], 0.2, 0)
+    assert refined_by_corners(few, CAMERA, np.eye(4), 0.2) is None
+
+
+@pytest.mark.parametrize(("host", "share", "listens"), [(0, 0.2, True), (7, 0.2, False), (0, 0.0, False)])
+def test_the_tracker_listens_to_corners_of_its_keyframe_alone(host: int, share: float, listens: bool) -> None:
+    """Corners that place the camera a fifth of a millimetre aside of where the image does."""
+    plain = _tracked(_wall(2, 1, soft_px=3), soft_px=3)
+    aside = np.eye(4)
+    aside[0, 3] = -(plain[1] + 0.2)
+    frame = replace(_wall(2, 1, soft_px=3), corners_again=_corners(aside, host=host))
+    told = _tracked(frame, soft_px=3, corner_depth_share=share)
+    assert told[2] == "ok"
+    assert told[1] == pytest.approx(plain[1] + 0.2 * listens, abs=0.01)

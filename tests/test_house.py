@@ -18,7 +18,7 @@ import scopemap
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
-BOTTOM = {"errors", "camera", "frame", "geometry", "config", "lenses", "calibration", "rectification"} | {
+BOTTOM = {"errors", "presets", "camera", "frame", "geometry", "config", "lenses", "calibration", "rectification"} | {
     *("weights", "checkpoints", "device", "trajectory", "trajectories"),
 }
 STAGES = {"masking", "depth", "flow", "perceptual", "odometry", "fusion"}

@@ -117,3 +117,58 @@ def test_nothing_usable_shows_no_detail() -> None:
     frame = _frame(0, NEAR[0])
     assert detail_of(replace(frame, valid=np.zeros_like(frame.valid))) == 0.0
     assert detail_of(replace(frame, rgb=np.zeros_like(frame.rgb))) == 0.0
+
+
+def _elsewhere(index: int, n: int) -> Frame:
+    """A frame of another place, far beyond what any of the others shows."""
+    return _frame(index, plane_scene.pose(at_mm=(-58.0 + n, -50.0, -10.0), turn_rad=(0.0, 0.0, 2.0)))
+
+
+def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_again() -> None:
+    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    there = [_elsewhere(8 + n, n) for n in range(9)]
+    back = [_frame(17 + n, T) for n, T in enumerate(NEAR[:3])]
+    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
+    assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
+    assert tracks[11].reason == "begins a new map"
+    assert [track.map for track in tracks] == [0] * 11 + [1] * 6 + [0] * 3
+    assert [track.status for track in tracks[12:]] == ["ok"] * 8
+    # The new map's world is its first frame's camera.
+    np.testing.assert_array_equal(tracks[11].T_world_camera, np.eye(4))
+    np.testing.assert_allclose(np.linalg.norm(tracks[16].T_world_camera[:3, 3]), 5.0, atol=0.3)
+    # And the old one is where it was.
+    assert tracks[17].reason == "found again"
+    turn, way_mm = _off(tracks[17], NEAR[0])
+    assert turn < np.radians(0.4)
+    assert way_mm < 0.3
+
+
+@pytest.mark.parametrize("unseen", ["dark", "smoked"])
+def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
+    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    last = frames[-1]
+    nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
+    spoilt = [replace(nothing, index=8 + n) for n in range(12)]
+    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], SETTINGS.model_copy(update={"new_map_after": 2}))
+    assert {track.map for track in tracks} == {0}
+    assert tracks[-1].status == "ok"
+
+
+def test_a_bare_wall_is_said_to_constrain_nothing() -> None:
+    rng = np.random.default_rng(0)
+
+    def bare(index: int) -> Frame:
+        """Light that falls off to the sides, and the sensor's noise."""
+        away = np.linalg.norm(CAMERA.rays, axis=-1, keepdims=True)
+        grey = 150 / away**2 + rng.normal(0, 1.0, away.shape)
+        rgb = np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8), 3, axis=2)
+        depth_mm = np.full(plane_scene.EVERYWHERE.shape, 50.0, np.float32)
+        return Frame(index, index / 30, rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm)
+
+    tracker = Tracker(SETTINGS)
+    first = tracker.track(bare(0))
+    tracker.adopt(replace(bare(0), T_world_camera=first.T_world_camera), measured=False)
+    track = tracker.track(bare(1))
+    assert track.status == "lost"
+    assert "weakly constrained" in track.reason
+    assert abs(track.correlation) < 0.15

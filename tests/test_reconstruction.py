@@ -21,7 +21,8 @@ from scopemap.pipeline import Step
 from scopemap.reconstruction import DEPTH_SCALE_MM, DepthWriter, FrameRecord, prepare_folder
 from scopemap.trajectory import read_trajectory
 
-COLUMNS = "index time_s name status reason keyframe residual inlier_share overlap iterations depth_scale warped_share"
+COLUMNS = "index time_s name status reason keyframe residual inlier_share correlation overlap iterations depth_scale"
+COLUMNS += " warped_share"
 LOST = 6
 
 
@@ -80,7 +81,7 @@ def test_frames_table(run: _Run) -> None:
 
 def test_numbers_that_do_not_exist_are_empty(run: _Run) -> None:
     rows = _rows(run.out)
-    for name in ("residual", "inlier_share", "overlap"):
+    for name in ("residual", "inlier_share", "correlation", "overlap"):
         assert rows[0][name] == ""
         told = [float(row[name]) for row in rows if row["status"] == "ok"]
         known = [getattr(record.track, name) for record in run.result.records if record.track.status == "ok"]

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from scopemap.errors import SettingsError
+from scopemap.presets import PRESETS
 
 Preset = Literal["paper", "default", "realtime"]
 
@@ -199,9 +200,16 @@ class OdometrySettings(Settings):
     )
     doubtful_inlier_share: float = Field(0.6, ge=0, le=1, description="less than that agrees badly")
     remembered_keyframes: int = Field(10, ge=0, description="among which a lost camera is looked for; 0: off")
+    new_map_after: int = Field(5, ge=0, description="so many clear frames lost in a row, a new map begins; 0: never")
     least_landmarks: int = Field(20, ge=6, description="that must agree on where the camera was found again")
+    corner_depth_share: float = Field(
+        0.2,
+        ge=0,
+        description="relative error of predicted depth, for corners of the keyframe that flow follows; 0: off",
+    )
     start: Literal["identity", "previous", "velocity"] = Field("previous", description="first guess of a frame")
     min_inlier_share: float = Field(0.4, ge=0, le=1, description="a frame below is lost; unrelated fine texture: 0.37")
+    min_correlation: float = Field(0.15, ge=-1, le=1, description="with the keyframe; a frame below is lost; -1: off")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with less usable overlap is lost")
     max_step: float = Field(0.5, gt=0, description="largest jump between frames: rad, and mm over mean depth")
 
@@ -307,50 +315,6 @@ class Config(Settings):
         """Return all settings as TOML text that `load` reads back; what is None is left out."""
         flat = _flatten(self.model_dump())
         return "".join(f"{key} = {_toml_value(value)}\n" for key, value in flat.items() if value is not None)
-
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "paper": {
-        "depth.backend": "depth-anything",
-        "depth.anchor": "depth-pro",
-        "depth.fit_shift": False,
-        "mapis.order": "refine-first",
-        "mapis.frame_scale": "none",
-        "mapis.blend": "linear",
-        "mapis.recursive": False,
-        "mapis.compare_warped": False,
-        "mapis.perceptual_score": True,
-        "networks.flow": "raft-large",
-        "networks.perceptual": "lpips",
-        "odometry.keyframe_every": 2,
-        "odometry.keyframe_agreement": 0.0,
-        "odometry.finest_level": 0,
-        "odometry.channels": "grey",
-        "odometry.lamp_gamma": 0.0,
-        "odometry.gain_bias": False,
-        "odometry.depth_share": 0.0,
-        "odometry.flow_contradiction": 0.0,
-        "odometry.least_detail": 0.0,
-        "odometry.remembered_keyframes": 0,
-        "odometry.start": "identity",
-        "smoothing.method": "wema",
-        "backend.method": "none",
-        "fusion.voxel_mm": 1.0,
-        "fusion.truncation_mm": 5.0,
-        "fusion.max_depth_mm": 100.0,
-    },
-    "realtime": {
-        "networks.flow": "dis",
-        "networks.perceptual": "structure",
-        "odometry.max_iterations": 15,
-        "fusion.voxel_mm": 1.5,
-        "fusion.truncation_mm": 5.0,
-        "fusion.max_depth_mm": 100.0,
-        "fusion.every": 2,
-        "backend.method": "none",
-    },
-}
 
 
 def setting_names() -> list[str]:

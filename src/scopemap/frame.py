@@ -18,17 +18,19 @@ TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "pre
 
 @dataclass(frozen=True)
 class SeenAgain:
-    """Points of the frame before, where optical flow finds them in this one.
+    """Points of an earlier frame, where optical flow finds them in this one.
 
     Attributes
     ----------
-    points_mm : (N, 3) float64, in the camera of the frame before. pixels : (N, 2) float64 x, y in this frame.
-    share : of this frame's pixels that flow and depth could be trusted in; the points are some of them.
+    points_mm : (N, 3) float64, in the camera of the earlier frame. pixels : (N, 2) float64 x, y in this frame.
+    share : of this frame's pixels that flow and depth could be trusted in; the points are some of them. Of corners, the
+    share of them that was found. host : number of the earlier frame, -1: the one before.
     """
 
     points_mm: np.ndarray
     pixels: np.ndarray
     share: float
+    host: int = -1
 
     def __post_init__(self) -> None:
         check_shape("SeenAgain.points_mm", self.points_mm, (None, 3))
@@ -51,6 +53,7 @@ class Frame:
     name : the file's own name, or "".
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: nothing is said of it.
     seen_again : what flow carries over from the frame before; None where there is none, or nothing is known of it.
+    corners_again : the same of the corners of the keyframe.
     """
 
     index: int
@@ -63,6 +66,7 @@ class Frame:
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
     seen_again: SeenAgain | None = None
+    corners_again: SeenAgain | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

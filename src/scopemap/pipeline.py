@@ -22,7 +22,7 @@ from scopemap.datasets import Sequence
 from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
-from scopemap.flow import FlowEstimator, create_flow, pair_flow
+from scopemap.flow import CornerFollower, DisFlow, FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Frame, SeenAgain
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
@@ -125,11 +125,33 @@ class Pipeline:
         self._backend = Backend(config.backend) if config.backend.method == "full" else None
         waits = self._backend is not None or follows_scene(config.fusion)
         self._volume = None if waits else TsdfVolume(config.fusion)
+        self._fuses_at_once = not waits
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
         self._last_mm: np.ndarray | None = None
         self._fusable = 0
+        follows = tracker is None and config.odometry.corner_depth_share > 0 and estimators.flow.name != "none"
+        self._corners = CornerFollower(DisFlow(), config.mapis.consistency_px) if follows else None
+        self._frames_of_map: dict[int, list[int]] = {}
+
+    @property
+    def main_map(self) -> int:
+        """Number of the map that counts: the one with most tracked frames; the first where frames are fused at once."""
+        if self._fuses_at_once:
+            return 0
+        return max(self._frames_of_map, key=lambda number: len(self._frames_of_map[number]), default=0)
+
+    @property
+    def maps_note(self) -> list[str]:
+        """What to say where there are several maps; nothing where there is one."""
+        if len(self._frames_of_map) < 2:
+            return []
+        total, kept = (sum(map(len, self._frames_of_map.values())), len(self._frames_of_map[self.main_map]))
+        return [
+            f"maps: the camera was lost for good {len(self._frames_of_map) - 1} times; of {total} frames tracked, the "
+            f"{kept} of the largest map are kept: how the others lie to them is not known"
+        ]
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the frame before it."""
@@ -158,6 +180,8 @@ class Pipeline:
             depth_sigma_mm=percept.raw_sigma_mm,
             seen_again=self._seen_again(percept),
         )
+        if self._corners is not None and percept.kind != "measured":
+            raw = replace(raw, corners_again=self._corners.find(raw))
         track = self._tracker.track(raw)
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
@@ -171,8 +195,11 @@ class Pipeline:
             self._mapis.forget()
             self._smooth.forget()
         else:
+            if track.status == "initial":
+                self._smooth.forget()
+            self._frames_of_map.setdefault(track.map, []).append(frame.index)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-            self._fuse(frame)
+            self._fuse(frame, track.map)
         self._last, self._last_mm = track, refined.depth_mm
         return Step(frame, track, percept.raw_mm, refined)
 
@@ -181,15 +208,19 @@ class Pipeline:
 
         Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
         """
-        return self._backend.adjust() if self._backend is not None and self._backend.keyframes else None
+        if self._backend is None or not self._backend.keyframes(self.main_map):
+            return None
+        return self._backend.adjust(self.main_map)
 
     def fuse(self, correction: Correction | None = None) -> None:
         """Fuse what waited, in voxels that suit it, as `adjust` corrected it."""
         if self._waiting.typical_mm is None:
             return
         volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, self._waiting.typical_mm))
+        elsewhere = {i for number, frames in self._frames_of_map.items() if number != self.main_map for i in frames}
         for frame in self._waiting.frames():
-            volume.integrate(frame if correction is None else correction.frame(frame))
+            if frame.index not in elsewhere:
+                volume.integrate(frame if correction is None else correction.frame(frame))
         self._waiting, self._volume = FrameSpool(), volume
 
     @property
@@ -215,8 +246,10 @@ class Pipeline:
             return track
         keyframe = replace(frame, T_world_camera=track.T_world_camera)
         adopted = self._tracker.adopt(keyframe, measured=measured)
+        if adopted and self._corners is not None:
+            self._corners.start(keyframe)
         if adopted and self._backend is not None:
-            self._backend.add(keyframe)
+            self._backend.add(keyframe, track.map)
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track
@@ -261,7 +294,9 @@ class Pipeline:
             return None
         return inverse(track.T_world_camera) @ self._last.T_world_camera
 
-    def _fuse(self, frame: Frame) -> None:
+    def _fuse(self, frame: Frame, map_number: int) -> None:
+        if self._fuses_at_once and map_number != self.main_map:
+            return
         if self.config.fusion.enabled and self._fusable % self.config.fusion.every == 0:
             if self._volume is None:
                 self._waiting.put(frame)

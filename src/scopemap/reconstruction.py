@@ -33,7 +33,8 @@ DEPTH_SCALE_MM = 0.01
 
 _LARGEST_UNIT = 65534
 _COLUMNS = [
-    *("index", "time_s", "name", "status", "reason", "keyframe", "residual", "inlier_share", "overlap", "iterations"),
+    *("index", "time_s", "name", "status", "reason", "keyframe", "residual", "inlier_share", "correlation"),
+    *("overlap", "iterations"),
     *("depth_scale", "warped_share"),
 ]
 _OWN_FILES = (
@@ -70,7 +71,7 @@ class FrameRecord:
     def row(self) -> list[str]:
         """Return the columns of frames.csv as text."""
         track = self.track
-        numbers = (track.residual, track.inlier_share, track.overlap)
+        numbers = (track.residual, track.inlier_share, track.correlation, track.overlap)
         return [
             *(str(self.index), f"{self.time_s:.6f}", self.name, track.status, track.reason, str(track.keyframe)),
             *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
@@ -88,6 +89,21 @@ def corrected(records: list[FrameRecord], correction: Correction) -> list[FrameR
             continue
         pose, factor = correction.pose(record.index, record.T_world_camera), correction.depth_factor(record.index)
         out.append(replace(record, T_world_camera=pose, depth_scale=record.depth_scale * factor))
+    return out
+
+
+def only_map(records: list[FrameRecord], number: int) -> list[FrameRecord]:
+    """Return the records with the frames of all other maps lost: their world is another."""
+    out: list[FrameRecord] = []
+    first = next((r.T_world_camera for r in records if r.track.status != "lost" and r.track.map == number), np.eye(4))
+    for record in records:
+        track = record.track
+        if track.status == "lost" or track.map != number:
+            reason = track.reason if track.status == "lost" else f"tracked in another map, number {track.map}"
+            pose = out[-1].T_world_camera if out else first
+            track = replace(track, status="lost", reason=reason, T_world_camera=pose)
+            record = replace(record, track=track, T_world_camera=pose)
+        out.append(record)
     return out
 
 

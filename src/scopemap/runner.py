@@ -23,7 +23,7 @@ from scopemap.errors import InputError
 from scopemap.masking import is_constant
 from scopemap.odometry import FrameTracker
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, prepare_folder
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_map, prepare_folder
 
 Observer = Callable[[Step], None]
 _VERSIONS = (
@@ -76,6 +76,9 @@ def reconstruct(
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
+    maps_note = pipeline.maps_note
+    if maps_note:
+        records = only_map(records, pipeline.main_map)
     correction = clock.timed("back end", pipeline.adjust)
     if correction is not None:
         records = corrected(records, correction)
@@ -87,7 +90,7 @@ def reconstruct(
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
     provenance["notes"] += exponent_note
-    provenance["warnings"] += distances.warnings(config.fusion)
+    provenance["warnings"] += distances.warnings(config.fusion) + maps_note
     provenance["notes"] += [] if correction is None else [correction.description]
     provenance["notes"] += pipeline.fusion_note
     result = Reconstruction(sequence.camera, records, mesh, config, provenance)

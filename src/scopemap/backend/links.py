@@ -1,7 +1,4 @@
-"""Which points of which keyframes are seen again where: corners spread over the image, carried by optical flow.
-
-Shading moves with the lamp and pulls flow along where tissue has no texture; corners hold on to the tissue itself.
-"""
+"""Which points of which keyframes are seen again where: corners spread over the image, carried by optical flow."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from scopemap.backend.adjustment import Points, Sightings
@@ -18,10 +14,8 @@ from scopemap.camera import PinholeCamera
 from scopemap.config import BackendSettings
 from scopemap.flow import FlowEstimator
 from scopemap.frame import Frame
+from scopemap.geometry.corners import corners, followed
 from scopemap.geometry.uncertainty import sigma_share
-
-_CORNER_BLOCK_PX = 5
-_BORDER_PX = 3
 
 
 @dataclass(frozen=True)
@@ -109,53 +103,6 @@ class Linker:
 
     def _see(self, host: _Keyframe, other: _Keyframe, forth: np.ndarray, back: np.ndarray) -> None:
         """Note where points of `host` are seen in `other`, where the way back ends where it began."""
-        start = host.places.astype(np.float32)
-        pixel = start + forth[host.places[:, 1], host.places[:, 0]]
-        returned = pixel + _sampled(back, pixel)
-        height, width = other.valid.shape
-        nearest = np.clip(np.rint(pixel).astype(int), 0, [width - 1, height - 1])
-        inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(1)
-        good = inside & other.valid[nearest[:, 1], nearest[:, 0]]
-        good &= np.linalg.norm(returned - start, axis=1) <= self.settings.consistency_px
-        number = np.flatnonzero(good)
-        self._sightings.append(
-            _Sighting(host.first + number, np.full(len(number), other.number), pixel[number].astype(np.float64))
-        )
-
-
-def corners(frame: Frame, cell_px: int) -> np.ndarray:
-    """Return pixels (n, 2) int x, y: the most corner-like one with depth of each cell of `cell_px` x `cell_px`.
-
-    The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every whole cell with
-    usable tissue gives one, however weak, unless it is quite flat: where corners are few, edges and shades are better
-    than nothing.
-    """
-    assert frame.depth_mm is not None
-    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    # On brightness relative to its surround: far tissue is dark, not featureless.
-    level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
-    strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
-    usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
-    # A patch that touches a mask's edge has a corner that is not the tissue's.
-    usable = cv2.erode(usable.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0) > 0
-    strength = np.where(usable, strength, -1.0)
-    height, width = (side // cell_px * cell_px for side in strength.shape)
-    cells: np.ndarray = strength[:height, :width].reshape(height // cell_px, cell_px, width // cell_px, cell_px)
-    cells = cells.transpose(0, 2, 1, 3).reshape(-1, cell_px * cell_px)
-    best = cells.argmax(1)
-    row, column = np.divmod(np.arange(len(cells)), width // cell_px)
-    places = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
-    return places[cells.max(1) > 0]
-
-
-def _sampled(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Flow (n, 2) at pixels (n, 2), bilinear; NaN outside. Not OpenCV's remap, which refuses none and very many."""
-    height, width = flow.shape[:2]
-    inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)
-    place = np.where(inside, pixel, 0.0)
-    corner = np.clip(np.floor(place).astype(int), 0, [width - 2, height - 2])
-    x, y = corner.T
-    a, b = (place - corner).T[..., None]
-    top = (1 - a) * flow[y, x] + a * flow[y, x + 1]
-    bottom = (1 - a) * flow[y + 1, x] + a * flow[y + 1, x + 1]
-    return np.where(inside, (1 - b) * top + b * bottom, np.nan)
+        number, pixel = followed(host.places, (forth, back), other.valid, self.settings.consistency_px)
+        keyframe = np.full(len(number), other.number)
+        self._sightings.append(_Sighting(host.first + number, keyframe, pixel))

@@ -5,10 +5,21 @@ from scopemap.errors import SettingsError
 from scopemap.flow.consistency import Flow, agree, pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.follow import CornerFollower
 from scopemap.flow.none import NoFlow
 from scopemap.flow.raft import CHECKPOINTS, RaftFlow
 
-__all__ = ["DisFlow", "Flow", "FlowEstimator", "NoFlow", "RaftFlow", "agree", "create_flow", "pair_flow"]
+__all__ = [
+    "CornerFollower",
+    "DisFlow",
+    "Flow",
+    "FlowEstimator",
+    "NoFlow",
+    "RaftFlow",
+    "agree",
+    "create_flow",
+    "pair_flow",
+]
 
 FLOWS = ("auto", "raft-small", "raft-large", "dis", "none")
 

@@ -2,7 +2,10 @@
 
 Photometric tracking is precise where it starts close by. Tissue that rushes past at tens of pixels a frame is beyond
 its reach, and it settles somewhere without a word; flow bridges such gaps, if coarsely. So flow has the last word where
-a photometric pose contradicts it, and none elsewhere.
+a photometric pose contradicts it (`pose_by_flow`).
+
+Where depth is predicted, shading that moves with the lamp pulls the photometric pose along, a little on every frame.
+Corners of the keyframe hold on to the tissue: followed by flow, they set its pose right (`refined_by_corners`).
 """
 
 from __future__ import annotations
@@ -13,13 +16,15 @@ import numpy as np
 
 from scopemap.camera import PinholeCamera
 from scopemap.frame import SeenAgain
-from scopemap.geometry.se3 import se3_exp
+from scopemap.geometry.se3 import orthonormalised, se3_exp
 
 _LEAST_POINTS = 50
 _STEPS = 30
 _SMALL_STEP = 1e-5
 _MEDIAN_TO_SIGMA_2D = 1 / 1.1774  # of the length of a normal vector in the plane
 _LEAST_SIGMA_PX = 0.1
+_CORNER_SIGMA_PX = 0.5
+_LEAST_SPREAD = 0.01
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,41 @@ def pose_by_flow(seen: SeenAgain, camera: PinholeCamera) -> FlowPose | None:
         if np.linalg.norm(step) < _SMALL_STEP:
             break
     return FlowPose(T, flow_error_px(seen, camera, T))
+
+
+def refined_by_corners(
+    seen: SeenAgain, camera: PinholeCamera, T_current_host: np.ndarray, depth_share: float
+) -> np.ndarray | None:
+    """Return the motion (4, 4), close to the one given, that a keyframe's corners ask for; None where they are too few.
+
+    An error of depth moves a point along its epipolar line alone: there a corner counts less by the variance that a
+    relative error of `depth_share` adds, across it fully. So turns, which move everything alike, are held by all
+    corners, and wrong depth does not bend them. Cauchy weights, as above.
+    """
+    if len(seen.points_mm) < _LEAST_POINTS:
+        return None
+    T, unit_mm = T_current_host, float(np.median(seen.points_mm[:, 2]))
+    for _ in range(_STEPS):
+        errors, jacobians, ahead = _linearised(seen, camera, T, unit_mm)
+        if ahead.sum() < _LEAST_POINTS:
+            return None
+        # d(pixel) / d(ln depth): the point moves along its ray, turned to the current camera.
+        along = np.einsum("nij,nj->ni", jacobians[:, :, 3:] / unit_mm, seen.points_mm @ T[:3, :3].T)
+        covariance = _CORNER_SIGMA_PX**2 * np.eye(2) + depth_share**2 * along[:, :, None] * along[:, None, :]
+        information = np.linalg.inv(covariance)
+        square = np.einsum("ni,nij,nj->n", errors, information, errors)
+        spread = max(_MEDIAN_TO_SIGMA_2D**2 * float(np.median(square[ahead])), _LEAST_SPREAD)
+        weight = np.where(ahead, 1 / (1 + square / (4 * spread)), 0.0)
+        weighted = np.einsum("n,nij,njk->nik", weight, information, jacobians)
+        hessian = np.einsum("nij,nik->jk", jacobians, weighted)
+        gradient = np.einsum("nij,ni->j", weighted, errors)
+        step = -np.linalg.lstsq(hessian, gradient, rcond=1e-12)[0]
+        T = se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T
+        if not np.isfinite(T).all():
+            return None
+        if np.linalg.norm(step) < _SMALL_STEP:
+            break
+    return orthonormalised(T)
 
 
 def flow_error_px(seen: SeenAgain, camera: PinholeCamera, T_current_previous: np.ndarray) -> float:

@@ -36,13 +36,17 @@ class Alignment:
     ----------
     motion : the best motion found. residual : robust standard deviation of the residuals at the finest level, of the
     normalised channel whatever was minimised, so in local deviations of the grey value.
-    inlier_share : share of the used pixels whose residual is below half a local deviation.
+    inlier_share : share of the used pixels whose residual is below half a local deviation. correlation : -1..1, of
+    both frames' normalised channel over these pixels; near 0 where there is nothing but noise, however well that fits.
+    texture : root mean square of that channel in the reference, 1 where tissue shows itself everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
     """
 
     motion: Motion
     residual: float
     inlier_share: float
+    correlation: float
+    texture: float
     overlap: float
     iterations: int
 
@@ -66,11 +70,17 @@ def judged(
 ) -> Alignment:
     """Return what two pyramids say of a motion, as it is."""
     residuals = _residuals(reference[0], current[0], motion, settings)
-    used = residuals[-1][np.isfinite(residuals[-1])]
+    compared = np.isfinite(residuals[-1])
+    used, shown = residuals[-1][compared], reference[0].channels[-1][compared]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
     sigma = _robust_sigma(used)
-    inliers = float(np.mean(np.abs(used) < _INLIER)) if used.size else 0.0
-    return Alignment(motion, sigma, inliers, used.size / max(usable, 1), iterations)
+    if not used.size:
+        return Alignment(motion, sigma, 0.0, 0.0, 0.0, 0.0, iterations)
+    inliers, found = float(np.mean(np.abs(used) < _INLIER)), shown + used
+    power = float(np.sqrt(np.mean(shown**2) * np.mean(found**2)))
+    correlation = float(np.mean(shown * found)) / max(power, 1e-9)
+    texture = float(np.sqrt(np.mean(shown**2)))
+    return Alignment(motion, sigma, inliers, correlation, texture, used.size / max(usable, 1), iterations)
 
 
 def _loss(sigma: np.ndarray, settings: OdometrySettings) -> Loss:

@@ -19,13 +19,13 @@ class Track:
     Attributes
     ----------
     index : number of the frame.
-    status : "initial" for the frame that fixes the world, "ok", or "lost".
+    status : "initial" for the frame that fixes the world of its map, "ok", or "lost".
     reason : one phrase; for a lost frame, what was wrong.
     T_world_camera : (4, 4) float64; a lost frame repeats the last pose that is known.
     keyframe : number of the frame it was aligned to.
     residual : robust standard deviation of the photometric residual, NaN if there was none.
-    inlier_share, overlap : 0..1, see `rtdl.Alignment`; NaN if there was no alignment.
-    iterations : dog-leg steps over all levels.
+    inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
+    iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
     """
 
     index: int
@@ -35,8 +35,10 @@ class Track:
     keyframe: int
     residual: float = float("nan")
     inlier_share: float = float("nan")
+    correlation: float = float("nan")
     overlap: float = float("nan")
     iterations: int = 0
+    map: int = 0
 
 
 class FrameTracker(Protocol):

@@ -13,12 +13,14 @@ from scopemap.frame import Frame
 from scopemap.geometry.landmarks import Landmarks, find_landmarks, locate
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
 from scopemap.odometry.clarity import Clarity
-from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow
+from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow, refined_by_corners
 from scopemap.odometry.pyramid import build_pyramid
 from scopemap.odometry.residuals import View
 from scopemap.odometry.rtdl import Alignment, Motion, align, judged
-from scopemap.odometry.track import Track
+from scopemap.odometry.track import Status, Track
 
+_BARE = 0.5  # texture of a wall that shows nothing but noise; tissue: 0.65 and more
+_STILL_ALIKE = 0.8  # share of the correlation that corners may cost; more, and flow has followed something else
 _LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go on
 
 
@@ -29,6 +31,7 @@ class _Keyframe:
     pyramid: list[View]
     depth_mm: float  # mean
     measured: bool
+    map: int
 
     @property
     def index(self) -> int:
@@ -46,55 +49,63 @@ class Tracker:
     The first usable frame fixes the world. Where a frame is lost, the record says so and why, and the next one starts
     from the last pose that is known, from where the last motion would have led, or from where the landmarks of a recent
     keyframe say that it is: whichever fits best, and that keyframe is tracked against from there. Where a frame brings
-    points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide.
+    points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide. Where frames stay
+    lost although they are clear, a new map begins, with a world of its own; a later loss may lead back to an older one.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
         self.settings = settings
         self._keyframe: _Keyframe | None = None
         self._remembered: deque[_Keyframe] = deque(maxlen=settings.remembered_keyframes)
+        self._remembered_elsewhere: deque[_Keyframe] = deque(maxlen=2 * settings.remembered_keyframes)
         self._clarity = Clarity()
         self._T_world_last = np.eye(4)
         self._T_step = np.eye(4)
         self._frames_lost = 0
         self._frames_since_keyframe = 0
         self._agreement: list[float] = []
-        self._flow_decided = self._unclear = False
+        self._flow_decided = self._flow_agrees = self._unclear = False
+        self._map, self._maps = 0, 1
+        self._clear_frames_lost = 0
 
     def track(self, frame: Frame) -> Track:
-        """Return the frame's pose relative to the first usable frame, or say why there is none."""
+        """Return the frame's pose relative to the first usable frame of its map, or say why there is none."""
         self._frames_since_keyframe += 1
         if frame.valid.mean() < self.settings.min_valid_share:
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
         detail = self._clarity.against_recent(frame)
         self._unclear = detail < self.settings.least_detail
         if self._keyframe is None:
-            return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
+            return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index, map=self._map)
         # The keyframe's points are moved: the depth of the frame itself has no say, unless it was measured.
         depth_mm = frame.depth_mm if self._keyframe.measured else None
         pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
-        alignment = self._best(pyramid)
+        alignment = self._by_corners(frame, pyramid, self._best(pyramid))
         by_flow = self._by_flow(frame, pyramid, alignment)
         # Where flow itself leads to nowhere, there is nothing to be said against the image alone.
         self._flow_decided = by_flow is not None and not self._trouble(self._keyframe, by_flow, by_flow=True)
-        if by_flow is not None and self._flow_decided:
-            alignment = by_flow
+        if by_flow is not None:
+            self._flow_agrees, alignment = self._flow_decided, by_flow if self._flow_decided else alignment
         if self._veiled(detail, alignment):
             return self._lost(frame, f"only {detail:.0%} of the usual detail: blur, smoke or fluid", alignment)
-        trouble, reason = self._trouble(self._keyframe, alignment, by_flow=self._flow_decided), ""
+        trouble, reason = self._trouble(self._keyframe, alignment, by_flow=self._flow_agrees), ""
         if trouble or self._frames_lost:
             found = self._found_again(frame, pyramid)
             if found is not None and (trouble or _agreement(found[1]) > _agreement(alignment)):
                 self._keyframe, alignment = found
+                self._map = self._keyframe.map
                 self._flow_decided, self._agreement = False, []
                 trouble, reason = "", "found again"
         if trouble:
+            self._clear_frames_lost += 1
+            if self._clear_frames_lost > self.settings.new_map_after > 0:
+                return self._new_map(frame)
             return self._lost(frame, trouble, alignment)
         T_world_camera = self._T_world_camera(self._keyframe, alignment)
         self._remember(T_world_camera)
         self._agreement.append(_agreement(alignment))
         reason = "flow decided" if self._flow_decided else reason
-        return _tracked(frame.index, "ok", reason, T_world_camera, self._keyframe.index, alignment)
+        return _tracked(frame.index, "ok", reason, T_world_camera, self._keyframe, alignment)
 
     def wants_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
@@ -116,7 +127,7 @@ class Tracker:
             return False
         pyramid = build_pyramid(frame, self.settings, trust_slope=measured)
         mean_mm = float(frame.depth_mm[known].mean())
-        self._keyframe = _Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured)
+        self._keyframe = _Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._map)
         self._remembered.append(self._keyframe)
         self._frames_since_keyframe, self._agreement = 0, []
         return True
@@ -134,10 +145,11 @@ class Tracker:
 
     def _found_again(self, frame: Frame, pyramid: list[View]) -> tuple[_Keyframe, Alignment] | None:
         """Return the remembered keyframe whose landmarks lead to the best alignment, and that; None where none does."""
-        if not self._remembered:
+        remembered = [*self._remembered, *self._remembered_elsewhere]
+        if not remembered:
             return None
         current, found = find_landmarks(replace(frame, depth_mm=None)), []
-        for keyframe in self._remembered:
+        for keyframe in remembered:
             place = locate(keyframe.landmarks, current, frame.camera, self.settings.least_landmarks)
             if place is not None:
                 alignment = align(keyframe.pyramid, pyramid, place.T_current_reference, self.settings)
@@ -145,9 +157,35 @@ class Tracker:
                     found.append((keyframe, alignment))
         return max(found, key=lambda pair: _agreement(pair[1]), default=None)
 
+    def _new_map(self, frame: Frame) -> Track:
+        """Begin anew with this frame: what was seen so far cannot be found, and it is not known how this lies to it."""
+        self._map, self._maps = self._maps, self._maps + 1
+        self._remembered_elsewhere.extend(self._remembered)
+        self._remembered.clear()
+        self._keyframe, self._T_world_last, self._T_step = None, np.eye(4), np.eye(4)
+        self._frames_lost = self._clear_frames_lost = 0
+        self._flow_decided = False
+        return Track(frame.index, "initial", "begins a new map", np.eye(4), frame.index, map=self._map)
+
+    def _by_corners(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment:
+        """Return the alignment that the keyframe's corners make of this one, or this one where they cannot tell."""
+        keyframe, seen, share = self._keyframe, frame.corners_again, self.settings.corner_depth_share
+        if keyframe is None or seen is None or seen.host != keyframe.index or share == 0:
+            return alignment
+        # What does not correlate is not nearly where it should be, and no start for anything.
+        if alignment.correlation < self.settings.min_correlation:
+            return alignment
+        T = refined_by_corners(seen, frame.camera, alignment.motion.T_current_reference, share)
+        if T is None:
+            return alignment
+        motion = alignment.motion._replace(T_current_reference=T)
+        found = judged(keyframe.pyramid, pyramid, motion, self.settings, alignment.iterations)
+        return found if found.correlation > _STILL_ALIKE * alignment.correlation else alignment
+
     def _by_flow(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment | None:
         """Return what takes the alignment's place where flow from the frame before contradicts it, else None."""
         keyframe, seen, factor = self._keyframe, frame.seen_again, self.settings.flow_contradiction
+        self._flow_agrees = False
         if keyframe is None or seen is None or factor == 0 or self._frames_lost:
             return None
         if seen.share < self.settings.flow_least_share:
@@ -159,9 +197,11 @@ class Tracker:
             return flow_error_px(seen, frame.camera, T_current_last)
 
         # Nothing within a pixel is contradicted, so flow need not be asked for its own motion.
-        if error_px(alignment) <= 1 or (flow := pose_by_flow(seen, frame.camera)) is None:
+        self._flow_agrees = error_px(alignment) <= 1
+        if self._flow_agrees or (flow := pose_by_flow(seen, frame.camera)) is None:
             return None
         most_px = factor * flow.error_px + 1
+        self._flow_agrees = True
         if error_px(alignment) <= most_px:
             return None
         start = orthonormalised(flow.T_current_previous @ T_last_keyframe)
@@ -197,6 +237,16 @@ class Tracker:
             return f"only {alignment.overlap:.0%} of the keyframe is in view"
         if alignment.inlier_share < settings.min_inlier_share and not by_flow:
             return f"only {alignment.inlier_share:.0%} of the pixels agree with the keyframe"
+        # Measured depth holds a pose by shape alone.
+        by_shape = keyframe.measured and settings.depth_share > 0
+        if alignment.correlation < settings.min_correlation and not by_shape:
+            if alignment.texture < _BARE:
+                return "weakly constrained: hardly any texture"
+            # A pose that flow bears out may be a pixel or two off, which is enough to spoil fine texture.
+            if alignment.correlation < settings.min_correlation / 3 or not by_flow:
+                return f"a correlation of {alignment.correlation:.2f} with the keyframe"
+        if keyframe.map != self._map:
+            return ""
         T_step = inverse(self._T_world_last) @ T_world_camera
         turn = float(rotation_angle_rad(T_step[:3, :3]))
         way = float(np.linalg.norm(T_step[:3, 3])) / keyframe.depth_mm
@@ -214,13 +264,15 @@ class Tracker:
         T_step = inverse(self._T_world_last) @ T_world_camera
         # After a gap the step is that of several frames: its share of one.
         self._T_step = mean_near(np.eye(4), [T_step], [1 / (1 + self._frames_lost)])
-        self._T_world_last, self._frames_lost = T_world_camera, 0
+        self._T_world_last, self._frames_lost, self._clear_frames_lost = T_world_camera, 0, 0
 
     def _lost(self, frame: Frame, reason: str, alignment: Alignment | None = None) -> Track:
         self._frames_lost += 1
         self._flow_decided = False
-        keyframe = self._keyframe.index if self._keyframe else frame.index
-        return _tracked(frame.index, "lost", reason, self._T_world_last, keyframe, alignment)
+        if self._keyframe is None or alignment is None:
+            keyframe = self._keyframe.index if self._keyframe else frame.index
+            return Track(frame.index, "lost", reason, self._T_world_last, keyframe, map=self._map)
+        return _tracked(frame.index, "lost", reason, self._T_world_last, self._keyframe, alignment)
 
 
 def _agreement(alignment: Alignment) -> float:
@@ -228,18 +280,18 @@ def _agreement(alignment: Alignment) -> float:
 
 
 def _tracked(
-    index: int, status: str, reason: str, T_world_camera: np.ndarray, keyframe: int, alignment: Alignment | None
+    index: int, status: Status, reason: str, T_world_camera: np.ndarray, keyframe: _Keyframe, alignment: Alignment
 ) -> Track:
-    if alignment is None:
-        return Track(index, status, reason, T_world_camera, keyframe)  # type: ignore[arg-type]
     return Track(
         index,
-        status,  # type: ignore[arg-type]
+        status,
         reason,
         T_world_camera,
-        keyframe,
+        keyframe.index,
         alignment.residual,
         alignment.inlier_share,
+        alignment.correlation,
         alignment.overlap,
         alignment.iterations,
+        keyframe.map,
     )

@@ -34,10 +34,13 @@ SETTINGS = OdometrySettings(
     depth_sigma_share=1e9,  # all depth counts alike
     depth_share=0.0,
     flow_contradiction=0.0,
+    corner_depth_share=0.0,
     least_detail=0.0,
     remembered_keyframes=0,
+    new_map_after=0,
     start="identity",
     min_inlier_share=0.0,
+    min_correlation=-1.0,
     max_step=1e9,  # never reached
 )
 """What is left of our tracker; all other settings are without effect on it or say when an image is empty."""

@@ -1,0 +1,51 @@
+"""Presets: what differs from the defaults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "depth.backend": "depth-anything",
+        "depth.anchor": "depth-pro",
+        "depth.fit_shift": False,
+        "mapis.order": "refine-first",
+        "mapis.frame_scale": "none",
+        "mapis.blend": "linear",
+        "mapis.recursive": False,
+        "mapis.compare_warped": False,
+        "mapis.perceptual_score": True,
+        "networks.flow": "raft-large",
+        "networks.perceptual": "lpips",
+        "odometry.keyframe_every": 2,
+        "odometry.keyframe_agreement": 0.0,
+        "odometry.finest_level": 0,
+        "odometry.channels": "grey",
+        "odometry.lamp_gamma": 0.0,
+        "odometry.gain_bias": False,
+        "odometry.depth_share": 0.0,
+        "odometry.flow_contradiction": 0.0,
+        "odometry.corner_depth_share": 0.0,
+        "odometry.least_detail": 0.0,
+        "odometry.min_correlation": -1.0,
+        "odometry.remembered_keyframes": 0,
+        "odometry.new_map_after": 0,
+        "odometry.start": "identity",
+        "smoothing.method": "wema",
+        "backend.method": "none",
+        "fusion.voxel_mm": 1.0,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+    },
+    "realtime": {
+        "networks.flow": "dis",
+        "networks.perceptual": "structure",
+        "odometry.max_iterations": 15,
+        "fusion.voxel_mm": 1.5,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+        "fusion.every": 2,
+        "backend.method": "none",
+    },
+}
