@@ -72,10 +72,11 @@ def test_only_the_kept_map_is_fused(result: Reconstruction, spliced: Path) -> No
         np.testing.assert_allclose(one, other, atol=2.0)
 
 
-def test_where_frames_are_fused_as_they_come_the_first_map_counts(spliced: Path) -> None:
+def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> None:
     at_once = {"backend__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
     result = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
     assert [r.track.status for r in result.records] == ["initial"] + ["ok"] * (FIRST - 1) + ["lost"] * SECOND
+    assert {record.track.map for record in result.records} == {0}
     assert len(result.mesh.faces) > 0
 
 

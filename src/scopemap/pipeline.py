@@ -119,13 +119,14 @@ class Pipeline:
         self.config = config
         self.estimators = estimators
         self._masker = Masker(config.mask)
-        self._tracker = tracker or Tracker(config.odometry)
+        waits = config.backend.method == "full" or follows_scene(config.fusion)
+        # Frames that are fused as they come cannot be sorted into maps at the end.
+        own = config.odometry if waits else config.odometry.model_copy(update={"new_map_after": 0})
+        self._tracker = tracker or Tracker(own)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
         self._backend = Backend(config.backend) if config.backend.method == "full" else None
-        waits = self._backend is not None or follows_scene(config.fusion)
         self._volume = None if waits else TsdfVolume(config.fusion)
-        self._fuses_at_once = not waits
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
@@ -137,9 +138,7 @@ class Pipeline:
 
     @property
     def main_map(self) -> int:
-        """Number of the map that counts: the one with most tracked frames; the first where frames are fused at once."""
-        if self._fuses_at_once:
-            return 0
+        """Number of the map that counts: the one with most tracked frames."""
         return max(self._frames_of_map, key=lambda number: len(self._frames_of_map[number]), default=0)
 
     @property
@@ -199,7 +198,7 @@ class Pipeline:
                 self._smooth.forget()
             self._frames_of_map.setdefault(track.map, []).append(frame.index)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-            self._fuse(frame, track.map)
+            self._fuse(frame)
         self._last, self._last_mm = track, refined.depth_mm
         return Step(frame, track, percept.raw_mm, refined)
 
@@ -294,9 +293,7 @@ class Pipeline:
             return None
         return inverse(track.T_world_camera) @ self._last.T_world_camera
 
-    def _fuse(self, frame: Frame, map_number: int) -> None:
-        if self._fuses_at_once and map_number != self.main_map:
-            return
+    def _fuse(self, frame: Frame) -> None:
         if self.config.fusion.enabled and self._fusable % self.config.fusion.every == 0:
             if self._volume is None:
                 self._waiting.put(frame)

@@ -46,7 +46,6 @@ class LoopFinder:
     def __init__(self, settings: BackendSettings) -> None:
         self.settings = settings
         self._known: list[Landmarks] = []
-        self._strongest: list[np.ndarray] = []
 
     def add(self, keyframe: Frame) -> list[Loop]:
         """Return the loops that a keyframe with depth closes."""
@@ -77,17 +76,13 @@ class LoopFinder:
                 )
             )
         self._known.append(new)
-        strongest = np.zeros((_STRONGEST, new.descriptors.shape[1]), np.float32)
-        strongest[: len(new.descriptors)] = new.descriptors[:_STRONGEST]
-        self._strongest.append(strongest)
         return loops
 
     def _candidates(self, new: Landmarks) -> list[int]:
         """Numbers of the keyframes, all before those that flow links to anyhow, that look most alike."""
-        long_before = len(self._known) - max(self.settings.gaps)
-        if long_before <= 0 or not len(new.descriptors):
-            return []
-        known = np.stack(self._strongest[:long_before])
-        alike = np.einsum("kd,nmd->nkm", new.descriptors[:_STRONGEST], known, optimize=True).max(2)
-        votes = np.maximum(alike - _ALIKE, 0.0).sum(1)
-        return [int(k) for k in np.argsort(-votes, kind="stable")[:_CANDIDATES] if votes[k] > 0]
+        long_before, strongest = len(self._known) - max(self.settings.gaps), new.descriptors[:_STRONGEST]
+        votes = []
+        for known in self._known[: max(long_before, 0)]:
+            alike = strongest @ known.descriptors[:_STRONGEST].T
+            votes.append(float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0)
+        return [int(k) for k in np.argsort(-np.array(votes), kind="stable")[:_CANDIDATES] if votes[k] > 0]
