@@ -58,7 +58,8 @@ def veiled(folder: Path) -> list[str]:
         for name, changes in VARIANTS.items():
             before, after = run(clean, changes), run(spoilt, changes)
             lost = np.array([record.track.status == "lost" for record in after.records])
-            waits = [int(np.argmin(lost[end + 1 :])) for end in (69, 104, 139)]
+            after_each = [lost[end + 1 :] for end in (69, 104, 139)]
+            waits = ["never" if still.all() else int(np.argmin(still)) for still in after_each]
             one, other = ate_mm(before, clean), ate_mm(after, spoilt)
             rows.append(
                 f"| {scene}, {name} | {lost[BAD].sum()} of {len(BAD)} | {', '.join(map(str, waits))} | {one:.3f} "

@@ -243,3 +243,18 @@ def test_the_tracker_listens_to_corners_of_its_keyframe_alone(host: int, share: 
     told = _tracked(frame, soft_px=3, corner_depth_share=share)
     assert told[2] == "ok"
     assert told[1] == pytest.approx(plain[1] + 0.2 * listens, abs=0.01)
+
+
+def test_flow_in_disarray_bears_nothing_out() -> None:
+    """A picture that hardly correlates is lost, whatever random places flow sees points in."""
+    rng = np.random.default_rng(8)
+    first = _wall(0, 0, soft_px=3)
+    other = cv2.GaussianBlur(rng.normal(size=(128, 160)).astype(np.float32), (0, 0), 3)
+    strange = np.repeat(np.clip(128 + 40 * other / other.std(), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    mixed = (0.25 * first.rgb + 0.75 * strange).astype(np.uint8)
+    seen = _truly(np.eye(4))
+    disarray = SeenAgain(seen.points_mm, rng.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
+    alone = _tracked(replace(first, index=1, rgb=mixed), soft_px=3, min_inlier_share=0.6, remembered_keyframes=0)
+    assert alone[2] == "lost"
+    borne = replace(first, index=1, rgb=mixed, seen_again=disarray)
+    assert _tracked(borne, soft_px=3, min_inlier_share=0.6, remembered_keyframes=0)[2] == "lost"

@@ -64,12 +64,12 @@ def test_what_is_too_far_to_be_kept_is_unknown() -> None:
 
 def test_the_typical_depth_is_the_median_over_frames_of_what_is_usable() -> None:
     spool = FrameSpool()
-    assert spool.typical_mm is None
+    assert spool.typical_mm() is None
     spool.put(replace(wall(70.0), valid=np.zeros((120, 160), bool)))
-    assert spool.typical_mm is None
+    assert spool.typical_mm() is None
     for n, depth_mm in enumerate((10.0, 12.0, 90.0)):
         spool.put(wall(depth_mm, n))
-    assert spool.typical_mm == pytest.approx(12.0)
+    assert spool.typical_mm() == pytest.approx(12.0)
 
 
 @pytest.mark.parametrize("factor", [0.03, 30.0])

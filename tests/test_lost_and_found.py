@@ -172,3 +172,35 @@ def test_a_bare_wall_is_said_to_constrain_nothing() -> None:
     assert track.status == "lost"
     assert "weakly constrained" in track.reason
     assert abs(track.correlation) < 0.15
+
+
+def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
+    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    rng = np.random.default_rng(4)
+    # As clear as tissue, and nothing that lasts.
+    shape = frames[0].rgb.shape[:2]
+    soft = [cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 1.5) for _ in range(70)]
+    nothing = [
+        replace(
+            frames[0],
+            index=8 + n,
+            rgb=np.repeat((128 + 40 * grey / grey.std()).clip(0, 255).astype(np.uint8)[..., None], 3, 2),
+        )
+        for n, grey in enumerate(soft)
+    ]
+    tracks = _tracked(
+        [*frames, *nothing, replace(frames[4], index=78)], SETTINGS.model_copy(update={"new_map_after": 1})
+    )
+    assert max(track.map for track in tracks) > 20
+    assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "found again", 0)
+    turn, way_mm = _off(tracks[-1], NEAR[4])
+    assert turn < np.radians(0.4)
+    assert way_mm < 0.3
+
+
+def test_no_world_begins_with_an_unclear_frame() -> None:
+    tracker, frame = Tracker(SETTINGS), _frame(0, NEAR[0])
+    assert tracker.track(frame).status == "initial"
+    # Not adopted, for want of depth: the next one fixes the world, unless it shows nothing.
+    assert tracker.track(replace(_smoked(frame), index=1)).status == "lost"
+    assert tracker.track(replace(frame, index=2)).status == "initial"

@@ -119,7 +119,7 @@ class Pipeline:
         self.config = config
         self.estimators = estimators
         self._masker = Masker(config.mask)
-        waits = config.backend.method == "full" or follows_scene(config.fusion)
+        waits = config.backend.method == "full" or follows_scene(config.fusion) or not config.fusion.enabled
         # Frames that are fused as they come cannot be sorted into maps at the end.
         own = config.odometry if waits else config.odometry.model_copy(update={"new_map_after": 0})
         self._tracker = tracker or Tracker(own)
@@ -146,10 +146,10 @@ class Pipeline:
         """What to say where there are several maps; nothing where there is one."""
         if len(self._frames_of_map) < 2:
             return []
-        total, kept = (sum(map(len, self._frames_of_map.values())), len(self._frames_of_map[self.main_map]))
+        total, kept = sum(map(len, self._frames_of_map.values())), len(self._frames_of_map[self.main_map])
         return [
-            f"maps: the camera was lost for good {len(self._frames_of_map) - 1} times; of {total} frames tracked, the "
-            f"{kept} of the largest map are kept: how the others lie to them is not known"
+            f"maps: there are {len(self._frames_of_map)}, since the camera was lost and not found again; of {total} "
+            f"frames tracked, the {kept} of the largest are kept: how the others lie to them is not known"
         ]
 
     def perceive(self, frame: Frame) -> Percept:
@@ -182,9 +182,14 @@ class Pipeline:
         if self._corners is not None and percept.kind != "measured":
             raw = replace(raw, corners_again=self._corners.find(raw))
         track = self._tracker.track(raw)
+        elsewhere = track.status != "lost" and self._last is not None and track.map != self._last.map
+        if elsewhere:
+            # What is known of the frames just before is of another world.
+            self._mapis.forget()
+            self._smooth.forget()
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
-            known = percept if track.status != "lost" else replace(percept, link=None)
+            known = replace(percept, link=None) if track.status == "lost" or elsewhere else percept
             refined = self._refine(known, self._motion(track))
         frame = replace(percept.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
         # Measured depth that was scaled or blended is not what the next frame measures.
@@ -194,8 +199,6 @@ class Pipeline:
             self._mapis.forget()
             self._smooth.forget()
         else:
-            if track.status == "initial":
-                self._smooth.forget()
             self._frames_of_map.setdefault(track.map, []).append(frame.index)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
@@ -213,10 +216,11 @@ class Pipeline:
 
     def fuse(self, correction: Correction | None = None) -> None:
         """Fuse what waited, in voxels that suit it, as `adjust` corrected it."""
-        if self._waiting.typical_mm is None:
-            return
-        volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, self._waiting.typical_mm))
         elsewhere = {i for number, frames in self._frames_of_map.items() if number != self.main_map for i in frames}
+        typical_mm = self._waiting.typical_mm(elsewhere)
+        if typical_mm is None:
+            return
+        volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, typical_mm))
         for frame in self._waiting.frames():
             if frame.index not in elsewhere:
                 volume.integrate(frame if correction is None else correction.frame(frame))
@@ -289,7 +293,7 @@ class Pipeline:
 
     def _motion(self, track: Track) -> np.ndarray | None:
         """Motion from the previous frame to this one, None unless both poses are known."""
-        if self._last is None or "lost" in (track.status, self._last.status):
+        if self._last is None or "lost" in (track.status, self._last.status) or track.map != self._last.map:
             return None
         return inverse(track.T_world_camera) @ self._last.T_world_camera
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -96,7 +97,11 @@ class _Map:
         if self._loops:
             graph = spread_loops(T_world_camera, self._loops, float(np.exp(np.median(points.log_depth))))
             start, loops = (inverse(graph.T_world_camera), graph.log_scale), graph.believed
-        found = adjust(Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, start))
+        problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, start)
+        found = adjust(problem)
+        if start is not None and not found.sigma_px <= settings.max_sigma_px:
+            # Loops may be what is wrong.
+            found, loops = adjust(replace(problem, start=None)), 0
         index = np.array(self.index)
         if not found.sigma_px <= settings.max_sigma_px:
             return unchanged(index, found.sigma_px)

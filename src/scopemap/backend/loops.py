@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import defaultdict
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from scopemap.geometry.landmarks import Landmarks, find_landmarks, locate
 _STRONGEST = 64  # landmarks by which candidates are chosen
 _ALIKE = 0.8  # cosine of descriptors from which on they speak for a candidate
 _CANDIDATES = 3
+# A camera that dwells would tie everything to the same few keyframes, and adjusting these together takes their square.
+_REST, _MOST_LOOPS, _MOST_PAIRS = 5, 20, 60  # keyframes between loops to one keyframe, loops to it, points of a loop
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class LoopFinder:
     def __init__(self, settings: BackendSettings) -> None:
         self.settings = settings
         self._known: list[Landmarks] = []
+        self._closed: defaultdict[int, list[int]] = defaultdict(list)
 
     def add(self, keyframe: Frame) -> list[Loop]:
         """Return the loops that a keyframe with depth closes."""
@@ -56,13 +60,14 @@ class LoopFinder:
             located = locate(known, new, keyframe.camera, self.settings.loop_landmarks)
             if located is None:
                 continue
-            one, other = located.pairs.T
+            one, other = located.pairs[:: -(-len(located.pairs) // _MOST_PAIRS)].T
             moved = known.points_mm[one] @ located.T_current_reference[2, :3] + located.T_current_reference[2, 3]
             with np.errstate(invalid="ignore", divide="ignore"):
                 z_past, z_new = np.log(known.points_mm[one, 2]), np.log(new.points_mm[other, 2])
                 ratio = z_new - np.log(moved)
-            if np.isfinite(ratio).sum() < self.settings.loop_landmarks // 2:
+            if np.isfinite(ratio).sum() < min(self.settings.loop_landmarks, _MOST_PAIRS) // 2:
                 continue
+            self._closed[past].append(len(self._known))
             loops.append(
                 Loop(
                     past,
@@ -75,7 +80,8 @@ class LoopFinder:
                     z_new,
                 )
             )
-        self._known.append(new)
+        # Half of the precision tells descriptors apart as well, in half of the memory.
+        self._known.append(replace(new, descriptors=new.descriptors.astype(np.float16)))
         return loops
 
     def _candidates(self, new: Landmarks) -> list[int]:
@@ -83,6 +89,11 @@ class LoopFinder:
         long_before, strongest = len(self._known) - max(self.settings.gaps), new.descriptors[:_STRONGEST]
         votes = []
         for known in self._known[: max(long_before, 0)]:
-            alike = strongest @ known.descriptors[:_STRONGEST].T
+            alike = strongest @ known.descriptors[:_STRONGEST].T.astype(np.float32)
             votes.append(float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0)
-        return [int(k) for k in np.argsort(-np.array(votes), kind="stable")[:_CANDIDATES] if votes[k] > 0]
+        ranked = np.argsort(-np.array(votes), kind="stable")
+        return [int(k) for k in ranked if votes[k] > 0 and self._may_close(int(k))][:_CANDIDATES]
+
+    def _may_close(self, past: int) -> bool:
+        closed = self._closed[past]
+        return len(closed) < _MOST_LOOPS and (not closed or len(self._known) - closed[-1] >= _REST)

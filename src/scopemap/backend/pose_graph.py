@@ -31,6 +31,7 @@ _LOOP = (0.02, 0.03, 0.05)
 # Of Cauchy's loss, in standard deviations. Wide at first: after much drift a true loop looks as false as a false one.
 _TOLERANCES = (100.0, 10.0, 1.0)
 _MOST_CALLS = 20
+_BELIEVED = 3.0  # root mean square error, in standard deviations, up to which a loop has been closed
 
 
 # A loop that says more than that share of the way between its ends (and of the depth) was never walked is not believed.
@@ -91,7 +92,8 @@ def spread_loops(T_world_camera: np.ndarray, loops: list[Loop], depth_mm: float)
         ).x
     R, p, s = state(x)
     poses = [se3(turn, depth_mm * place) for turn, place in zip(R.as_matrix(), p, strict=True)]
-    return Graph(np.stack(poses), s, len(loops))
+    left = np.linalg.norm(errors(x).reshape(-1, _OWN)[count - 1 :], axis=1) / np.sqrt(_OWN)
+    return Graph(np.stack(poses), s, int((left < _BELIEVED).sum()))
 
 
 def _plausible(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:

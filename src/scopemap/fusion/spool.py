@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -44,10 +44,13 @@ class FrameSpool:
         """Return how many frames wait."""
         return len(self._entries)
 
-    @property
-    def typical_mm(self) -> float | None:
-        """Median of the frames' median depths, mm; None where no depth is known."""
-        medians_mm = [entry.median_mm for entry in self._entries if np.isfinite(entry.median_mm)]
+    def typical_mm(self, without: Collection[int] = ()) -> float | None:
+        """Return the median of the frames' median depths, mm; None where no depth is known.
+
+        without : numbers of frames that do not count.
+        """
+        some = [entry.median_mm for entry in self._entries if entry.number not in without]
+        medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
         return float(np.median(medians_mm)) if medians_mm else None
 
     def put(self, frame: Frame) -> None:

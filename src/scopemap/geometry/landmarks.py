@@ -78,7 +78,7 @@ def matches(reference: Landmarks, current: Landmarks) -> np.ndarray:
     """Return pairs (M, 2) int of landmarks that are each other's likeliest, and much likelier than the next."""
     if len(reference.pixels) < 2 or len(current.pixels) < 2:
         return np.zeros((0, 2), dtype=int)
-    alike = reference.descriptors @ current.descriptors.T
+    alike = np.asarray(reference.descriptors, np.float32) @ np.asarray(current.descriptors, np.float32).T
     rows = np.arange(len(alike))
     best = alike.argmax(1)
     mutual = alike.argmax(0)[best] == rows

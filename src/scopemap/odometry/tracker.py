@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,6 +20,8 @@ from scopemap.odometry.rtdl import Alignment, Motion, align, judged
 from scopemap.odometry.track import Status, Track
 
 _BARE = 0.5  # texture of a wall that shows nothing but noise; tissue: 0.65 and more
+_BELIEVABLE_PX = 2.0  # median error of flow's own motion, up to which that bears a pose out
+_WORTH_KEEPING = 5  # frames tracked in a map, from which on it is looked for later
 _STILL_ALIKE = 0.8  # share of the correlation that corners may cost; more, and flow has followed something else
 _LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go on
 
@@ -66,42 +68,51 @@ class Tracker:
         self._agreement: list[float] = []
         self._flow_decided = self._flow_agrees = self._unclear = False
         self._map, self._maps = 0, 1
+        self._tracked_in: Counter[int] = Counter()
         self._clear_frames_lost = 0
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or say why there is none."""
         self._frames_since_keyframe += 1
         if frame.valid.mean() < self.settings.min_valid_share:
+            self._clear_frames_lost = 0
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
         detail = self._clarity.against_recent(frame)
         self._unclear = detail < self.settings.least_detail
+        if self._keyframe is None and self._unclear:
+            return self._lost(frame, f"only {detail:.0%} of the usual detail: blur, smoke or fluid")
         if self._keyframe is None:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index, map=self._map)
         # The keyframe's points are moved: the depth of the frame itself has no say, unless it was measured.
         depth_mm = frame.depth_mm if self._keyframe.measured else None
         pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
-        alignment = self._by_corners(frame, pyramid, self._best(pyramid))
+        alignment = self._by_corners(self._keyframe, frame, pyramid, self._best(pyramid))
         by_flow = self._by_flow(frame, pyramid, alignment)
         # Where flow itself leads to nowhere, there is nothing to be said against the image alone.
         self._flow_decided = by_flow is not None and not self._trouble(self._keyframe, by_flow, by_flow=True)
         if by_flow is not None:
             self._flow_agrees, alignment = self._flow_decided, by_flow if self._flow_decided else alignment
         if self._veiled(detail, alignment):
+            self._clear_frames_lost = 0
             return self._lost(frame, f"only {detail:.0%} of the usual detail: blur, smoke or fluid", alignment)
         trouble, reason = self._trouble(self._keyframe, alignment, by_flow=self._flow_agrees), ""
         if trouble or self._frames_lost:
-            found = self._found_again(frame, pyramid)
+            found = self._found_again(frame, pyramid, elsewhere=bool(trouble))
             if found is not None and (trouble or _agreement(found[1]) > _agreement(alignment)):
                 self._keyframe, alignment = found
-                self._map = self._keyframe.map
                 self._flow_decided, self._agreement = False, []
                 trouble, reason = "", "found again"
         if trouble:
             self._clear_frames_lost += 1
-            if self._clear_frames_lost > self.settings.new_map_after > 0:
+            if self._clear_frames_lost > self.settings.new_map_after > 0 and not self._unclear:
                 return self._new_map(frame)
             return self._lost(frame, trouble, alignment)
         T_world_camera = self._T_world_camera(self._keyframe, alignment)
+        if self._keyframe.map != self._map:
+            # The last pose and the last step are of another world.
+            self._enter(self._keyframe.map)
+            self._T_world_last = T_world_camera
+        self._tracked_in[self._map] += 1
         self._remember(T_world_camera)
         self._agreement.append(_agreement(alignment))
         reason = "flow decided" if self._flow_decided else reason
@@ -143,34 +154,52 @@ class Tracker:
         found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
         return max(found, key=_agreement)
 
-    def _found_again(self, frame: Frame, pyramid: list[View]) -> tuple[_Keyframe, Alignment] | None:
-        """Return the remembered keyframe whose landmarks lead to the best alignment, and that; None where none does."""
-        remembered = [*self._remembered, *self._remembered_elsewhere]
-        if not remembered:
+    def _found_again(self, frame: Frame, pyramid: list[View], *, elsewhere: bool) -> tuple[_Keyframe, Alignment] | None:
+        """Return the remembered keyframe whose landmarks lead to the best alignment, and that; None where none does.
+
+        Other maps are asked only if `elsewhere` says so, and this one does not know the place.
+        """
+        if self.settings.remembered_keyframes == 0:
             return None
-        current, found = find_landmarks(replace(frame, depth_mm=None)), []
-        for keyframe in remembered:
-            place = locate(keyframe.landmarks, current, frame.camera, self.settings.least_landmarks)
-            if place is not None:
-                alignment = align(keyframe.pyramid, pyramid, place.T_current_reference, self.settings)
-                if not self._trouble(keyframe, alignment, by_flow=False):
-                    found.append((keyframe, alignment))
-        return max(found, key=lambda pair: _agreement(pair[1]), default=None)
+        current = find_landmarks(replace(frame, depth_mm=None))
+        for remembered in (self._remembered, self._remembered_elsewhere if elsewhere else ()):
+            found = []
+            for keyframe in remembered:
+                place = locate(keyframe.landmarks, current, frame.camera, self.settings.least_landmarks)
+                if place is not None:
+                    alignment = align(keyframe.pyramid, pyramid, place.T_current_reference, self.settings)
+                    if not self._trouble(keyframe, alignment, by_flow=False):
+                        found.append((keyframe, self._by_corners(keyframe, frame, pyramid, alignment)))
+            if found:
+                return max(found, key=lambda pair: _agreement(pair[1]))
+        return None
+
+    def _enter(self, number: int) -> None:
+        """Go on in a map; of the others, those that are more than a few frames are remembered."""
+        known = [*self._remembered_elsewhere, *self._remembered]
+        self._map = number
+        self._remembered.clear()
+        self._remembered_elsewhere.clear()
+        self._remembered.extend(keyframe for keyframe in known if keyframe.map == number)
+        self._remembered_elsewhere.extend(
+            keyframe
+            for keyframe in known
+            if keyframe.map != number and self._tracked_in[keyframe.map] >= _WORTH_KEEPING
+        )
 
     def _new_map(self, frame: Frame) -> Track:
         """Begin anew with this frame: what was seen so far cannot be found, and it is not known how this lies to it."""
-        self._map, self._maps = self._maps, self._maps + 1
-        self._remembered_elsewhere.extend(self._remembered)
-        self._remembered.clear()
+        self._enter(self._maps)
+        self._maps += 1
         self._keyframe, self._T_world_last, self._T_step = None, np.eye(4), np.eye(4)
         self._frames_lost = self._clear_frames_lost = 0
         self._flow_decided = False
         return Track(frame.index, "initial", "begins a new map", np.eye(4), frame.index, map=self._map)
 
-    def _by_corners(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment:
+    def _by_corners(self, keyframe: _Keyframe, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment:
         """Return the alignment that the keyframe's corners make of this one, or this one where they cannot tell."""
-        keyframe, seen, share = self._keyframe, frame.corners_again, self.settings.corner_depth_share
-        if keyframe is None or seen is None or seen.host != keyframe.index or share == 0:
+        seen, share = frame.corners_again, self.settings.corner_depth_share
+        if seen is None or seen.host != keyframe.index or share == 0:
             return alignment
         # What does not correlate is not nearly where it should be, and no start for anything.
         if alignment.correlation < self.settings.min_correlation:
@@ -201,7 +230,8 @@ class Tracker:
         if self._flow_agrees or (flow := pose_by_flow(seen, frame.camera)) is None:
             return None
         most_px = factor * flow.error_px + 1
-        self._flow_agrees = True
+        # Flow that no motion explains contradicts nothing, and bears nothing out.
+        self._flow_agrees = flow.error_px <= _BELIEVABLE_PX
         if error_px(alignment) <= most_px:
             return None
         start = orthonormalised(flow.T_current_previous @ T_last_keyframe)
