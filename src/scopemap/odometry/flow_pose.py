@@ -56,14 +56,10 @@ def pose_by_flow(seen: SeenAgain, camera: PinholeCamera) -> FlowPose | None:
             return None
         square = (errors**2).sum(1)
         weight = np.where(ahead, 1 / (1 + square / (2 * _sigma_px(square[ahead])) ** 2), 0.0)
-        weighted = jacobians * weight[:, None, None]
-        hessian = np.einsum("nij,nik->jk", weighted, jacobians)
-        gradient = np.einsum("nij,ni->j", weighted, errors)
-        step = -np.linalg.lstsq(hessian, gradient, rcond=1e-12)[0]
-        T = se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T
+        T, length = _moved(T, jacobians, jacobians * weight[:, None, None], errors, unit_mm)
         if not np.isfinite(T).all():
             return None
-        if np.linalg.norm(step) < _SMALL_STEP:
+        if length < _SMALL_STEP:
             break
     return FlowPose(T, flow_error_px(seen, camera, T))
 
@@ -92,13 +88,10 @@ def refined_by_corners(
         spread = max(_MEDIAN_TO_SIGMA_2D**2 * float(np.median(square[ahead])), _LEAST_SPREAD)
         weight = np.where(ahead, 1 / (1 + square / (4 * spread)), 0.0)
         weighted = np.einsum("n,nij,njk->nik", weight, information, jacobians)
-        hessian = np.einsum("nij,nik->jk", jacobians, weighted)
-        gradient = np.einsum("nij,ni->j", weighted, errors)
-        step = -np.linalg.lstsq(hessian, gradient, rcond=1e-12)[0]
-        T = se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T
+        T, length = _moved(T, jacobians, weighted, errors, unit_mm)
         if not np.isfinite(T).all():
             return None
-        if np.linalg.norm(step) < _SMALL_STEP:
+        if length < _SMALL_STEP:
             break
     return orthonormalised(T)
 
@@ -107,6 +100,15 @@ def flow_error_px(seen: SeenAgain, camera: PinholeCamera, T_current_previous: np
     """Return the median distance of the points, moved by a motion (4, 4), from where flow sees them, px."""
     errors, _, ahead = _linearised(seen, camera, T_current_previous, 1.0)
     return float(np.median(np.where(ahead, np.linalg.norm(errors, axis=1), np.inf)))
+
+
+def _moved(
+    T: np.ndarray, jacobians: np.ndarray, weighted: np.ndarray, errors: np.ndarray, unit_mm: float
+) -> tuple[np.ndarray, float]:
+    """Return the motion after a Gauss-Newton step, and the step's length; `weighted` (N, 2, 6) are W J."""
+    hessian = np.einsum("nij,nik->jk", jacobians, weighted)
+    step = -np.linalg.lstsq(hessian, np.einsum("nij,ni->j", weighted, errors), rcond=1e-12)[0]
+    return se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T, float(np.linalg.norm(step))
 
 
 def _sigma_px(square: np.ndarray) -> float:
