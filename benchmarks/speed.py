@@ -59,6 +59,8 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         "wait to be fused": (pipeline._waiting, "put"),
         "fuse": (TsdfVolume, "integrate"),
     }
+    if pipeline._corners is not None:
+        parts["corners"] = (pipeline._corners, "find")
     if pipeline._backend is not None:
         parts["back end"] = (pipeline._backend, "adjust")
     for part, (owner, name) in parts.items():
@@ -109,11 +111,11 @@ def main() -> None:
         model = config.depth.model if config.depth.backend == "scopenet" else ""
         network = measure_network(options.input or Path(folder), options.frames, model)
     unit = per_frame.pop("DIS")
-    counted = ("track", "keyframe", "MAPIS", "wait to be fused", "fuse")
+    counted = ("corners", "track", "keyframe", "MAPIS", "wait to be fused", "fuse")
     both = sum(per_frame.get(part, 0.0) for part in counted)
     print(f"{width}x{height} px, median per frame; one DIS flow pair with its check: {unit:.1f} ms\n")
     print("| part | ms | in DIS pairs |\n|---|---|---|")
-    for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + fuse**", both), *network.items()]:
+    for part, ms in [*per_frame.items(), ("**corners + track + keyframe + MAPIS + fuse**", both), *network.items()]:
         print(f"| {part} | {ms:.1f} | {ms / unit:.2f} |")
 
 
