@@ -288,7 +288,10 @@ def _project_files() -> list[Path]:
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout
-    return [path for name in listed.splitlines() if (path := ROOT / name).is_file()]
+    # Somebody's virtual environment in the clone, whatever its name, is no part of the project.
+    environments = tuple(file.parent for file in ROOT.glob("*/pyvenv.cfg"))
+    paths = (ROOT / name for name in listed.splitlines())
+    return [path for path in paths if path.is_file() and not any(map(path.is_relative_to, environments))]
 
 
 def test_no_file_is_large() -> None:
