@@ -120,6 +120,13 @@ def unpack(keys: np.ndarray) -> np.ndarray:
     return np.stack([(keys >> 42) & _KEY_MASK, (keys >> 21) & _KEY_MASK, keys & _KEY_MASK], -1) - KEY_OFFSET
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _blocks_between(a: float, b: float, wide: float, per_mm: float) -> tuple[int, int]:
+    """Return the first and the last block that the way from a to b, `wide` to either side, touches along an axis."""
+    low, high = (a, b) if a < b else (b, a)
+    return int(np.floor((low - wide) * per_mm)) >> 3, int(np.ceil((high + wide) * per_mm)) >> 3
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndarray:
     """Return keys, some of them repeated, of all blocks within the truncation of a measured pixel (H, W).
@@ -131,28 +138,35 @@ def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndar
     pieces = int(np.ceil(4.0 * grid.truncation_mm / block_mm))
     piece_mm = 2.0 * grid.truncation_mm / pieces
     footprint = 1.5 / min(view.fx, view.fy)
-    origin = -view.R.T @ view.t
-    low, high, direction = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
+    # Arrays read out of a tuple are counted references: once, not at every pixel.
+    R, per_mm = view.R, 1.0 / grid.voxel_mm
+    origin = -R.T @ view.t
     recent = np.full(_RECENT, -1, np.int64)
     keys, count = np.empty(4096, np.int64), 0
+    # By piece: the blocks of the pixel before, which are most often this one's as well. At first, none.
+    last_box = [(0, -1, 0, -1, 0, -1)] * pieces
     for row in range(inverse_depth.shape[0]):
         for col in range(inverse_depth.shape[1]):
             if not inverse_depth[row, col] > 0:
                 continue
             depth = 1.0 / inverse_depth[row, col]
             x, y = (col - view.cx) / view.fx, (row - view.cy) / view.fy
-            for axis in range(3):
-                direction[axis] = view.R[0, axis] * x + view.R[1, axis] * y + view.R[2, axis]
+            dx, dy = R[0, 0] * x + R[1, 0] * y + R[2, 0], R[0, 1] * x + R[1, 1] * y + R[2, 1]
+            dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
             for piece in range(pieces):
                 near = max(depth - grid.truncation_mm + piece * piece_mm, 0.0)
                 far = max(near, depth - grid.truncation_mm + (piece + 1) * piece_mm)
-                for axis in range(3):
-                    a, b = origin[axis] + near * direction[axis], origin[axis] + far * direction[axis]
-                    low[axis] = np.int64(np.floor((min(a, b) - footprint * far) / grid.voxel_mm)) >> 3
-                    high[axis] = np.int64(np.ceil((max(a, b) + footprint * far) / grid.voxel_mm)) >> 3
-                for i in range(low[0], high[0] + 1):
-                    for j in range(low[1], high[1] + 1):
-                        for k in range(low[2], high[2] + 1):
+                wide = footprint * far
+                first_x, last_x = _blocks_between(origin[0] + near * dx, origin[0] + far * dx, wide, per_mm)
+                first_y, last_y = _blocks_between(origin[1] + near * dy, origin[1] + far * dy, wide, per_mm)
+                first_z, last_z = _blocks_between(origin[2] + near * dz, origin[2] + far * dz, wide, per_mm)
+                box = (first_x, last_x, first_y, last_y, first_z, last_z)
+                if box == last_box[piece]:
+                    continue
+                last_box[piece] = box
+                for i in range(first_x, last_x + 1):
+                    for j in range(first_y, last_y + 1):
+                        for k in range(first_z, last_z + 1):
                             key = pack(i, j, k)
                             place = (i * 73856093 ^ j * 19349663 ^ k * 83492791) & (_RECENT - 1)
                             if recent[place] != key:
@@ -185,38 +199,41 @@ def _sample(inverse_depth: np.ndarray, u: float, v: float, largest_step: float) 
 def _integrate_block(
     voxels: Voxels, slot: int, corner: np.ndarray, surface: Surface, rgb: np.ndarray, view: View, grid: Grid
 ) -> None:
-    height, width = surface.inverse_depth.shape
-    R, truncation = view.R, grid.truncation_mm
+    # Arrays read out of a tuple are counted references: once, not at every voxel.
+    tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
+    inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
+    R, t, truncation = view.R, view.t, grid.truncation_mm
+    height, width = inverse_depths.shape
     for i in range(BLOCK):
         for j in range(BLOCK):
             for k in range(BLOCK):
                 x, y = (corner[0] + i) * grid.voxel_mm, (corner[1] + j) * grid.voxel_mm
                 z = (corner[2] + k) * grid.voxel_mm
-                depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + view.t[2]
+                depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
                 if depth <= 0:
                     continue
-                u = view.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + view.t[0]) / depth + view.cx
-                v = view.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + view.t[1]) / depth + view.cy
+                u = view.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth + view.cx
+                v = view.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth + view.cy
                 if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
                     continue
                 row, col = int(v + 0.5), int(u + 0.5)
-                weight = surface.weight[row, col]
+                weight = pixel_weight[row, col]
                 if weight == 0:
                     continue
-                inverse_depth = _sample(surface.inverse_depth, u, v, grid.largest_step)
+                inverse_depth = _sample(inverse_depths, u, v, grid.largest_step)
                 gap = 1.0 - depth * inverse_depth
                 behind = -gap / (inverse_depth * truncation)
                 if behind >= 1.0:
                     continue
                 weight *= min(1.0, (1.0 - behind) / (1.0 - _FULL_WEIGHT_SHARE))
-                distance = min(max(gap * surface.plane_mm[row, col], -truncation), truncation)
-                total = voxels.weight[slot, i, j, k] + weight
-                voxels.tsdf[slot, i, j, k] += (distance - voxels.tsdf[slot, i, j, k]) * weight / total
-                voxels.weight[slot, i, j, k] = total
+                distance = min(max(gap * plane_mm[row, col], -truncation), truncation)
+                total = weights[slot, i, j, k] + weight
+                tsdf[slot, i, j, k] += (distance - tsdf[slot, i, j, k]) * weight / total
+                weights[slot, i, j, k] = total
                 if abs(distance) <= _COLOUR_BAND_VOXELS * grid.voxel_mm:
                     for channel in range(3):
-                        voxels.colour[slot, i, j, k, channel] += weight * rgb[row, col, channel]
-                    voxels.colour[slot, i, j, k, 3] += weight
+                        colour[slot, i, j, k, channel] += weight * rgb[row, col, channel]
+                    colour[slot, i, j, k, 3] += weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)

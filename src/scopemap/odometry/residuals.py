@@ -29,8 +29,6 @@ import numpy as np
 from numba import njit
 
 PARAMETERS = 8
-_PAIRS = PARAMETERS * (PARAMETERS + 1) // 2
-_SUMS = _PAIRS + PARAMETERS + 2  # upper triangle, gradient, cost, weight
 _ONE_SURFACE = 0.1  # relative spread of four neighbouring depths that is still one surface
 _SAME_PLACE = 0.1  # relative difference of depths that may be the same tissue
 
@@ -91,105 +89,125 @@ class NormalEquations(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _land(reference, current, T, row, column):  # type: ignore[no-untyped-def]
-    """Where a reference pixel lands: X', place in its cell, cell (column, row), |X|^2, weight (0 = unusable)."""
-    nothing = (0.0, 0.0, 1.0, 0.0, 0.0, 0, 0, 1.0, 0.0)
-    depth, weight = float(reference.depth_mm[row, column]), float(reference.weight[row, column])
-    if weight <= 0.0 or not depth > 0.0:
-        return nothing
-    K = reference.intrinsics
-    X, Y = depth * (column - K[2]) / K[0], depth * (row - K[3]) / K[1]
-    x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * depth + T[0, 3]
-    y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * depth + T[1, 3]
-    z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * depth + T[2, 3]
-    if z < 1e-3 * depth:
-        return nothing
-    G = current.intrinsics
-    u, v = G[0] * x / z + G[2], G[1] * y / z + G[3]
-    h, w = current.weight.shape
-    if not (0.0 <= u < w - 1 and 0.0 <= v < h - 1):
-        return nothing
-    i, j = int(u), int(v)
-    usable = min(current.weight[j, i], current.weight[j, i + 1], current.weight[j + 1, i], current.weight[j + 1, i + 1])
-    return x, y, z, u - i, v - j, i, j, X * X + Y * Y + depth * depth, weight * usable
+def _lifted(depth_mm, K, row, column):  # type: ignore[no-untyped-def]
+    """Point X of a reference pixel; K: its intrinsics."""
+    depth = float(depth_mm[row, column])
+    return depth * (column - K[2]) / K[0], depth * (row - K[3]) / K[1], depth
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bilinear(image, a, b, i, j):  # type: ignore[no-untyped-def]
-    """Value at (i + a, j + b) and its exact derivatives along x and y."""
-    i00, i10 = float(image[j, i]), float(image[j, i + 1])
-    i01, i11 = float(image[j + 1, i]), float(image[j + 1, i + 1])
+def _land(point, T, G, usable):  # type: ignore[no-untyped-def]
+    """Where a point X lands: X', its place (in its cell; the cell's column and row), weight there (0 = nowhere).
+
+    G, usable : intrinsics and weights of the current image.
+    """
+    X, Y, Z = point
+    x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
+    y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
+    z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * Z + T[2, 3]
+    # Fails where depth is unknown, too.
+    if not z >= 1e-3 * Z > 0.0:
+        return (x, y, z), (0.0, 0.0, 0, 0), 0.0
+    u, v = G[0] * x / z + G[2], G[1] * y / z + G[3]
+    h, w = usable.shape
+    if not (0.0 <= u < w - 1 and 0.0 <= v < h - 1):
+        return (x, y, z), (0.0, 0.0, 0, 0), 0.0
+    i, j = int(u), int(v)
+    weight = min(usable[j, i], usable[j, i + 1], usable[j + 1, i], usable[j + 1, i + 1])
+    return (x, y, z), (u - i, v - j, i, j), float(weight)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bilinear(image, c, place):  # type: ignore[no-untyped-def]
+    """Value of channel c and its exact derivatives along x and y."""
+    a, b, i, j = place
+    i00, i10 = float(image[c, j, i]), float(image[c, j, i + 1])
+    i01, i11 = float(image[c, j + 1, i]), float(image[c, j + 1, i + 1])
     top, bottom = i00 + a * (i10 - i00), i01 + a * (i11 - i01)
     return top + b * (bottom - top), (1 - b) * (i10 - i00) + b * (i11 - i01), bottom - top
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _tilt(reference, T, row, column):  # type: ignore[no-untyped-def]
-    """Plane m of a reference pixel, turned to the current camera, and 1 + m . R^T t: the lamp's lift off the plane."""
-    K = reference.intrinsics
-    a, b = float(reference.slope[row, column, 0]), float(reference.slope[row, column, 1])
-    c = 1.0 / float(reference.depth_mm[row, column]) - a * (column - K[2]) / K[0] - b * (row - K[3]) / K[1]
+def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
+    """Return L of a point X with slope (a, b) that is now at X', and -d ln L / dX' for translations.
+
+    The lamp sits in the camera's centre: turning changes nothing.
+    """
+    (X, Y, Z), (x, y, z), (a, b) = point, moved, slope
+    # The plane m, turned to the current camera, and 1 + m . R^T t, the lift off it.
+    c = (1.0 - a * X - b * Y) / Z
     mx = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
     my = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
     mz = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
     lift = 1.0 + mx * T[0, 3] + my * T[1, 3] + mz * T[2, 3]
-    if 0.3 < lift < 3.0:
-        return mx, my, mz, lift
-    return 0.0, 0.0, 0.0, 1.0  # a plane seen from its edge or from behind: its tilt says nothing
+    if not 0.3 < lift < 3.0:  # a plane seen from its edge or from behind: its tilt says nothing
+        mx, my, mz, lift = 0.0, 0.0, 0.0, 1.0
+    square = x * x + y * y + z * z
+    nearer = (X * X + Y * Y + Z * Z) / square
+    lamp = (nearer * np.sqrt(nearer) * lift) ** gamma
+    kx = gamma * (3.0 * x / square - mx / lift)
+    ky = gamma * (3.0 * y / square - my / lift)
+    return lamp, (kx, ky, gamma * (3.0 * z / square - mz / lift))
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _gap(current, moved, place):  # type: ignore[no-untyped-def]
-    """Distance of X' from the tangent plane of the current depth, mm, and its derivative by X'; NaN across an edge.
-
-    moved : X'. place : where it lands, in its cell and the cell (column, row).
-    """
-    (x, y, z), (a, b, i, j), depth = moved, place, current.depth_mm
-    d00, d10, d01, d11 = float(depth[j, i]), float(depth[j, i + 1]), float(depth[j + 1, i]), float(depth[j + 1, i + 1])
+def _gap(depth, moved, place, G):  # type: ignore[no-untyped-def]
+    """Distance of X' from the tangent plane of the current depth (1, H, W), mm, its derivative; NaN across an edge."""
+    (x, y, z), (_, _, i, j) = moved, place
+    d00, d10 = float(depth[0, j, i]), float(depth[0, j, i + 1])
+    d01, d11 = float(depth[0, j + 1, i]), float(depth[0, j + 1, i + 1])
     nearest, farthest = min(d00, d10, d01, d11), max(d00, d10, d01, d11)
     # The comparison fails where any of them is unknown.
     if not (
         farthest - nearest < _ONE_SURFACE * nearest and abs(d00 + d11 + d10 + d01 - 4.0 * z) < 4.0 * _SAME_PLACE * z
     ):
-        return np.nan, 0.0, 0.0, 0.0
-    D, du, dv = _bilinear(depth, a, b, i, j)
-    gx, gy = du * current.intrinsics[0] / z, dv * current.intrinsics[1] / z
+        return np.nan, (0.0, 0.0, 0.0)
+    D, du, dv = _bilinear(depth, 0, place)
+    gx, gy = du * G[0] / z, dv * G[1] / z
     gz = -(gx * x + gy * y) / z - 1.0
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
-    return (D - z) / length, gx / length, gy / length, gz / length
+    return (D - z) / length, (gx / length, gy / length, gz / length)
 
 
 @njit(cache=True, nogil=True)
 def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: ignore[no-untyped-def]
     """Return the geometric residual (H, W) float32 on the reference's grid, NaN where there is none."""
-    h, w = reference.weight.shape
+    # Arrays read out of a tuple are counted references: once, not at every pixel.
+    depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
+    current_mm, usable, G = np.expand_dims(current.depth_mm, 0), current.weight, current.intrinsics
+    h, w = weights.shape
     out = np.full((h, w), np.nan, np.float32)
     for row in range(h):
         for column in range(w):
-            x, y, z, a, b, i, j, _, weight = _land(reference, current, T_current_reference, row, column)
-            if weight > 0.0:
-                out[row, column] = _gap(current, (x, y, z), (a, b, i, j))[0] / unit_mm
+            if weights[row, column] > 0.0:
+                moved, place, there = _land(_lifted(depth_mm, K, row, column), T, G, usable)
+                if there > 0.0:
+                    out[row, column] = _gap(current_mm, moved, place, G)[0] / unit_mm
     return out
 
 
 @njit(cache=True, nogil=True)
 def residual_images(reference, current, T_current_reference, affine, loss):  # type: ignore[no-untyped-def]
     """Return residuals (C, H, W) float32 on the reference's grid, NaN where a pixel is not used."""
-    channels, h, w = reference.channels.shape
+    depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
+    shown, slope, lit, gamma = reference.channels, reference.slope, loss.lit, loss.gamma
+    image, usable, G = current.channels, current.weight, current.intrinsics
+    channels, h, w = shown.shape
     out = np.full((channels, h, w), np.nan, np.float32)
     for row in range(h):
         for column in range(w):
-            x, y, z, a, b, i, j, square, weight = _land(reference, current, T_current_reference, row, column)
-            if weight <= 0.0:
+            if not weights[row, column] > 0.0:
                 continue
-            _, _, _, lift = _tilt(reference, T_current_reference, row, column)
-            lamp = ((square / (x * x + y * y + z * z)) ** 1.5 * lift) ** loss.gamma
+            point = _lifted(depth_mm, K, row, column)
+            moved, place, there = _land(point, T, G, usable)
+            if not there > 0.0:
+                continue
+            lamp, _ = _light(point, moved, (slope[row, column, 0], slope[row, column, 1]), T, gamma)
             for c in range(channels):
-                value, _, _ = _bilinear(current.channels[c], a, b, i, j)
-                expected = float(reference.channels[c, row, column])
-                if loss.lit[c]:
+                expected = float(shown[c, row, column])
+                if lit[c]:
                     expected = affine[0] * lamp * expected + affine[1]
-                out[c, row, column] = value - expected
+                out[c, row, column] = _bilinear(image, c, place)[0] - expected
     return out
 
 
@@ -203,77 +221,90 @@ def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add(sums, J, r, weight, free):  # type: ignore[no-untyped-def]
-    """Add one residual's share to the upper triangle and the gradient; derivatives from `free` on are zero."""
-    for k in range(free):
-        wj = weight * J[k]
-        sums[_PAIRS + k] += wj * r
-        first = k * PARAMETERS - k * (k - 1) // 2 - k
-        for m in range(k, free):
-            sums[first + m] += wj * J[m]
+def _turned(moved, g):  # type: ignore[no-untyped-def]
+    """Derivative by a rotation of the camera's frame, from the derivative g by X'."""
+    (x, y, z), (gx, gy, gz) = moved, g
+    return y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _add(hessian, gradient, J, r, information, count):  # type: ignore[no-untyped-def]
+    """Add the first of residuals r (N,), derivatives (8, N): reordered sums over a whole row run in vectors."""
+    for k in range(PARAMETERS):
+        total = 0.0
+        for n in range(count):
+            total += information[n] * J[k, n] * r[n]
+        gradient[k] += total
+        for m in range(k, PARAMETERS):
+            total = 0.0
+            for n in range(count):
+                total += information[n] * J[k, n] * J[m, n]
+            hessian[k, m] += total
 
 
 @njit(cache=True, nogil=True)
 def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[no-untyped-def]
-    """Sums over all pixels, `_SUMS` long."""
-    channels, h, w = reference.channels.shape
-    sums, J = np.zeros(_SUMS), np.zeros(PARAMETERS)
+    """Sums over all pixels: upper triangle of the hessian (8, 8), gradient (8,), cost, weight."""
+    depth_mm, weights, K = reference.depth_mm, reference.weight, reference.intrinsics
+    shown, slope, lit, gamma = reference.channels, reference.slope, loss.lit, loss.gamma
+    image, usable, G = current.channels, current.weight, current.intrinsics
+    current_mm, sigma, share = np.expand_dims(current.depth_mm, 0), loss.sigma, loss.share
+    channels, h, w = shown.shape
+    hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    total_cost = total_weight = 0.0
+    # The residuals of a row of pixels.
+    most = (channels + 1) * w
+    J, r, information = np.zeros((PARAMETERS, most)), np.zeros(most), np.zeros(most)
     for row in range(h):
+        n = 0
         for column in range(w):
-            x, y, z, a, b, i, j, square, weight = _land(reference, current, T, row, column)
-            if weight <= 0.0:
+            if not weights[row, column] > 0.0:
                 continue
-            sums[_SUMS - 1] += weight
-            fx, fy = current.intrinsics[0] / z, current.intrinsics[1] / z
-            distance = x * x + y * y + z * z
-            mx, my, mz, lift = _tilt(reference, T, row, column)
-            lamp = ((square / distance) ** 1.5 * lift) ** loss.gamma
+            point = _lifted(depth_mm, K, row, column)
+            moved, place, there = _land(point, T, G, usable)
+            weight = there * float(weights[row, column])
+            if not weight > 0.0:
+                continue
+            total_weight += weight
+            x, y, z = moved
             if loss.depth_share > 0.0:
-                gap, nx, ny, nz = _gap(current, (x, y, z), (a, b, i, j))
+                gap, normal = _gap(current_mm, moved, place, G)
                 if np.isfinite(gap):
-                    r, s = gap / unit_mm, loss.depth_sigma
-                    cost, information = _huber(r, s, loss.threshold, loss.depth_share * weight)
-                    sums[_SUMS - 2] += cost
-                    turn = 1.0 / unit_mm
-                    J[0], J[1], J[2] = turn * (y * nz - z * ny), turn * (z * nx - x * nz), turn * (x * ny - y * nx)
-                    J[3], J[4], J[5] = nx, ny, nz
-                    _add(sums, J, r, information, PARAMETERS - 2)
-            # -d ln(lamp) / dX', for translations; the lamp sits in the camera's centre: turning changes nothing.
-            kx = loss.gamma * (3.0 * x / distance - mx / lift)
-            ky = loss.gamma * (3.0 * y / distance - my / lift)
-            kz = loss.gamma * (3.0 * z / distance - mz / lift)
+                    r[n] = gap / unit_mm
+                    cost, information[n] = _huber(r[n], loss.depth_sigma, loss.threshold, loss.depth_share * weight)
+                    total_cost += cost
+                    J[0, n], J[1, n], J[2, n] = _turned((x / unit_mm, y / unit_mm, z / unit_mm), normal)
+                    J[3, n], J[4, n], J[5, n] = normal
+                    J[6, n], J[7, n] = 0.0, 0.0
+                    n += 1
+            lamp, dims = _light(point, moved, (slope[row, column, 0], slope[row, column, 1]), T, gamma)
             for c in range(channels):
-                if loss.share[c] <= 0.0:
+                if share[c] <= 0.0:
                     continue
-                value, du, dv = _bilinear(current.channels[c], a, b, i, j)
-                shown = float(reference.channels[c, row, column])
-                k, free = 0.0, PARAMETERS - 2
-                if loss.lit[c]:
-                    shown *= lamp
-                    r = value - affine[0] * shown - affine[1]
-                    k, free = affine[0] * shown, PARAMETERS
-                    J[6], J[7] = -shown, -1.0
-                else:
-                    r = value - shown
-                cost, information = _huber(r, loss.sigma[c], loss.threshold, loss.share[c] * weight)
-                sums[_SUMS - 2] += cost
-                gx, gy = du * fx, dv * fy
+                value, du, dv = _bilinear(image, c, place)
+                expected, k = float(shown[c, row, column]), 0.0
+                r[n], J[6, n], J[7, n] = value - expected, 0.0, 0.0
+                if lit[c]:
+                    expected *= lamp
+                    k = affine[0] * expected
+                    r[n], J[6, n], J[7, n] = value - k - affine[1], -expected, -1.0
+                cost, information[n] = _huber(r[n], sigma[c], loss.threshold, share[c] * weight)
+                total_cost += cost
+                gx, gy = du * G[0] / z, dv * G[1] / z
                 gz = -(gx * x + gy * y) / z
-                J[0], J[1], J[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
-                J[3], J[4], J[5] = unit_mm * (gx + k * kx), unit_mm * (gy + k * ky), unit_mm * (gz + k * kz)
-                _add(sums, J, r, information, free)
-    return sums
+                J[0, n], J[1, n], J[2, n] = _turned(moved, (gx, gy, gz))
+                J[3, n], J[4, n] = unit_mm * (gx + k * dims[0]), unit_mm * (gy + k * dims[1])
+                J[5, n] = unit_mm * (gz + k * dims[2])
+                n += 1
+        _add(hessian, gradient, J, r, information, n)
+    return hessian, gradient, total_cost, total_weight
 
 
 def normal_equations(
     reference: View, current: View, T_current_reference: np.ndarray, affine: np.ndarray, loss: Loss, unit_mm: float
 ) -> NormalEquations:
     """Linearise the loss around a motion (4, 4) and a brightness change (gain, bias); translation in `unit_mm`."""
-    sums = _accumulate(reference, current, T_current_reference, affine, loss, unit_mm)
-    weight = float(sums[-1])
-    sums /= max(weight, 1e-9)
-    hessian = np.zeros((PARAMETERS, PARAMETERS))
-    upper = np.triu_indices(PARAMETERS)
-    hessian[upper] = sums[:_PAIRS]
-    hessian[upper[::-1]] = sums[:_PAIRS]
-    return NormalEquations(hessian, sums[_PAIRS : _PAIRS + PARAMETERS], float(sums[-2]), weight)
+    hessian, gradient, cost, weight = _accumulate(reference, current, T_current_reference, affine, loss, unit_mm)
+    count = max(weight, 1e-9)
+    hessian += np.triu(hessian, 1).T
+    return NormalEquations(hessian / count, gradient / count, cost / count, weight)
