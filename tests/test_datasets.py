@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drawn_inputs import SIZE, frames_of, number_in, picture, poses, save, write_c3vd, write_sevenscenes, write_video
+from drawn_inputs import SIZE, frames_of, number_in, picture, poses, save, write_c3vd, write_video
 
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
@@ -201,26 +201,6 @@ def test_poses_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "pose.txt").write_text(text)
     with pytest.raises(InputError, match=r"pose\.txt"):
         read_poses(tmp_path / "pose.txt")
-
-
-# ---- 7-Scenes
-
-
-def test_sevenscenes(tmp_path: Path) -> None:
-    folder = write_sevenscenes(tmp_path / "s")
-    sequence = open_sequence(folder)
-    assert sequence.source.name == "7-scenes"
-    assert sequence.camera.fx == pytest.approx(292.5)
-    for (frame, truth), T_world_camera in zip(sequence, poses(3), strict=True):
-        assert number_in(frame.rgb) == frame.index
-        np.testing.assert_allclose(truth.T_world_camera, T_world_camera, atol=1e-6)
-        assert np.isnan(truth.depth_mm[:4]).all()
-        np.testing.assert_allclose(truth.depth_mm[6:], 1500)
-    np.savetxt(folder / "camera-intrinsics.txt", [[500, 0, 310], [0, 501, 250], [0, 0, 1]])
-    (folder / "frame-000001.pose.txt").write_text("nan " * 16)
-    changed = open_sequence(folder)
-    assert changed.camera.fx == pytest.approx(250)
-    assert [truth.T_world_camera is None for _, truth in changed] == [False, True, False]
 
 
 # ---- video

@@ -7,8 +7,9 @@ import pytest
 
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.errors import CalibrationError
+from scopemap.geometry.se3 import inverse, se3_exp, transform
 from scopemap.lenses import FisheyeCamera, OmnidirectionalCamera, OpenCvCamera
-from scopemap.rectification import Rectifier, working_camera, working_size
+from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera, working_size
 
 PINHOLE = PinholeCamera(300.0, 302.0, 318.0, 245.0, 640, 480)
 LENSES = {
@@ -144,3 +145,31 @@ def test_what_does_not_fit_is_refused() -> None:
     away = PinholeCamera(300.0, 300.0, 5000.0, 240.0, 640, 480)
     with pytest.raises(CalibrationError, match="no pixel"):
         Rectifier(PINHOLE, away)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (320, 240)])
+def test_depth_of_a_sensor_beside_the_camera_lands_where_the_camera_sees_it(source: CameraModel, size: tuple) -> None:
+    """A slanted plane: depth that another camera took is, on the grid of the images, what these would have measured."""
+    sensor = PinholeCamera(340.0, 345.0, 320.0, 240.0, 640, 480)
+    T = se3_exp(np.array([0.02, -0.03, 0.05, -25.0, 4.0, 2.0]))
+    normal_mm = np.array([0.2, 0.1, 1.0]) / 1000  # normal . X = 1, in the sensor's frame
+    rays = sensor.resized(*size).rays
+    rectifier = Rectifier(source, working_camera(source, (320, 240)))
+    found_mm = SensorRectifier(rectifier, DepthSensor(sensor, T)).nearest((1 / (rays @ normal_mm)).astype(np.float32))
+    known = np.isfinite(found_mm)
+    points = transform(inverse(T), rectifier.target.rays[known] * found_mm[known, None])
+    # Half a pixel either way on the slant, twice; and what a coarser sensor leaves empty stays empty.
+    assert np.abs(points @ normal_mm - 1).max() < 0.004
+    assert known.mean() > (0.5 if size == (640, 480) else 0.15)
+
+
+def test_the_nearest_of_two_surfaces_counts_and_what_the_sensor_does_not_know_stays_unknown() -> None:
+    camera = PinholeCamera(100.0, 100.0, 20.0, 20.0, 40, 40)
+    depth_mm = np.full((40, 40), 1000, np.float32)
+    depth_mm[:, :20] = 500
+    depth_mm[5] = np.nan
+    found_mm = DepthSensor(camera, se3_exp(np.array([0, 0, 0, 25.0, 0, 0]))).registered(depth_mm, camera)
+    # 2.5 px to the right at 1000 mm, 5 px at 500 mm: the near half hides the far one's edge.
+    assert np.isnan(found_mm[5]).all()
+    assert (found_mm[6:, 5:25] == 500).all()
+    assert (found_mm[6:, 25:] == 1000).all()

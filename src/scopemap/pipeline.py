@@ -19,7 +19,15 @@ import trimesh
 from scopemap.backend import Backend, Correction
 from scopemap.config import Config, DepthSettings, FusionSettings
 from scopemap.datasets import Sequence
-from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, reach_mm
+from scopemap.depth import (
+    AnchoredDepth,
+    DepthEstimator,
+    DepthKind,
+    create_anchor,
+    create_depth,
+    files_folder,
+    reach_mm,
+)
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.flow import CornerFollower, DisFlow, FlowEstimator, create_flow, pair_flow
@@ -74,11 +82,12 @@ class Estimators:
     @classmethod
     def create(cls, config: Config, sequence: Sequence) -> Estimators:
         """Build what the settings name; raises what the parts raise where weights or files are missing."""
-        networks = config.networks
+        networks, folder = config.networks, files_folder(config.depth)
+        beside = folder is not None and folder.resolve() == sequence.path.resolve()
         return cls(
             create_depth(
                 config.depth,
-                sequence.rectifier,
+                sequence.depth_rectifier if beside else sequence.rectifier,
                 networks.device,
                 sequence.depth_scale_mm,
                 calibrated=sequence.calibrated,

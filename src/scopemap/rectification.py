@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.errors import CalibrationError, check_shape
+from scopemap.geometry.se3 import transform
 
 LONGEST_WORKING_SIDE_PX = 400
 _BLUR_PER_SHRINK = 0.4
@@ -127,3 +128,42 @@ class Rectifier:
         if size == (self.source.width, self.source.height):
             return image.copy()
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA if self._shrink > 1 else cv2.INTER_LINEAR)
+
+
+@dataclass(frozen=True)
+class DepthSensor:
+    """A depth camera beside the camera of the images.
+
+    camera : of the depth files. T_colour_depth : (4, 4), mm, takes its points to the camera of the images.
+    """
+
+    camera: PinholeCamera
+    T_colour_depth: np.ndarray
+
+    def registered(self, depth_mm: np.ndarray, colour: CameraModel) -> np.ndarray:
+        """Return the depth that `colour` sees, (h, w) float32, NaN = unknown; of several in a pixel the nearest.
+
+        depth_mm : as the sensor sees it, at any size, NaN = unknown.
+        """
+        points = self.camera.resized(depth_mm.shape[1], depth_mm.shape[0]).rays * depth_mm[..., None]
+        points = transform(self.T_colour_depth, points[np.isfinite(depth_mm)])
+        pixels = colour.project(points)
+        seen = np.isfinite(pixels).all(-1)
+        # Rounding halves to even would leave every second pixel empty.
+        points, pixels = points[seen], np.floor(pixels[seen] + 0.5).astype(int)
+        inside = ((pixels >= 0) & (pixels < [colour.width, colour.height])).all(-1)
+        seen_mm = np.full((colour.height, colour.width), np.inf, dtype=np.float32)
+        np.minimum.at(seen_mm, (pixels[inside, 1], pixels[inside, 0]), points[inside, 2].astype(np.float32))
+        return np.where(np.isfinite(seen_mm), seen_mm, np.float32(np.nan))
+
+
+class SensorRectifier(Rectifier):
+    """Like the rectifier of the images, for depth that a sensor beside them took."""
+
+    def __init__(self, images: Rectifier, sensor: DepthSensor) -> None:
+        super().__init__(images.source, images.target)
+        self._sensor = sensor
+
+    def nearest(self, array: np.ndarray) -> np.ndarray:
+        """Return depth, mm, (h, w) as the sensor sees it, on the working camera's grid, NaN where it is not known."""
+        return super().nearest(self._sensor.registered(array, self.source))

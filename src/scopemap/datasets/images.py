@@ -14,6 +14,7 @@ from scopemap.calibration import read_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.errors import InputError
+from scopemap.rectification import DepthSensor
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FOLDER_RATE_HZ = 30.0
@@ -92,6 +93,7 @@ class ImageFolder:
         self.camera: CameraModel | None = None
         self.camera_source = ""
         self.depth_scale_mm: float | None = None
+        self.depth_sensor: DepthSensor | None = None
         calibration_file = path / "camera.yaml"
         if calibration_file.is_file():
             calibration = read_calibration(calibration_file, (self.width, self.height))

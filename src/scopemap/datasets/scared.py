@@ -21,6 +21,7 @@ from scopemap.datasets.scared_files import KeyframeTruth, calibration_camera, re
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
 from scopemap.errors import CalibrationError, InputError
+from scopemap.rectification import DepthSensor
 
 OWN_CALIBRATION = "camera.yaml"
 _CALIBRATIONS = ("endoscope_calibration.yaml", "camera_calibration.yaml")
@@ -55,6 +56,7 @@ class ScaredKeyframe:
         self.count: int | None = self._pictures.count if self._numbers is None else len(self._numbers)
         self.camera: CameraModel | None = None
         self.depth_scale_mm: float | None = None
+        self.depth_sensor: DepthSensor | None = None
         self.camera_source = ""
         self._calibrate()
         scale_mm = self.depth_scale_mm or 1.0

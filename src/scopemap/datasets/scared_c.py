@@ -22,6 +22,7 @@ from scopemap.datasets.scared import OWN_CALIBRATION
 from scopemap.datasets.scared_files import KeyframeTruth, read_frame_data
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.errors import CalibrationError, InputError
+from scopemap.rectification import DepthSensor
 
 _INTRINSICS = "intrinsics_colmap.yaml"
 _LOG = "frame_log.json"
@@ -52,6 +53,7 @@ class ScaredCKeyframe:
         self.notes = [f"time stamps: {times}", "truth: COLMAP's poses, scaled to the scan of the keyframe"]
         self.height, self.width = self._size()
         self.depth_scale_mm: float | None = None
+        self.depth_sensor: DepthSensor | None = None
         self.camera, self.camera_source = self._calibrated()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(path, self._data, (self.width, self.height), "sfm", scale_mm)

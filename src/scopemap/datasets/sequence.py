@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -12,7 +13,7 @@ import numpy as np
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth, TruthQuality
-from scopemap.rectification import Rectifier, working_camera
+from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class SourceTruth:
     Attributes
     ----------
     T_world_camera : (4, 4) float64, mm, or None.
-    depth_mm : (h, w) float32 along the optical axis, of the image's view at any size, NaN = unknown; or None.
+    depth_mm : (h, w) float32 along the optical axis, NaN = unknown, of the image's view or what the source's
+        `depth_sensor` sees, at any size; or None.
     quality : how the truth came about.
     """
 
@@ -61,6 +63,7 @@ class Source(Protocol):
     camera_source : how the camera is known, one phrase, or "".
     pixel_aspect : width of a pixel over its height.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
+    depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
     """
@@ -73,6 +76,7 @@ class Source(Protocol):
     camera_source: str
     pixel_aspect: float
     depth_scale_mm: float | None
+    depth_sensor: DepthSensor | None
     notes: list[str]
     warnings: list[str]
 
@@ -133,6 +137,12 @@ class Sequence:
         """The working camera, which every frame carries."""
         return self.rectifier.target
 
+    @cached_property
+    def depth_rectifier(self) -> Rectifier:
+        """From the depth files beside the frames to the working camera."""
+        sensor = self.source.depth_sensor
+        return self.rectifier if sensor is None else SensorRectifier(self.rectifier, sensor)
+
     @property
     def count(self) -> int | None:
         """Number of selected frames, or None where only reading on would tell; a video's is its header's claim."""
@@ -179,5 +189,5 @@ class Sequence:
         truth = self.source.truth(index)
         if truth is None:
             return None
-        depth_mm = None if truth.depth_mm is None else self.rectifier.nearest(truth.depth_mm)
+        depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
         return Truth(index, truth.T_world_camera, depth_mm, truth.quality)

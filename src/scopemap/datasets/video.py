@@ -14,6 +14,7 @@ from av.video.stream import VideoStream
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.errors import InputError
+from scopemap.rectification import DepthSensor
 
 DEFAULT_RATE_HZ = 30.0
 # Headers round durations and count pictures that are never shown: less than this is not a video that breaks off.
@@ -36,6 +37,7 @@ class VideoFile:
         self.camera: CameraModel | None = None
         self.camera_source = ""
         self.depth_scale_mm: float | None = None
+        self.depth_sensor: DepthSensor | None = None
         self.notes: list[str] = []
         self.warnings: list[str] = []
         first = [frame for _, frame in islice(self._decoded(), 2)]

@@ -12,7 +12,16 @@ from scopemap.depth.shading import ShadingDepth
 from scopemap.errors import SettingsError
 from scopemap.rectification import Rectifier
 
-__all__ = ["AnchoredDepth", "DepthEstimate", "DepthEstimator", "DepthKind", "create_anchor", "create_depth", "reach_mm"]
+__all__ = [
+    "AnchoredDepth",
+    "DepthEstimate",
+    "DepthEstimator",
+    "DepthKind",
+    "create_anchor",
+    "create_depth",
+    "files_folder",
+    "reach_mm",
+]
 
 _FILES = "files:"
 
@@ -27,15 +36,16 @@ def create_depth(
 ) -> DepthEstimator:
     """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
 
-    rectifier : from the source camera to the working camera, for depth files.
+    rectifier : from the camera that depth files show the view of to the working camera.
     device : "auto", "cpu" or "cuda", for networks.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
     calibrated : whether the frames' camera is known; False: ScopeNet is not told the rays, which would mislead it.
 
     Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
     """
-    if settings.backend.startswith(_FILES):
-        return FilesDepth(Path(settings.backend.removeprefix(_FILES)), rectifier, settings, depth_scale_mm)
+    folder = files_folder(settings)
+    if folder is not None:
+        return FilesDepth(folder, rectifier, settings, depth_scale_mm)
     if settings.backend == "shading":
         return ShadingDepth(settings)
     # Networks take seconds to import: only who asks for one waits.
@@ -52,6 +62,11 @@ def create_depth(
     raise SettingsError(
         f"unknown depth '{settings.backend}': choose scopenet, shading, depth-anything, depth-pro or files:FOLDER"
     )
+
+
+def files_folder(settings: DepthSettings) -> Path | None:
+    """Return the folder that depth files come from, None where depth comes from elsewhere."""
+    return Path(settings.backend.removeprefix(_FILES)) if settings.backend.startswith(_FILES) else None
 
 
 def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
