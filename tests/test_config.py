@@ -17,7 +17,7 @@ from scopemap.errors import SettingsError
 SOURCE = Path(scopemap.config.__file__).parent
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
-    "mask": ["masking.py"],
+    "mask": ["masking.py", "mask_files.py"],
     "depth": ["depth/*.py", "depth_range.py"],
     "mapis": ["depth/mapis.py", "pipeline.py"],
     "networks": ["pipeline.py"],

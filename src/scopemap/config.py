@@ -39,6 +39,12 @@ class MaskSettings(Settings):
     highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median in a highlight")
     highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
     border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
+    files: str = Field(
+        "",
+        description="folder of masks, one image per frame, found by the number in its name: what is not 0 is left out "
+        "(instruments, overlays)",
+    )
+    files_grow_px: int = Field(3, ge=0, description="px by which these masks are widened")
 
 
 class DepthSettings(Settings):

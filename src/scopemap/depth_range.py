@@ -28,6 +28,7 @@ from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
 from scopemap.geometry.warp import pull
+from scopemap.mask_files import create_masks
 from scopemap.masking import Masker, is_constant
 
 _REFERENCE_EVERY, _REFERENCES = 4, 20
@@ -73,7 +74,8 @@ def described(fit: ExponentFit, frames: int) -> str:
 
 def _pairs(sequence: Sequence, config: Config) -> Iterator[tuple[Frame, list[Frame]]]:
     """Yield each usable reference, masked, with the frames that may be its partner, farthest first."""
-    masker, window = Masker(config.mask), deque[Frame]()
+    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier))
+    window = deque[Frame]()
     least_share, most = config.odometry.min_valid_share, config.depth.exponent_frames
     every = min(max(min(sequence.count or most, most) // _REFERENCES, 1), _REFERENCE_EVERY)
 

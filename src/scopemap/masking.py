@@ -9,6 +9,7 @@ import numpy as np
 
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame
+from scopemap.mask_files import MaskFiles
 
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
 _NEIGHBOURHOOD_SHARE = 0.09
@@ -28,15 +29,18 @@ def is_constant(rgb: np.ndarray) -> bool:
 
 
 class Masker:
-    """Narrows `Frame.valid` to usable tissue; the field of view is learnt from the frames it has seen so far."""
+    """Narrows `Frame.valid` to usable tissue; the field of view is learnt from the frames it has seen so far.
 
-    def __init__(self, settings: MaskSettings) -> None:
-        self.settings = settings
+    files : masks of what is known to be no tissue, or None.
+    """
+
+    def __init__(self, settings: MaskSettings, files: MaskFiles | None = None) -> None:
+        self.settings, self._files = settings, files
         self._lit: np.ndarray | None = None
         self._field: np.ndarray | None = None
 
     def __call__(self, frame: Frame) -> Frame:
-        """Return the frame with `valid` False also outside the field of view, at highlights and at bad exposure.
+        """Return the frame with `valid` False also outside the field of view, at highlights, at bad exposure, by files.
 
         Under-exposed is a pixel whose brightest channel is at most `dark_level`, its own or the mean around it: noise
         lifts single pixels of a black image. Over-exposed is one whose second brightest channel reaches
@@ -52,6 +56,9 @@ class Masker:
             field = self._field_of_view(lit, frame.valid)
         if self.settings.highlights:
             valid &= ~_grown(clipped | self._highlights(darkest, field), self.settings.highlight_grow_px)
+        covered = None if self._files is None else self._files.covered(frame.index)
+        if covered is not None:
+            valid &= ~covered
         return replace(frame, valid=valid & field)
 
     def _field_of_view(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:

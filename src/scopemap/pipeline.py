@@ -35,6 +35,7 @@ from scopemap.frame import Frame, SeenAgain
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
+from scopemap.mask_files import MaskFiles, create_masks
 from scopemap.masking import Masker, is_constant
 from scopemap.odometry import FrameTracker, Track, Tracker, create_smoother
 from scopemap.perceptual import PerceptualDistance, create_perceptual
@@ -78,6 +79,7 @@ class Estimators:
     anchor: AnchoredDepth
     flow: FlowEstimator
     perceptual: PerceptualDistance
+    masks: MaskFiles | None = None
 
     @classmethod
     def create(cls, config: Config, sequence: Sequence) -> Estimators:
@@ -95,6 +97,7 @@ class Estimators:
             create_anchor(config.depth, networks.device),
             create_flow(networks.flow, networks.flow_iterations, networks.device),
             create_perceptual(networks.perceptual, networks.device),
+            create_masks(config.mask, sequence.rectifier),
         )
 
     def reach_mm(self, settings: DepthSettings, room: float = 1.0) -> float:
@@ -115,7 +118,8 @@ class Estimators:
             # Several parts have weights and hashes: each says whose.
             facts = part.provenance()
             parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
-        return parts | {"anchor": self.anchor.description}
+        masks = self.masks.provenance() if self.masks is not None else {}
+        return parts | masks | {"anchor": self.anchor.description}
 
 
 class Pipeline:
@@ -127,7 +131,7 @@ class Pipeline:
     def __init__(self, config: Config, estimators: Estimators, tracker: FrameTracker | None = None) -> None:
         self.config = config
         self.estimators = estimators
-        self._masker = Masker(config.mask)
+        self._masker = Masker(config.mask, estimators.masks)
         waits = config.backend.method == "full" or follows_scene(config.fusion) or not config.fusion.enabled
         # Frames that are fused as they come cannot be sorted into maps at the end.
         own = config.odometry if waits else config.odometry.model_copy(update={"new_map_after": 0})

@@ -1,0 +1,77 @@
+"""Masks from files: what others know to be no tissue, instruments above all, one image per frame."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.config import MaskSettings
+from scopemap.errors import InputError
+from scopemap.rectification import Rectifier
+
+_LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
+_LOSSY = (".jpg", ".jpeg")
+_HALF = 127
+
+
+def create_masks(settings: MaskSettings, rectifier: Rectifier) -> MaskFiles | None:
+    """Return the masks that the settings name, None where they name none; raises as `MaskFiles` does."""
+    return MaskFiles(Path(settings.files), rectifier, settings.files_grow_px) if settings.files else None
+
+
+class MaskFiles:
+    """Masks in a folder, found by the last whole number in their names, which is the frame's.
+
+    folder : holds the images. rectifier : from the camera of the images to the working camera.
+    grow_px : by which masks are widened, at the working size: outlines are drawn a little inside more often than not.
+
+    Raises `InputError` where the folder does not exist, holds no image with a number, or two for one.
+    """
+
+    def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
+        self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
+        self._files = _numbered(self._folder)
+
+    def covered(self, index: int) -> np.ndarray | None:
+        """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
+
+        Masked is what is not 0, in a JPEG what is above 127. Raises `InputError` for a file that is no image,
+        `CalibrationError` for one of another aspect than the images.
+        """
+        file = self._files.get(index)
+        if file is None:
+            return None
+        image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
+        # An alpha channel is no part of what is drawn.
+        level = image if image.ndim == 2 else image[..., :3].max(-1)
+        masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
+        if self._grow_px > 0:
+            side = 2 * self._grow_px + 1
+            masked = cv2.dilate(masked, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+        return masked > 0
+
+    def provenance(self) -> dict[str, str]:
+        """Return the folder and how many masks it holds."""
+        return {"masks": f"{len(self._files)} files in {self._folder}"}
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    if not folder.is_dir():
+        raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()):
+        numbers = re.findall(r"\d+", file.stem)
+        if file.suffix.lower() not in (*_LOSSLESS, *_LOSSY) or not numbers or file.name.startswith("."):
+            continue
+        number = int(numbers[-1])
+        if number in found:
+            raise InputError(f"two masks for frame {number} in {folder}: {found[number].name} and {file.name}")
+        found[number] = file
+    if not found:
+        raise InputError(f"reading masks: {folder} holds no image with a number in its name; the number is the frame's")
+    return found

@@ -1,0 +1,113 @@
+"""Masks from files: which pixels they leave out, and what is wrong with a folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_inputs import frames_of, picture, save
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config, MaskSettings
+from scopemap.datasets import open_sequence
+from scopemap.errors import CalibrationError, InputError
+from scopemap.frame import Frame
+from scopemap.mask_files import MaskFiles, create_masks
+from scopemap.masking import Masker
+from scopemap.pipeline import Estimators, Pipeline
+from scopemap.rectification import Rectifier, working_camera
+
+SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)
+RECTIFIER = Rectifier(SOURCE, working_camera(SOURCE, (320, 240)))
+
+
+def write_masks(folder: Path, values: dict[str, np.ndarray]) -> Path:
+    folder.mkdir()
+    for name, image in values.items():
+        assert cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+def left_half(level: int = 255) -> np.ndarray:
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:, :320] = level
+    return mask
+
+
+@pytest.mark.parametrize("level", [1, 7, 255])
+def test_what_is_not_zero_is_masked_at_the_working_size(level: int, tmp_path: Path) -> None:
+    folder = write_masks(tmp_path / "masks", {"frame-000007.mask.png": left_half(level)})
+    covered = MaskFiles(folder, RECTIFIER).covered(7)
+    assert covered.shape == (240, 320)
+    assert covered[:, :160].all()
+    assert not covered[:, 160:].any()
+
+
+def test_masks_are_widened(tmp_path: Path) -> None:
+    folder = write_masks(tmp_path / "masks", {"7.png": left_half()})
+    covered = MaskFiles(folder, RECTIFIER, grow_px=4).covered(7)
+    assert covered[:, :164].all()
+    assert not covered[:, 164:].any()
+
+
+def test_noise_of_a_jpeg_is_no_mask_and_colours_and_alpha_are_read(tmp_path: Path) -> None:
+    coloured = np.zeros((480, 640, 4), np.uint8)
+    coloured[:, :320, 2], coloured[..., 3] = 200, 255
+    values = {"1.jpg": left_half(), "2.png": coloured}
+    masks = MaskFiles(write_masks(tmp_path / "masks", values), RECTIFIER)
+    for index in (1, 2):
+        assert masks.covered(index)[:, :158].all()
+        assert not masks.covered(index)[:, 162:].any()
+
+
+def test_a_frame_without_a_mask_has_none(tmp_path: Path) -> None:
+    masks = MaskFiles(write_masks(tmp_path / "masks", {"3.png": left_half()}), RECTIFIER)
+    assert masks.covered(4) is None
+    assert masks.provenance() == {"masks": f"1 files in {tmp_path / 'masks'}"}
+
+
+def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no folder"):
+        MaskFiles(tmp_path / "nowhere", RECTIFIER)
+    with pytest.raises(InputError, match="no image with a number"):
+        MaskFiles(write_masks(tmp_path / "names", {"tool.png": left_half()}), RECTIFIER)
+    with pytest.raises(InputError, match="two masks for frame 1"):
+        MaskFiles(write_masks(tmp_path / "twice", {"a1.png": left_half(), "b1.png": left_half()}), RECTIFIER)
+    damaged = write_masks(tmp_path / "damaged", {"1.png": left_half()})
+    (damaged / "1.png").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"cannot read the mask .*1\.png"):
+        MaskFiles(damaged, RECTIFIER).covered(1)
+    narrow = write_masks(tmp_path / "narrow", {"1.png": np.zeros((480, 320), np.uint8)})
+    with pytest.raises(CalibrationError, match="aspect"):
+        MaskFiles(narrow, RECTIFIER).covered(1)
+
+
+def test_the_masker_leaves_masked_pixels_out_of_that_frame_only(tmp_path: Path) -> None:
+    """The field of view is learnt over the frames: an instrument that was there once must not stay."""
+    masks = MaskFiles(write_masks(tmp_path / "masks", {"0.png": left_half()}), RECTIFIER)
+    rgb = np.random.default_rng(0).integers(80, 120, (240, 320, 3)).astype(np.uint8)
+    frame = Frame(0, 0.0, rgb, RECTIFIER.target, np.ones((240, 320), bool))
+    masker, bare = Masker(MaskSettings(), masks), Masker(MaskSettings())
+    assert not masker(frame).valid[:, :160].any()
+    np.testing.assert_array_equal(masker(frame).valid[:, 160:], bare(frame).valid[:, 160:])
+    later = replace(frame, index=1)
+    np.testing.assert_array_equal(masker(later).valid, bare(later).valid)
+
+
+def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for i in range(3):
+        save(images / f"{i}.png", picture(i, (640, 480)))
+    masks = write_masks(tmp_path / "masks", {f"{i}.png": left_half() for i in range(3)})
+    config = Config.load(settings={"mask.files": str(masks), "mask.files_grow_px": 0, "depth.backend": "shading"})
+    sequence = open_sequence(images)
+    estimators = Estimators.create(config, sequence)
+    assert estimators.provenance()["masks"].startswith("3 files")
+    percept = Pipeline(config, estimators).perceive(frames_of(sequence)[1])
+    assert not percept.frame.valid[:, :160].any()
+    assert percept.frame.valid[:, 160:].any()
+    assert create_masks(MaskSettings(), sequence.rectifier) is None
