@@ -31,9 +31,14 @@ LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
 SHADING = {"depth.backend": "shading"}
 NO_SURFACE = {"fusion.enabled": False}
 TRACKED = {"backend.method": "none"}
-ABLATIONS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "no back end": TRACKED,
+# One part each taken away or replaced: of what tracks and makes depth consistent, measured without the back end, which
+# would hide most of it ...
+FRONT_END: dict[str, dict[str, Any]] = {
+    "no corners": {"odometry.corner_depth_share": 0.0},
+    "flow never overrules": {"odometry.flow_contradiction": 0.0},
+    "no early keyframes": {"odometry.keyframe_agreement": 0.0},
+    "no distance to the frame's depth": {"odometry.depth_share": 0.0},
+    "uncertainty of depth not used to track": {"odometry.depth_sigma_share": 1e6},
     "keyframe every 2": {"odometry.keyframe_every": 2},
     "keyframe every 5": {"odometry.keyframe_every": 5},
     "keyframe every 20": {"odometry.keyframe_every": 20},
@@ -53,6 +58,13 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "WEMA": {"smoothing.method": "wema"},
     "WEMA, s = 1": {"smoothing.method": "wema", "smoothing.dynamic": False},
     "no flow": {"networks.flow": "none"},
+}
+# ... and of the back end, with all of the front end.
+BACK_END: dict[str, dict[str, Any]] = {
+    "no loops": {"backend.loop_landmarks": 0},
+    "links to the keyframe before only": {"backend.gaps": (1,)},
+    "depth of keyframes hardly adjusted": {"backend.scale_sigma": 1e-3},
+    "back end, but no corners while tracking": {"odometry.corner_depth_share": 0.0},
 }
 
 
@@ -130,16 +142,22 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
 
 
 def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
-    """Yield every ablation on the real clip (Depth Anything files) and on a phantom (true depth)."""
-    cecum, source = data / "endoscopy/c3vd/cecum_t1_a", folder / "ablated"
-    write_phantom(PhantomSpec(scene="colon", frames=120, seed=5), source)
+    """Yield every ablation on the real clip (Depth Anything files) and on a phantom (scopenet, true depth)."""
+    cecum, colon = data / "endoscopy/c3vd/cecum_t1_a", folder / "ablated"
+    write_phantom(PhantomSpec(scene="colon", frames=120, seed=5), colon)
     files = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
-    for name, changes in ABLATIONS.items():
-        yield Run(f"{name}: cecum_t1_a", cecum, "sim3", files | NO_SURFACE | LIGHT | changes)
-    for name, changes in ABLATIONS.items():
-        if not any(key.startswith(("mapis", "networks")) for key in changes):  # true depth is left as it is
-            truth = {"depth.backend": f"files:{source}"}
-            yield Run(f"{name}: colon phantom, true depth", source, "origin", truth | NO_SURFACE | LIGHT | changes)
+    for source, where, settings in ((cecum, "cecum_t1_a", files), (colon, "colon, scopenet", {})):
+        light = settings | NO_SURFACE | LIGHT
+        for name, changes in ({"default": {}} | BACK_END).items():
+            yield Run(f"{name}: {where}", source, "sim3", light | changes)
+        for name, changes in ({"as tracked": {}} | FRONT_END).items():
+            if "sigma" not in str(changes) or not settings:  # files say nothing of their uncertainty
+                yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes)
+    exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE | LIGHT
+    for name, changes in ({"as tracked": {}} | FRONT_END).items():
+        # True depth is left as it is, and tracked by without corners and flow.
+        if not any(key.startswith(("mapis", "networks")) or "corner" in key or "flow" in key for key in changes):
+            yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
 
 
 def row(run: Run, out: Path | None) -> str:
