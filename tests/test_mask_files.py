@@ -111,3 +111,15 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     assert not percept.frame.valid[:, :160].any()
     assert percept.frame.valid[:, 160:].any()
     assert create_masks(MaskSettings(), sequence.rectifier) is None
+
+
+def test_the_data_sets_own_masks_are_used_unless_others_or_none_are_asked_for(tmp_path: Path) -> None:
+    own, others = (write_masks(tmp_path / name, {"0.png": left_half()}) for name in ("own", "others"))
+
+    def used(files: str) -> str:
+        masks = create_masks(MaskSettings(files=files), RECTIFIER, own)
+        return "" if masks is None else masks.provenance()["masks"]
+
+    assert used("").endswith("own")
+    assert used(str(others)).endswith("others")
+    assert used("none") == ""

@@ -42,7 +42,7 @@ class MaskSettings(Settings):
     files: str = Field(
         "",
         description="folder of masks, one image per frame, found by the number in its name: what is not 0 is left out "
-        "(instruments, overlays)",
+        "(instruments, overlays); empty: the data set's own where it has some; none: without",
     )
     files_grow_px: int = Field(3, ge=0, description="px by which these masks are widened")
 

@@ -74,7 +74,8 @@ def described(fit: ExponentFit, frames: int) -> str:
 
 def _pairs(sequence: Sequence, config: Config) -> Iterator[tuple[Frame, list[Frame]]]:
     """Yield each usable reference, masked, with the frames that may be its partner, farthest first."""
-    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier))
+    masks = create_masks(config.mask, sequence.rectifier, sequence.source.masks)
+    masker = Masker(config.mask, masks)
     window = deque[Frame]()
     least_share, most = config.odometry.min_valid_share, config.depth.exponent_frames
     every = min(max(min(sequence.count or most, most) // _REFERENCES, 1), _REFERENCE_EVERY)

@@ -15,11 +15,18 @@ from scopemap.rectification import Rectifier
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
 _HALF = 127
+_NO_MASKS = "none"
 
 
-def create_masks(settings: MaskSettings, rectifier: Rectifier) -> MaskFiles | None:
-    """Return the masks that the settings name, None where they name none; raises as `MaskFiles` does."""
-    return MaskFiles(Path(settings.files), rectifier, settings.files_grow_px) if settings.files else None
+def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None = None) -> MaskFiles | None:
+    """Return the masks that the settings name, where they name none the data set's own, None where there are none.
+
+    own : folder of the data set's masks, or None. Raises as `MaskFiles` does.
+    """
+    folder = Path(settings.files) if settings.files else own
+    if folder is None or settings.files == _NO_MASKS:
+        return None
+    return MaskFiles(folder, rectifier, settings.files_grow_px)
 
 
 class MaskFiles:

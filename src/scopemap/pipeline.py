@@ -97,7 +97,7 @@ class Estimators:
             create_anchor(config.depth, networks.device),
             create_flow(networks.flow, networks.flow_iterations, networks.device),
             create_perceptual(networks.perceptual, networks.device),
-            create_masks(config.mask, sequence.rectifier),
+            create_masks(config.mask, sequence.rectifier, sequence.source.masks),
         )
 
     def reach_mm(self, settings: DepthSettings, room: float = 1.0) -> float:

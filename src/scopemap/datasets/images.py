@@ -94,6 +94,7 @@ class ImageFolder:
         self.camera_source = ""
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
+        self.masks: Path | None = None
         calibration_file = path / "camera.yaml"
         if calibration_file.is_file():
             calibration = read_calibration(calibration_file, (self.width, self.height))

@@ -57,6 +57,7 @@ class ScaredKeyframe:
         self.camera: CameraModel | None = None
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
+        self.masks: Path | None = None
         self.camera_source = ""
         self._calibrate()
         scale_mm = self.depth_scale_mm or 1.0

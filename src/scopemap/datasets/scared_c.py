@@ -54,6 +54,7 @@ class ScaredCKeyframe:
         self.height, self.width = self._size()
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
+        self.masks: Path | None = None
         self.camera, self.camera_source = self._calibrated()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(path, self._data, (self.width, self.height), "sfm", scale_mm)

@@ -64,6 +64,7 @@ class Source(Protocol):
     pixel_aspect : width of a pixel over its height.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
+    masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
     """
@@ -77,6 +78,7 @@ class Source(Protocol):
     pixel_aspect: float
     depth_scale_mm: float | None
     depth_sensor: DepthSensor | None
+    masks: Path | None
     notes: list[str]
     warnings: list[str]
 

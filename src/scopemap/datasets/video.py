@@ -38,6 +38,7 @@ class VideoFile:
         self.camera_source = ""
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
+        self.masks: Path | None = None
         self.notes: list[str] = []
         self.warnings: list[str] = []
         first = [frame for _, frame in islice(self._decoded(), 2)]
