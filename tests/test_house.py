@@ -19,7 +19,7 @@ import scopemap
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
 BOTTOM = {"errors", "presets", "camera", "frame", "geometry", "config", "lenses", "calibration", "rectification"} | {
-    *("weights", "checkpoints", "device", "trajectory", "trajectories", "mask_files"),
+    *("weights", "checkpoints", "device", "trajectory", "trajectories", "mask_files", "decoding"),
 }
 STAGES = {"masking", "depth", "flow", "perceptual", "odometry", "fusion"}
 # What a room may import besides itself; rooms that are not named may import all but the command line.

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
+from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
 from scopemap.rectification import Rectifier
 
@@ -51,7 +52,7 @@ class MaskFiles:
         file = self._files.get(index)
         if file is None:
             return None
-        image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        image = read_decoded(file)
         if image is None:
             raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
         # An alpha channel is no part of what is drawn.

@@ -14,8 +14,9 @@ import numpy as np
 
 from scopemap.calibration import fitted_to
 from scopemap.camera import CameraModel, PinholeCamera
-from scopemap.datasets.images import ImageFolder, decoded, image_files
+from scopemap.datasets.images import ImageFolder, image_files
 from scopemap.datasets.sequence import SourceTruth
+from scopemap.decoding import decoded
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
 from scopemap.lenses import OmnidirectionalCamera

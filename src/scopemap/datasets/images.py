@@ -13,6 +13,7 @@ import numpy as np
 from scopemap.calibration import read_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.decoding import decoded, read_decoded
 from scopemap.errors import InputError
 from scopemap.rectification import DepthSensor
 
@@ -41,22 +42,12 @@ def image_files(folder: Path) -> list[Path]:
 
 def read_image(file: Path) -> np.ndarray | None:
     """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
-    # Decoding what was read also works for names that OpenCV cannot open on some systems.
-    return decoded_image(file.read_bytes())
+    return _rgb(read_decoded(file, cv2.IMREAD_COLOR))
 
 
 def decoded_image(content: bytes) -> np.ndarray | None:
     """Return the image in a file's `content` as (h, w, 3) uint8 RGB; None where it holds none."""
-    image = decoded(content, cv2.IMREAD_COLOR)
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Return the image in a file's `content` as OpenCV has it, channels turned round; None where it holds none."""
-    try:
-        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags) if content else None
-    except cv2.error:
-        return None
+    return _rgb(decoded(content, cv2.IMREAD_COLOR))
 
 
 def read_depth16(file: Path) -> np.ndarray | None:
@@ -66,7 +57,7 @@ def read_depth16(file: Path) -> np.ndarray | None:
     """
     if not file.is_file():
         return None
-    values = decoded(file.read_bytes())
+    values = read_decoded(file)
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         raise InputError(f"reading {file}: expected a depth image of one 16-bit channel")
     return values
@@ -144,6 +135,10 @@ class ImageFolder:
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
             self.warnings.append(message)
+
+
+def _rgb(image: np.ndarray | None) -> np.ndarray | None:
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _numbers(files: list[Path]) -> list[int]:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from scopemap.camera import CameraModel, PinholeCamera
-from scopemap.datasets.images import decoded
 from scopemap.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.datasets.sequence import SourceTruth
+from scopemap.decoding import decoded
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.geometry.se3 import inverse, orthonormalised

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from scopemap.config import DepthSettings
+from scopemap.decoding import read_decoded
 from scopemap.depth.estimate import DepthEstimate, DepthKind
 from scopemap.errors import InputError
 from scopemap.frame import Frame
@@ -157,7 +158,7 @@ def depth_files(folder: Path) -> dict[int, Path]:
 def _read(file: Path) -> np.ndarray:
     """Return (h, w) uint8, uint16 or floating; raises `InputError` for what is no depth image."""
     try:
-        array = np.load(file, allow_pickle=False) if file.suffix.lower() == _NUMPY else _read_image(file)
+        array = np.load(file, mmap_mode="r", allow_pickle=False) if file.suffix.lower() == _NUMPY else _read_image(file)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"cannot read the depth file {file}: {error}") from None
     array = np.squeeze(array)
@@ -172,7 +173,7 @@ def _read(file: Path) -> np.ndarray:
 
 
 def _read_image(file: Path) -> np.ndarray:
-    array = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    array = read_decoded(file)
     if array is None:
         raise ValueError("not an image, or damaged")
     return array

@@ -17,11 +17,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 
 from scopemap.camera import CameraModel
+from scopemap.decoding import read_decoded
 from scopemap.errors import InputError, check_shape
 from scopemap.evaluation.registration import refine
 from scopemap.evaluation.surface import (
@@ -251,7 +251,7 @@ def _numbers(path: Path, rows: list[str]) -> np.ndarray:
 
 def _read_depth_points(path: Path) -> np.ndarray:
     """Return SCARED's points (N, 3), mm, one per pixel, NaN where there is none; OpenCV reverses x, y, z."""
-    points = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    points = read_decoded(path)
     if points is None or points.ndim != 3 or points.shape[2] != 3:
         raise InputError(f"cannot read the true surface {path}: expected an image of three channels, x, y and z")
     return points[..., ::-1].reshape(-1, 3)

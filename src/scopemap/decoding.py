@@ -1,0 +1,86 @@
+"""Decoding images from files that anyone may have written: none whose header claims more pixels than a limit.
+
+A few hundred bytes can claim to be gigabytes of picture. The limit is 64 million pixels; the environment variable
+`SCOPEMAP_MAX_MEGAPIXELS` sets another (where it is no TIFF, up to what Pillow opens: 178 million).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.errors import InputError
+
+_MOST_MEGAPIXELS = 64.0
+_VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
+
+
+def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
+    """Return the image in a file's `content` as OpenCV has it, channels turned round; None where it holds none.
+
+    Raises `InputError` where it claims more pixels than the limit.
+    """
+    claimed, most = _claimed_pixels(content), _most_megapixels()
+    if claimed > most * 1e6:
+        raise InputError(
+            f"decoding an image: its header claims more than {most:g} million pixels; if it is sound, set the "
+            f"environment variable {_VARIABLE}"
+        )
+    if claimed == 0:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
+    """Return the image in a file as `decoded` does; the error names the file.
+
+    Reading first and decoding then also works for names that OpenCV cannot open on some systems.
+    """
+    try:
+        return decoded(file.read_bytes(), flags)
+    except InputError as error:
+        raise InputError(f"reading {file}: {error}") from None
+
+
+def _most_megapixels() -> float:
+    text = os.environ.get(_VARIABLE, "")
+    try:
+        return float(text) if text else _MOST_MEGAPIXELS
+    except ValueError:
+        raise InputError(f"the environment variable {_VARIABLE} must be a number, got '{text}'") from None
+
+
+def _claimed_pixels(content: bytes) -> float:
+    """Return how many pixels the header claims; 0 where nothing that can be decoded is known to be there."""
+    # Only who reads images waits for the import.
+    from PIL import Image, TiffImagePlugin
+
+    file = io.BytesIO(content)
+    # Damaged headers end in anything at all.
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if content[:4] in _TIFF:
+                # Pillow opens few kinds of TIFF, but reads the directory of all.
+                directory = TiffImagePlugin.ImageFileDirectory_v2(content[: 16 if b"+" in content[:4] else 8])
+                file.seek(directory.next)
+                directory.load(file)
+                return int(directory[_WIDTH]) * int(directory[_HEIGHT])
+            with Image.open(file) as image:
+                return image.width * image.height
+    except Image.DecompressionBombError:
+        return math.inf
+    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, SyntaxError, struct.error, AttributeError):
+        return 0

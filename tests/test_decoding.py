@@ -1,0 +1,95 @@
+"""Images that claim to be larger than they may be are refused before they are decoded; damaged ones are none."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scopemap.decoding import decoded, read_decoded
+from scopemap.errors import InputError
+
+HUGE = 60_000
+
+
+def encoded(ending: str, image: np.ndarray) -> bytes:
+    ok, content = cv2.imencode(ending, image)
+    assert ok
+    return content.tobytes()
+
+
+def grey(dtype: type = np.uint8) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 200, (12, 20)).astype(dtype)
+
+
+def huge_png() -> bytes:
+    content = bytearray(encoded(".png", grey()))
+    content[16:24] = struct.pack(">II", HUGE, HUGE)
+    content[29:33] = struct.pack(">I", zlib.crc32(bytes(content[12:29])))
+    return bytes(content)
+
+
+def huge_jpeg() -> bytes:
+    content = bytearray(encoded(".jpg", grey()))
+    start = content.index(b"\xff\xc0")
+    content[start + 5 : start + 9] = struct.pack(">HH", HUGE, HUGE)
+    return bytes(content)
+
+
+def huge_bmp() -> bytes:
+    content = bytearray(encoded(".bmp", grey()))
+    content[18:26] = struct.pack("<ii", HUGE, HUGE)
+    return bytes(content)
+
+
+def huge_tiff() -> bytes:
+    content = bytearray(encoded(".tiff", grey()))
+    (place,) = struct.unpack("<I", content[4:8])
+    (count,) = struct.unpack("<H", content[place : place + 2])
+    for entry in range(place + 2, place + 2 + 12 * count, 12):
+        tag, kind = struct.unpack("<HH", content[entry : entry + 4])
+        if tag in (256, 257):
+            content[entry + 8 : entry + 12] = struct.pack("<HH" if kind == 3 else "<I", *([HUGE, 0][: 5 - kind]))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("huge", [huge_png, huge_jpeg, huge_bmp, huge_tiff])
+def test_what_claims_to_be_huge_is_refused(huge: Callable[[], bytes], tmp_path: Path) -> None:
+    content = huge()
+    with pytest.raises(InputError, match=r"more than 64 million pixels.*SCOPEMAP_MAX_MEGAPIXELS"):
+        decoded(content)
+    (tmp_path / "bömb 1.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"reading .*bömb 1\.png"):
+        read_decoded(tmp_path / "bömb 1.png")
+
+
+@pytest.mark.parametrize(
+    ("ending", "dtype"),
+    [(".png", np.uint8), (".png", np.uint16), (".bmp", np.uint8), (".tiff", np.uint16), (".tiff", np.float32)],
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sound_images_come_as_they_were(ending: str, dtype: type, channels: int) -> None:
+    image = grey(dtype) if channels == 1 else np.repeat(grey(dtype)[..., None], 3, -1)
+    if ending == ".bmp" and channels == 1:
+        assert decoded(encoded(ending, image), cv2.IMREAD_GRAYSCALE) is not None
+        return
+    np.testing.assert_array_equal(decoded(encoded(ending, image)), image)
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing", b"II*\0", encoded(".png", grey())[:30], b"II*\0" + b"\xff" * 80])
+def test_what_is_no_image_is_none(content: bytes) -> None:
+    assert decoded(content) is None
+
+
+def test_the_limit_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCOPEMAP_MAX_MEGAPIXELS", "0.0001")
+    with pytest.raises(InputError, match=r"more than 0\.0001 million"):
+        decoded(encoded(".png", grey()))
+    monkeypatch.setenv("SCOPEMAP_MAX_MEGAPIXELS", "many")
+    with pytest.raises(InputError, match="must be a number, got 'many'"):
+        decoded(encoded(".png", grey()))
