@@ -307,7 +307,7 @@ def test_bad_input_is_one_line(
         (("--depth", "sonar"), "unknown depth 'sonar'"),
         (("--depth", "files:/nowhere"), "/nowhere is no folder"),
         (("--flow", "farneback"), "unknown flow 'farneback': choose one of auto"),
-        (("--dataset", "endomapper"), "unknown data set 'endomapper': choose one of"),
+        (("--dataset", "endomopper"), "unknown data set 'endomopper': choose one of"),
         (("--dataset", "video"), "it is a folder"),
         (("--camera", "/nowhere.yaml"), "cannot read the calibration"),
         (("--config", "/nowhere.toml"), "cannot read the settings"),

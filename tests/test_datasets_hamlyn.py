@@ -13,7 +13,7 @@ from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.datasets import open_sequence
-from scopemap.datasets.hamlyn import read_intrinsics
+from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
 from scopemap.masking import Masker

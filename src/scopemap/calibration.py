@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,7 @@ _MODEL_NAMES = ("camera_model", "distortion_model", "model", "Camera.type")
 _FISHEYE_WORDS = ("fisheye", "equidistant", "kannala", "kb4")
 _OMNIDIRECTIONAL_WORDS = ("omnidirectional", "scaramuzza")
 _ASPECT_TOLERANCE = 0.01
+_MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,10 @@ def read_calibration(file: Path | str, image_size: tuple[int, int]) -> Calibrati
     """
     file = Path(file)
     try:
+        if file.stat().st_size > _MOST_BYTES:
+            raise CalibrationError(
+                f"the calibration {file} is larger than any calibration: {file.stat().st_size} bytes"
+            )
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
@@ -149,12 +155,7 @@ def _with_lens(root: cv2.FileNode, pinhole: PinholeCamera, file: Path) -> Camera
     words = [root.getNode(name).string().lower() for name in _MODEL_NAMES if root.getNode(name).isString()]
     model = " ".join(words) + (" fisheye" if _number(root, ("fisheye_model", "fisheye")) else "")
     if any(word in model for word in _OMNIDIRECTIONAL_WORDS):
-        polynomial, stretch = _array(root, ("polynomial",)), _array(root, ("stretch",))
-        if polynomial is None:
-            raise CalibrationError(f"the calibration {file} is omnidirectional but has no 'polynomial'")
-        c, d, e = (1.0, 0.0, 0.0) if stretch is None else (float(x) for x in stretch.ravel())
-        centre = (pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
-        return OmnidirectionalCamera(tuple(float(a) for a in polynomial.ravel()), *centre, (c, d, e))
+        return _omnidirectional(root, pinhole, file)
     found = _array(root, _DISTORTION_NAMES)
     distortion = () if found is None else tuple(float(k) for k in found.ravel())
     is_fisheye = any(word in model for word in _FISHEYE_WORDS)
@@ -166,9 +167,22 @@ def _with_lens(root: cv2.FileNode, pinhole: PinholeCamera, file: Path) -> Camera
         raise CalibrationError(f"the calibration {file}: {error}") from None
 
 
+def _omnidirectional(root: cv2.FileNode, pinhole: PinholeCamera, file: Path) -> OmnidirectionalCamera:
+    polynomial, stretch = _array(root, ("polynomial",)), _array(root, ("stretch",))
+    if polynomial is None:
+        raise CalibrationError(f"the calibration {file} is omnidirectional but has no 'polynomial'")
+    centre = (pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    try:
+        c, d, e = (1.0, 0.0, 0.0) if stretch is None else (float(x) for x in stretch.ravel())
+        return OmnidirectionalCamera(tuple(float(a) for a in polynomial.ravel()), *centre, (c, d, e))
+    except ValueError as error:
+        raise CalibrationError(f"the calibration {file}: {error}") from None
+
+
 def _number(root: cv2.FileNode, names: tuple[str, ...]) -> float | None:
     nodes = (root.getNode(name) for name in names)
-    return next((node.real() for node in nodes if node.isInt() or node.isReal()), None)
+    found = (node.real() for node in nodes if node.isInt() or node.isReal())
+    return next((number for number in found if math.isfinite(number)), None)
 
 
 def _array(root: cv2.FileNode, names: tuple[str, ...]) -> np.ndarray | None:

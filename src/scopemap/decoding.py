@@ -44,12 +44,14 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
 
 
 def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Return the image in a file as `decoded` does; the error names the file.
+    """Return the image in a file as `decoded` does, None also where there is no file to read; the error names the file.
 
     Reading first and decoding then also works for names that OpenCV cannot open on some systems.
     """
     try:
         return decoded(file.read_bytes(), flags)
+    except OSError:
+        return None
     except InputError as error:
         raise InputError(f"reading {file}: {error}") from None
 

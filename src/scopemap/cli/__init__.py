@@ -9,7 +9,7 @@ import sys
 
 import typer
 
-from scopemap.cli import models
+from scopemap.cli import datasets, models
 from scopemap.cli.bench import bench
 from scopemap.cli.compare import compare
 from scopemap.cli.demo import demo
@@ -27,6 +27,7 @@ app = typer.Typer(
 for command in (run, demo, evaluate, compare, bench, phantom):
     app.command()(command)
 app.add_typer(models.app, name="models")
+app.add_typer(datasets.app, name="datasets")
 
 
 def _version(asked: bool) -> None:

@@ -48,10 +48,7 @@ def run(
     ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option(
-            help="scared-c, scared, hamlyn, hamlyn-tracking, c3vd, 7-scenes, video or images; told from what lies "
-            "there if left out."
-        ),
+        typer.Option(help="Name of a reader (see `scopemap datasets list`); told from what lies there if left out."),
     ] = None,
     camera: Annotated[
         Path | None,

@@ -16,7 +16,7 @@ from scopemap.calibration import fitted_to
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files
 from scopemap.datasets.sequence import SourceTruth
-from scopemap.decoding import decoded
+from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
 from scopemap.lenses import OmnidirectionalCamera
@@ -120,7 +120,7 @@ def _layout(path: Path) -> tuple[list[Path], Path, str]:
 
 
 def _read_depth(file: Path) -> np.ndarray:
-    values = decoded(file.read_bytes())
+    values = read_decoded(file)
     if values is None or values.ndim != 2 or values.dtype not in _LARGEST:
         raise InputError(f"reading {file}: expected a depth image of one 8- or 16-bit channel")
     return values

@@ -9,25 +9,46 @@ import numpy as np
 
 from scopemap.calibration import Calibration, read_calibration
 from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.datasets.colmap import ColmapFolder
+from scopemap.datasets.endomapper import EndoMapperSequence
+from scopemap.datasets.endomapper_sim import EndoMapperSimFolder
+from scopemap.datasets.endonerf import EndoNerfFolder
+from scopemap.datasets.endoslam import EndoSlamFolder
 from scopemap.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
 from scopemap.datasets.images import ImageFolder
+from scopemap.datasets.oneslam import OneSlamFolder
 from scopemap.datasets.scared import ScaredKeyframe
 from scopemap.datasets.scared_c import ScaredCKeyframe
 from scopemap.datasets.sequence import Sequence, Source, assumed_camera
+from scopemap.datasets.servct import ServCtFolder
 from scopemap.datasets.sevenscenes import SevenScenesFolder
+from scopemap.datasets.simcol import SimColFolder
+from scopemap.datasets.stereomis import StereoMisFolder
+from scopemap.datasets.tum import TumRgbdFolder
 from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError
 from scopemap.rectification import Rectifier, working_camera, working_size
 
-Reader: TypeAlias = ScaredCKeyframe | ScaredKeyframe | VideoFile | ImageFolder  # data sets of folders are ImageFolders
+# Data sets of folders of images are ImageFolders.
+Reader: TypeAlias = ScaredCKeyframe | ScaredKeyframe | EndoMapperSequence | StereoMisFolder | VideoFile | ImageFolder
 
 _KINDS: tuple[type[Reader], ...] = (
     ScaredCKeyframe,
     ScaredKeyframe,
     HamlynFolder,
     HamlynTrackingFolder,
+    EndoSlamFolder,
+    SimColFolder,
+    EndoMapperSequence,
+    EndoMapperSimFolder,
+    StereoMisFolder,
     C3vdFolder,
+    EndoNerfFolder,
+    ServCtFolder,
     SevenScenesFolder,
+    TumRgbdFolder,
+    OneSlamFolder,
+    ColmapFolder,
     VideoFile,
     ImageFolder,
 )

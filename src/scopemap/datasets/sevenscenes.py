@@ -15,10 +15,12 @@ import numpy as np
 
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files, read_depth16
+from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import CalibrationError, InputError
-from scopemap.geometry.se3 import inverse, orthonormalised, se3
+from scopemap.geometry.se3 import inverse, se3
 from scopemap.rectification import DepthSensor
+from scopemap.trajectories.poses import rigid
 
 DEPTH_CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
 """As published."""
@@ -43,7 +45,7 @@ class SevenScenesFolder(ImageFolder):
         self._file_of = dict(zip(self.numbers, self.files, strict=True))
         if self.camera is None:
             file = path / "camera-intrinsics.txt"
-            stated = _read_intrinsics(file, (self.width, self.height)) if file.is_file() else None
+            stated = read_intrinsics(file, (self.width, self.height)) if file.is_file() else None
             if stated is None or stated == DEPTH_CAMERA.resized(self.width, self.height):
                 self._check_aspect()
                 self.camera = COLOUR_CAMERA.resized(self.width, self.height)
@@ -88,23 +90,14 @@ class SevenScenesFolder(ImageFolder):
             )
 
 
-def _read_intrinsics(file: Path, size: tuple[int, int]) -> PinholeCamera:
-    K = _read_matrix(file, (3, 3))
-    return PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *size)
-
-
 def _read_pose(file: Path) -> np.ndarray | None:
     if not file.is_file():
         return None
-    T_world_camera = _read_matrix(file, (4, 4))
+    try:
+        T_world_camera = np.array(file.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)
+    except (OSError, ValueError) as error:
+        raise InputError(f"reading {file}: expected 4x4 numbers ({error})") from None
     if not np.isfinite(T_world_camera).all():
         return None
     T_world_camera[:3, 3] *= _MM_PER_METRE
-    return orthonormalised(T_world_camera)
-
-
-def _read_matrix(file: Path, shape: tuple[int, int]) -> np.ndarray:
-    try:
-        return np.array(file.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(shape)
-    except ValueError as error:
-        raise InputError(f"reading {file}: expected {shape[0]}x{shape[1]} numbers ({error})") from None
+    return rigid(T_world_camera[None], [str(file)])[0]

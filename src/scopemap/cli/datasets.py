@@ -1,0 +1,145 @@
+"""`scopemap datasets`: which data sets are read, and what is wrong with one."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from scopemap.cli.figures import without_nan
+from scopemap.cli.options import AsJson, Quiet
+from scopemap.errors import InputError, ScopemapError
+
+if TYPE_CHECKING:
+    from scopemap.datasets.checking import Finding
+
+app = typer.Typer(help="Data sets: list what is read, check one.", no_args_is_help=True)
+
+_SECONDS_BETWEEN_LINES = 10.0
+_COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
+_ASKED = "Whether "
+Progress = Callable[[int, int | None], None]
+
+
+@app.command("list")
+def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """List the data sets that are read, in the order in which they are recognised."""
+    from scopemap.datasets import DATASETS
+
+    # A reader's module says what the data set is, its `recognises` what it is told by; nothing is kept in two places.
+    rows = [
+        {
+            "name": name,
+            "what": _first_line(sys.modules[kind.__module__]),
+            "recognised": _first_line(kind.recognises).removeprefix(_ASKED),
+        }
+        for name, kind in DATASETS.items()
+    ]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+    elif not quiet:
+        table = Table("name", "what it is", "recognised where")
+        for row in rows:
+            table.add_row(*map(escape, row.values()))
+        Console().print(table)
+
+
+@app.command()
+def check(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A video, a folder of images or a data set's folder.")],
+    dataset: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Calibration to check with, instead of the data set's.")
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Read a data set once and say what is wrong with its frames, camera, poses and depth; exit code 1 with errors."""
+    from scopemap.datasets import open_sequence
+    from scopemap.datasets.checking import check as findings_of
+    from scopemap.datasets.checking import refusal
+    from scopemap.datasets.survey import survey
+
+    figures: dict[str, Any] = {}
+    try:
+        sequence = open_sequence(path, dataset=dataset, camera=camera)
+    except ScopemapError as error:
+        findings = [refusal(error)]
+    else:
+        with _progress(quiet or as_json) as listener:
+            found = survey(sequence, listener)
+        figures, findings = found.figures, findings_of(found)
+    if as_json:
+        report = {"path": str(path), "figures": figures, "findings": [asdict(finding) for finding in findings]}
+        typer.echo(json.dumps(without_nan(report), indent=2))
+    elif not quiet:
+        _print(path, figures, findings)
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        more = f" (and {len(errors) - 1} more error(s))" if len(errors) > 1 else ""
+        raise InputError(f"checking {path}: {errors[0].code}: {errors[0].message}{more}")
+
+
+def _first_line(documented: object) -> str:
+    return (inspect.getdoc(documented) or "").split("\n")[0].rstrip(".")
+
+
+def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None:
+    console = Console()
+    typer.echo(str(path))
+    if figures:
+        table = Table("figure")
+        table.add_column("value", justify="right")
+        for name, value in figures.items():
+            table.add_row(name, f"{value:.5g}" if isinstance(value, float) else escape(str(value)))
+        console.print(table)
+    if findings:
+        table = Table("severity", "code", "what was found")
+        for finding in findings:
+            table.add_row(finding.severity, finding.code, escape(finding.message), style=_COLOURS[finding.severity])
+        console.print(table)
+    counts = Counter(finding.severity for finding in findings)
+    typer.echo(f"errors: {counts['error']}, warnings: {counts['warning']}")
+
+
+@contextmanager
+def _progress(silent: bool) -> Iterator[Progress | None]:
+    """Yield what shows (frames read, frames in all or None) on stderr; None if `silent`."""
+    if silent:
+        yield None
+    elif sys.stderr.isatty():
+        from rich.progress import Progress as Bar
+
+        with Bar(console=Console(stderr=True)) as bar:
+            task = bar.add_task("checking", total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+    else:
+        yield _Lines()
+
+
+class _Lines:
+    """One line now and then."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def __call__(self, done: int, total: int | None) -> None:
+        now = time.perf_counter()
+        if now - self._last >= _SECONDS_BETWEEN_LINES or done == total:
+            self._last = now
+            typer.echo(f"checked {done}{f' of {total}' if total else ''} frames", err=True)

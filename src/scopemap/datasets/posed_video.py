@@ -1,0 +1,102 @@
+"""A folder with one video and true poses by frame number: what the data sets share that come as video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import log
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.calibration import fitted_to, read_calibration
+from scopemap.camera import CameraModel
+from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.datasets.video import VideoFile
+from scopemap.errors import CalibrationError
+from scopemap.frame import TruthQuality
+from scopemap.rectification import DepthSensor
+
+_OWN_CALIBRATION = "camera.yaml"
+_FOCAL_RANGE = (0.3, 5.0)
+
+
+class PosedVideo:
+    """One view of a folder's video, with the poses that a data set fills in; no depth.
+
+    path : the folder. video : the file. aspect : width over height of one view, of which the video may hold two, above
+    or beside each other, the left one first; None: the whole image. A frame's time stamp is its number over the
+    video's rate, so that it is known before anything is decoded. `camera.yaml` in the folder is its calibration.
+
+    Raises `InputError` for a video that cannot be read, `CalibrationError` for a calibration that does not fit.
+    """
+
+    quality: TruthQuality = "kinematic"
+
+    def __init__(self, path: Path, video: Path, aspect: float | None = None) -> None:
+        self.path = path
+        self._video = VideoFile(video)
+        self.width, self.height, view = _view(self._video.width, self._video.height, aspect)
+        self.pixel_aspect = self._video.pixel_aspect
+        self.count: int | None = self._video.count
+        self.camera: CameraModel | None = None
+        self.camera_source = ""
+        self.depth_scale_mm: float | None = None
+        self.depth_sensor: DepthSensor | None = None
+        self.masks: Path | None = None
+        self.notes = [f"time stamps: frame number / {self._video.rate_hz:g} s", f"the view used: {view}"]
+        self.warnings = self._video.warnings
+        self.poses: dict[int, np.ndarray] = {}
+        own = path / _OWN_CALIBRATION
+        if own.is_file():
+            calibration = read_calibration(own, (self.width, self.height))
+            self.camera, self.camera_source = calibration.camera, f"{calibration.source} beside the frames"
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames of the view, decoded in order."""
+        for frame in self._video.frames(selection):
+            rgb = np.ascontiguousarray(frame.rgb[: self.height, : self.width])
+            yield SourceFrame(frame.index, self._time_s(frame.index), rgb)
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return number and time of the selected frames, as many as the header claims; None where no pose is known."""
+        if self.count is None or not self.poses:
+            return None
+        return [(number, self._time_s(number)) for number in range(self.count)[selection]]
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the frame's pose, or None where it has none."""
+        return self.poses.get(index)
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return the pose, without depth; None where the frame has none."""
+        pose = self.pose(index)
+        return None if pose is None else SourceTruth(pose, None, self.quality)
+
+    def _calibrate(self, camera: CameraModel, file: Path) -> None:
+        """Take `camera`, read from `file`, brought to the size of the view."""
+        fitted = fitted_to(camera, (self.width, self.height), str(file))
+        central, (least, most) = fitted.central, _FOCAL_RANGE
+        focal = all(least * self.width < f < most * self.width for f in (central.fx, central.fy))
+        if not (focal and 0 <= central.cx < self.width and 0 <= central.cy < self.height):
+            raise CalibrationError(
+                f"the calibration {file} does not fit images of {self.width}x{self.height} px: focal length "
+                f"{central.fx:g}, {central.fy:g} px, principal point {central.cx:g}, {central.cy:g} px"
+            )
+        self.camera = fitted
+        rescaled = "" if fitted is camera else f", rescaled from {camera.width}x{camera.height} px"
+        self.camera_source = f"calibration of the data set, {file.name}{rescaled}"
+
+    def _time_s(self, index: int) -> float:
+        return index / self._video.rate_hz
+
+
+def _view(width: int, height: int, aspect: float | None) -> tuple[int, int, str]:
+    """Return size and name of the view whose aspect comes nearest; the three differ by factors of two."""
+    views = [
+        (width, height, "the whole image"),
+        (width, height // 2, "left, the upper half"),
+        (width // 2, height, "left, the left half"),
+    ]
+    if aspect is None or min(width, height) < 2:
+        return views[0]
+    return min(views, key=lambda view: abs(log(view[0] / (view[1] * aspect))))

@@ -1,0 +1,94 @@
+"""A tiny made-up copy of every layout that a reader knows, by the reader's name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
+from drawn_scared import write_scared, write_scared_c
+from test_calibration import CAMERAS, ROS
+from test_datasets_c3vd_layouts import write_endogslam, write_v2
+from test_datasets_colmap import write_scene as write_colmap
+from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
+from test_datasets_endomapper_sim import write_sim
+from test_datasets_endonerf import write_scene as write_llff
+from test_datasets_endoslam import write_real, write_unity
+from test_datasets_hamlyn import write_images, write_rectified
+from test_datasets_oneslam import write_oneslam
+from test_datasets_servct import write_experiment
+from test_datasets_simcol import write_simcol
+from test_datasets_stereomis import write_stereomis
+from test_datasets_tum import write_tum
+
+from scopemap.calibration import write_calibration
+
+
+def write_pictures(folder: Path) -> Path:
+    folder.mkdir()
+    for number in range(4):
+        save(folder / f"{number:03d}.png", picture(number))
+    return folder
+
+
+def write_tracking(folder: Path) -> Path:
+    write_images(folder, [0, 1, 2], "color", "depth")
+    (folder / "intrinsics.txt").write_text("60 0 40 0 60 32 0 0 1\n")
+    return folder
+
+
+def write_endomapper_with_model(folder: Path) -> Path:
+    sequence = write_endomapper(folder)
+    write_models(archive_of(sequence), {0: images_bin([1, 2, 3])})
+    return sequence
+
+
+Writer = Callable[[Path], Path]
+
+# Each makes the folder, which does not exist yet, and returns what is to be opened; after a colon, another form.
+WRITERS: dict[str, Writer] = {
+    "images": write_pictures,
+    "video": lambda folder: write_video(_made(folder) / "clip.mp4", 6),
+    "c3vd": lambda folder: write_c3vd(folder, 4),
+    "c3vd:v2": write_v2,
+    "c3vd:endogslam": write_endogslam,
+    "7-scenes": write_sevenscenes,
+    "scared": write_scared,
+    "scared-c": lambda folder: write_scared_c(folder, [2, 3, 5, 9]),
+    "hamlyn": write_rectified,
+    "hamlyn-tracking": write_tracking,
+    "endonerf": write_llff,
+    "serv-ct": write_experiment,
+    "tum": write_tum,
+    "oneslam": write_oneslam,
+    "simcol3d": lambda folder: write_simcol(_made(folder)),
+    "endoslam:unity": lambda folder: write_unity(folder / "UnityCam" / "Colon"),
+    "endoslam:real": lambda folder: write_real(folder / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1"),
+    "stereomis": write_stereomis,
+    "endomapper": write_endomapper_with_model,
+    "endomapper-sim": write_sim,
+    "colmap:txt": write_colmap,
+    "colmap:bin": lambda folder: write_colmap(folder, "bin"),
+}
+
+
+def write_cameras(folder: Path) -> Path:
+    """Write calibrations of every model in every form: not a data set, but read as freely."""
+    _made(folder)
+    for number, camera in enumerate(CAMERAS):
+        write_calibration(camera, folder / f"{number}.yaml", depth_scale_mm=0.01)
+    for ending in ("xml", "json"):
+        storage = cv2.FileStorage(str(folder / f"opencv.{ending}"), cv2.FILE_STORAGE_WRITE)
+        storage.write("K", CAMERAS[0].matrix)
+        storage.write("D", np.array([[-0.3, 0.1, 1e-3, -5e-4, -0.01]]))
+        storage.release()
+    (folder / "ros.yaml").write_text(ROS)
+    (folder / "line.txt").write_text("520.5 525.25 318 245 -0.3 0.1 0.001 -0.0005\n")
+    return folder
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
