@@ -51,12 +51,17 @@ class Alignment:
     iterations: int
 
 
-def align(reference: list[View], current: list[View], start: np.ndarray, settings: OdometrySettings) -> Alignment:
-    """Align two pyramids (finest level first), starting from the motion `start` (4, 4)."""
+def align(
+    reference: list[View], current: list[View], start: np.ndarray, settings: OdometrySettings, *, down_to: int = 0
+) -> Alignment:
+    """Align two pyramids (finest level first), starting from the motion `start` (4, 4).
+
+    `down_to` leaves out so many of the finest levels, which cost most of the time; judged is at the finest one anyhow.
+    """
     motion, iterations = Motion(start, np.array([1.0, 0.0])), 0
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
-    for level in reversed(range(len(reference))):
+    for level in reversed(range(min(down_to, len(reference) - 1), len(reference))):
         rotation_only = settings.rotation_first and level == len(reference) - 1 and len(reference) > 1
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps

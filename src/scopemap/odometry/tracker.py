@@ -86,7 +86,7 @@ class Tracker:
         # The keyframe's points are moved: the depth of the frame itself has no say, unless it was measured.
         depth_mm = frame.depth_mm if self._keyframe.measured else None
         pyramid = build_pyramid(replace(frame, depth_mm=depth_mm, depth_sigma_mm=None), self.settings)
-        alignment = self._by_corners(self._keyframe, frame, pyramid, self._best(pyramid))
+        alignment = self._against(self._keyframe, frame, pyramid)
         by_flow = self._by_flow(frame, pyramid, alignment)
         # Where flow itself leads to nowhere, there is nothing to be said against the image alone.
         self._flow_decided = by_flow is not None and not self._trouble(self._keyframe, by_flow, by_flow=True)
@@ -147,12 +147,22 @@ class Tracker:
         """Whether the keyframe agrees much less with the last frame than with the first after it, however that was."""
         return bool(self._agreement) and self._agreement[-1] < self.settings.keyframe_agreement * self._agreement[0]
 
-    def _best(self, pyramid: list[View]) -> Alignment:
-        keyframe = self._keyframe
-        assert keyframe is not None
+    def _against(self, keyframe: _Keyframe, frame: Frame, pyramid: list[View]) -> Alignment:
+        """Return the alignment to the keyframe: by brightness, and by the keyframe's corners where these are seen.
+
+        Corners end in the same place from wherever brightness took them, so its finest level is left out unless they
+        cannot tell.
+        """
         starts = [inverse(T) @ keyframe.T_world_camera for T in self._guesses()]
-        found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
-        return max(found, key=_agreement)
+        down_to = 1 if self._has_corners(keyframe, frame) else 0
+        found = [align(keyframe.pyramid, pyramid, start, self.settings, down_to=down_to) for start in starts]
+        alignment = max(found, key=_agreement)
+        by_corners = self._by_corners(keyframe, frame, pyramid, alignment)
+        if by_corners is not alignment or down_to == 0:
+            return by_corners
+        start = alignment.motion.T_current_reference
+        alignment = align(keyframe.pyramid[:1], pyramid[:1], start, self.settings)
+        return self._by_corners(keyframe, frame, pyramid, alignment)
 
     def _found_again(self, frame: Frame, pyramid: list[View], *, elsewhere: bool) -> tuple[_Keyframe, Alignment] | None:
         """Return the remembered keyframe whose landmarks lead to the best alignment, and that; None where none does.
@@ -199,7 +209,7 @@ class Tracker:
     def _by_corners(self, keyframe: _Keyframe, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment:
         """Return the alignment that the keyframe's corners make of this one, or this one where they cannot tell."""
         seen, share = frame.corners_again, self.settings.corner_depth_share
-        if seen is None or seen.host != keyframe.index or share == 0:
+        if seen is None or not self._has_corners(keyframe, frame):
             return alignment
         # What does not correlate is not nearly where it should be, and no start for anything.
         if alignment.correlation < self.settings.min_correlation:
@@ -210,6 +220,10 @@ class Tracker:
         motion = alignment.motion._replace(T_current_reference=T)
         found = judged(keyframe.pyramid, pyramid, motion, self.settings, alignment.iterations)
         return found if found.correlation > _STILL_ALIKE * alignment.correlation else alignment
+
+    def _has_corners(self, keyframe: _Keyframe, frame: Frame) -> bool:
+        seen = frame.corners_again
+        return seen is not None and seen.host == keyframe.index and self.settings.corner_depth_share > 0
 
     def _by_flow(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment | None:
         """Return what takes the alignment's place where flow from the frame before contradicts it, else None."""
