@@ -65,8 +65,20 @@ def test_noise_of_a_jpeg_is_no_mask_and_colours_and_alpha_are_read(tmp_path: Pat
 
 def test_a_frame_without_a_mask_has_none(tmp_path: Path) -> None:
     masks = MaskFiles(write_masks(tmp_path / "masks", {"3.png": left_half()}), RECTIFIER)
-    assert masks.covered(4) is None
     assert masks.provenance() == {"masks": f"1 files in {tmp_path / 'masks'}"}
+    assert masks.covered(4) is None
+
+
+def test_masks_that_fit_no_frame_are_told(tmp_path: Path) -> None:
+    masks = MaskFiles(write_masks(tmp_path / "masks", {"900.png": left_half(), "2.png": left_half()}), RECTIFIER)
+    assert masks.warnings == []
+    for index in (0, 1, 2):
+        masks.covered(index)
+    assert masks.provenance()["masks"].endswith("; 1 of 3 frames have one")
+    (warning,) = masks.warnings
+    assert "2 of 3 frames have none" in warning
+    masks.covered(900)
+    assert masks.warnings == []
 
 
 def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from scopemap.errors import InputError
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNG = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
 
 
@@ -66,6 +67,8 @@ def _most_megapixels() -> float:
 
 def _claimed_pixels(content: bytes) -> float:
     """Return how many pixels the header claims; 0 where nothing that can be decoded is known to be there."""
+    if content[:8] == _PNG:
+        return _png_pixels(content)
     # Only who reads images waits for the import.
     from PIL import Image, TiffImagePlugin
 
@@ -86,3 +89,20 @@ def _claimed_pixels(content: bytes) -> float:
         return math.inf
     except (OSError, ValueError, TypeError, LookupError, ArithmeticError, SyntaxError, struct.error, AttributeError):
         return 0
+
+
+def _png_pixels(content: bytes) -> int:
+    """As `_claimed_pixels`, of a PNG; by itself, as Pillow refuses pictures beside which a comment is damaged.
+
+    A chunk that claims to be longer than the file is not decoded either: OpenCV would take the memory first.
+    """
+    place, pixels = len(_PNG), 0
+    while place + 8 <= len(content):
+        (length,) = struct.unpack(">I", content[place : place + 4])
+        if place + 12 + length > len(content):
+            return 0
+        if content[place + 4 : place + 8] == b"IHDR" and length >= 8:
+            width, height = struct.unpack(">II", content[place + 8 : place + 16])
+            pixels = max(pixels, width * height)
+        place += 12 + length
+    return pixels

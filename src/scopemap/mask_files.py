@@ -42,6 +42,7 @@ class MaskFiles:
     def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
         self._files = _numbered(self._folder)
+        self._asked: set[int] = set()
 
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
@@ -49,6 +50,7 @@ class MaskFiles:
         Masked is what is not 0, in a JPEG what is above 127. Raises `InputError` for a file that is no image,
         `CalibrationError` for one of another aspect than the images.
         """
+        self._asked.add(index)
         file = self._files.get(index)
         if file is None:
             return None
@@ -64,8 +66,22 @@ class MaskFiles:
         return masked > 0
 
     def provenance(self) -> dict[str, str]:
-        """Return the folder and how many masks it holds."""
-        return {"masks": f"{len(self._files)} files in {self._folder}"}
+        """Return the folder, how many masks it holds, and how many of the frames that were asked for have one."""
+        found = f"{len(self._files)} files in {self._folder}"
+        if self._asked:
+            found += f"; {len(self._asked & set(self._files))} of {len(self._asked)} frames have one"
+        return {"masks": found}
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to say where most frames have no mask; numbers that do not fit look just like that."""
+        missing = len(self._asked - set(self._files))
+        if 2 * missing <= len(self._asked):
+            return []
+        return [
+            f"masks: {missing} of {len(self._asked)} frames have none in {self._folder}; the last number in a mask's "
+            "name must be the frame's"
+        ]
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

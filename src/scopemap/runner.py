@@ -89,6 +89,7 @@ def reconstruct(
     mesh = clock.timed("mesh", pipeline.surface)
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
+    provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
     provenance["notes"] += exponent_note
     provenance["warnings"] += distances.warnings(config.fusion) + maps_note
     provenance["notes"] += [] if correction is None else [correction.description]
