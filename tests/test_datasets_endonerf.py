@@ -191,27 +191,33 @@ def test_the_camera_of_larger_images_is_rescaled(tmp_path: Path) -> None:
 # ---- masks
 
 
-@pytest.mark.parametrize(("left_out", "used"), [([], "gt_masks"), (["gt_masks"], "masks"), (["gt_masks", "masks"], "")])
-def test_instruments_are_masked_unasked(left_out: list[str], used: str, tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a")
-    for name in left_out:
-        shutil.rmtree(folder / name)
-    sequence = open_sequence(folder)
+def test_instruments_are_masked_unasked(tmp_path: Path) -> None:
+    sequence = open_sequence(write_scene(tmp_path / "a"))
     settings = Config().mask.model_copy(update={"files_grow_px": 0})
     masks = create_masks(settings, sequence.rectifier, sequence.source.masks)
-    if not used:
-        assert masks is None
-        return
-    assert sequence.source.masks == folder / used
-    rows = {"gt_masks": 10, "masks": 20}[used]
-    np.testing.assert_array_equal(masks.covered(9), mask_image(rows) > 0)
+    np.testing.assert_array_equal(masks.covered(9), mask_image(10) > 0)
 
 
-def test_a_folder_of_masks_that_holds_none_is_passed_over(tmp_path: Path) -> None:
+@pytest.mark.parametrize("emptied", [False, True])
+def test_masks_with_the_holes_of_the_depth_are_not_used_unasked_and_said(emptied: bool, tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "a")
-    for file in (folder / "gt_masks").iterdir():
-        file.unlink()
-    assert open_sequence(folder).source.masks == folder / "masks"
+    shutil.rmtree(folder / "gt_masks")
+    if emptied:
+        (folder / "gt_masks").mkdir()
+    sequence = open_sequence(folder)
+    assert sequence.source.masks is None
+    assert "masks (instruments and holes of the depth) is not used unasked" in sequence.notes
+    shutil.rmtree(folder / "masks")
+    assert not any("masks" in note for note in open_sequence(folder).notes)
+
+
+def test_files_of_llff_alone_are_no_scene(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "a")
+    shutil.rmtree(folder / "depth")
+    assert open_sequence(folder).source.name == "endonerf"
+    shutil.rmtree(folder / "gt_masks")
+    assert open_sequence(folder).source.name == "images"
+    assert open_sequence(folder, dataset="endonerf").source.name == "endonerf"
 
 
 # ---- faults

@@ -14,7 +14,6 @@ from drawn_inputs import frames_of, number_in, picture, save
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.datasets import open_sequence
-from scopemap.datasets.oneslam import OneSlamFolder
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
 
@@ -190,7 +189,7 @@ def test_a_calibration_that_is_none_is_one_sentence(stated: object, message: str
     folder = write_oneslam(tmp_path / "colon")
     write_json(folder, stated)
     with pytest.raises(CalibrationError, match=message) as caught:
-        open_sequence(folder)
+        open_sequence(folder, dataset="oneslam")
     assert "\n" not in str(caught.value)
     assert "calibration.json" in str(caught.value)
 
@@ -200,7 +199,26 @@ def test_a_calibration_that_breaks_off_is_refused(content: bytes, tmp_path: Path
     folder = write_oneslam(tmp_path / "colon")
     (folder / "calibration.json").write_bytes(content)
     with pytest.raises(CalibrationError, match=r"cannot read the calibration in .*calibration\.json"):
-        open_sequence(folder)
+        open_sequence(folder, dataset="oneslam")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[1, 2]", b'{"FPS": 30}', b'{"intrinsics": ', b" " * (2 << 20), b"[" * 100_000]
+)
+def test_another_calibration_json_is_not_taken_for_ours(content: bytes, tmp_path: Path) -> None:
+    folder = write_oneslam(tmp_path / "colon")
+    (folder / "calibration.json").write_bytes(content)
+    sequence = open_sequence(folder)
+    assert (sequence.source.name, sequence.path) == ("images", folder / "images")
+
+
+@pytest.mark.parametrize("content", [b"", b'{"intrinsics": {"fx": 900, "fy": 900, "cx": 40, "cy": 32}}'])
+def test_a_camera_that_is_given_stands_in_for_a_bad_one(content: bytes, tmp_path: Path) -> None:
+    folder = write_oneslam(tmp_path / "colon")
+    (folder / "calibration.json").write_bytes(content)
+    (tmp_path / "mine.txt").write_text("60 60 40 32")
+    sequence = open_sequence(folder, dataset="oneslam", camera=tmp_path / "mine.txt")
+    assert (sequence.camera.fx, sequence.source.truth(3).quality) == (60.0, "registered")
 
 
 @pytest.mark.parametrize("rate", [0, -25, "fast", [25], float("nan"), float("inf")])
@@ -290,6 +308,6 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     (folder / "calibration.json").unlink()
     assert open_sequence(folder).source.name == "images"
     with pytest.raises(CalibrationError, match=r"cannot read the calibration in .*calibration\.json"):
-        OneSlamFolder(folder)
+        open_sequence(folder, dataset="oneslam")
     with pytest.raises(InputError, match="there is no image"):
         open_sequence(folder / "depths", dataset="oneslam")

@@ -30,12 +30,8 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
 
     Raises `InputError` where it claims more pixels than the limit.
     """
-    claimed, most = _claimed_pixels(content), _most_megapixels()
-    if claimed > most * 1e6:
-        raise InputError(
-            f"decoding an image: its header claims more than {most:g} million pixels; if it is sound, set the "
-            f"environment variable {_VARIABLE}"
-        )
+    claimed = _claimed_pixels(content)
+    check_pixels(claimed)
     if claimed == 0:
         return None
     try:
@@ -55,6 +51,16 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
         return None
     except InputError as error:
         raise InputError(f"reading {file}: {error}") from None
+
+
+def check_pixels(claimed: float) -> None:
+    """Raise `InputError` where an image claims more pixels than the limit."""
+    most = _most_megapixels()
+    if claimed > most * 1e6:
+        raise InputError(
+            f"decoding an image: its header claims more than {most:g} million pixels; if it is sound, set the "
+            f"environment variable {_VARIABLE}"
+        )
 
 
 def _most_megapixels() -> float:

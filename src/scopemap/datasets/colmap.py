@@ -30,8 +30,8 @@ _MOST_NAMED = 5
 class ColmapFolder(ImageFolder):
     """All images of the folder; those in the model have its pose. A `camera.yaml` in the folder wins over its camera.
 
-    Raises `InputError` where the model is damaged, has none of the images, or has them by different cameras, and
-    `CalibrationError` where its camera is of a model that has no counterpart here or does not fit.
+    Raises `InputError` where the model is damaged or has none of the images. Cameras that are damaged, differ, are of a
+    model that has no counterpart here or do not fit are its `camera_fault`.
     """
 
     name = "colmap"
@@ -50,7 +50,8 @@ class ColmapFolder(ImageFolder):
         names = {file.name: number for file, number in zip(files, self.numbers, strict=True)}
         here = {names[name]: image for image in images if (name := image_path(image).name) in names}
         if self.camera is None:
-            self._use_camera(cameras_file, Counter(image.camera for image in here.values()))
+            with self._making_camera():
+                self._use_camera(cameras_file, Counter(image.camera for image in here.values()))
         posed = {number: image for number, image in here.items() if image.is_posed}
         if not posed:
             raise InputError(f"reading {images_file}: every pose of the images that are here holds NaN or infinity")
@@ -84,7 +85,8 @@ class ColmapFolder(ImageFolder):
             raise InputError(
                 f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ "
                 f"({'; '.join(named)}{'; ...' * (len(models) > _MOST_NAMED)}); a sequence has one: reconstruct with a "
-                f"single camera for all images, or put their calibration (camera.yaml) into {self.path}"
+                "single camera for all images, or give their calibration (--camera, or as camera.yaml in "
+                f"{self.path})"
             )
         camera = models[most_used[0]]
         self.camera = fitted_to(camera, (self.width, self.height), f"camera {most_used[0]} of {file}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import shutil
 import zipfile
@@ -18,10 +19,15 @@ from scopemap.geometry.se3 import inverse
 from scopemap.trajectories.colmap import poses_of
 
 _IMAGES = re.compile(r"(.*/)?sparse/(\d{1,9})/images\.bin")
-_LARGEST_MODEL_BYTES = 4 << 30
-_LONGEST_LIST_BYTES = 64 << 20
+_LARGEST_MODEL_BYTES = 1 << 30
+_MOST_IMAGES = 1_000_000
+_COUNT_BYTES = 8
+# Poses and points hardly compress: what claims to be larger than this, and that many times its place, is no model.
+_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 16 << 20, 200
+_MOST_MODELS = 64
+_LONGEST_LIST_BYTES = 1 << 20
 # What zipfile raises for damage; a RuntimeError for a password and for a compression that it does not know.
-_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -43,13 +49,18 @@ class SubModel:
 def read_largest_model(archive: Path) -> SubModel:
     """Return the sub-model whose list names the most frames, without lists the longest file; of equals the first.
 
-    Raises `InputError` for an archive that is damaged or holds no sub-model with poses.
+    Raises `InputError` for an archive that is damaged, holds no sub-model with poses, or claims to hold too much.
     """
     try:
         with zipfile.ZipFile(archive) as opened:
             members = {int(match[2]): match for name in opened.namelist() if (match := _IMAGES.fullmatch(name))}
             if not members:
                 raise InputError(f"reading {archive}: it holds no COLMAP model (sparse/<number>/images.bin)")
+            if len(members) > _MOST_MODELS:
+                raise InputError(
+                    f"reading {archive}: it holds {len(members)} sub-models, expected {_MOST_MODELS} at most; leave "
+                    "small ones out"
+                )
             sizes = _sizes(opened, members)
             number = max(sizes, key=lambda number: (sizes[number], -number))
             poses = _poses(opened, archive, members[number][0])
@@ -70,15 +81,9 @@ def _sizes(opened: zipfile.ZipFile, members: dict[int, re.Match[str]]) -> dict[i
 
 
 def _poses(opened: zipfile.ZipFile, archive: Path, member: str) -> dict[str, np.ndarray]:
-    size = opened.getinfo(member).file_size
-    if size > _LARGEST_MODEL_BYTES:
-        raise InputError(
-            f"reading {archive}: {member} holds {size >> 20} MB, expected {_LARGEST_MODEL_BYTES >> 20} at most"
-        )
     with TemporaryDirectory() as folder:
         unpacked = Path(folder) / "images.bin"
-        with opened.open(member) as stream, unpacked.open("wb") as file:
-            shutil.copyfileobj(stream, file)
+        _unpack(opened, archive, member, unpacked)
         try:
             images = [image for image in read_images(unpacked) if image.is_posed]
             T_camera_world = poses_of(images)
@@ -87,3 +92,20 @@ def _poses(opened: zipfile.ZipFile, archive: Path, member: str) -> dict[str, np.
             raise InputError(str(error).replace(str(unpacked), f"{archive}, {member}")) from None
     names = [image_path(image).name for image in images]
     return dict(zip(names, inverse(T_camera_world), strict=True))
+
+
+def _unpack(opened: zipfile.ZipFile, archive: Path, member: str, unpacked: Path) -> None:
+    """Write `member` to the file `unpacked`; zipfile never gives more than the size that was looked at."""
+    size, stored = opened.getinfo(member).file_size, opened.getinfo(member).compress_size
+    if size > _LARGEST_MODEL_BYTES or size > max(_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO * stored):
+        raise InputError(
+            f"reading {archive}: {member} claims {size >> 20} MB in {stored} bytes, expected "
+            f"{_LARGEST_MODEL_BYTES >> 20} MB and {_PLAUSIBLE_RATIO} times its compressed size at most"
+        )
+    with opened.open(member) as stream, unpacked.open("wb") as file:
+        start = stream.read(_COUNT_BYTES)
+        count = int.from_bytes(start, "little")
+        if count > _MOST_IMAGES:
+            raise InputError(f"reading {archive}: {member} claims {count} images, expected {_MOST_IMAGES} at most")
+        file.write(start)
+        shutil.copyfileobj(stream, file)

@@ -3,7 +3,7 @@
 `rgb/image_NNNN.png`, `depth/aov_image_NNNN.exr` (the depth buffer, in channel R), and `trajectory.csv` with a row
 `tX;tY;tZ;rX;rY;rZ;rW;time(s)` per picture, from 0: camera-to-world, decimetres. `calibration.txt` holds the pinhole.
 
-The depth buffer v runs from 1 at 0.1 mm to 0 at 400 mm: the depth is 1 dm / (0.25 + 99.75 v).
+The depth buffer v runs from 1 at 1 mm to 0 at 400 mm: the depth is 1 dm / (0.25 + 99.75 v).
 """
 
 from __future__ import annotations

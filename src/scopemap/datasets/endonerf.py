@@ -22,7 +22,7 @@ from scopemap.errors import CalibrationError, InputError
 from scopemap.trajectories.poses import rigid
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
-_MASKS = ("gt_masks", "masks")
+_DEPTHS, _MASKS, _MASKS_WITH_HOLES = "depth", "gt_masks", "masks"
 _COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
 _IDENTITY_TOLERANCE = 1e-2
 _REST_TOLERANCE = 1e-6
@@ -33,8 +33,8 @@ _DAMAGE = (OSError, ValueError, TypeError, SyntaxError, TokenError, EOFError, Me
 class EndoNerfFolder(ImageFolder):
     """One EndoNeRF scene, or a folder in its layout; a `camera.yaml` beside `images` wins over `poses_bounds.npy`.
 
-    Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` and `CalibrationError` for one
-    that cannot be used.
+    Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
+    camera in it that cannot be is its `camera_fault`.
     """
 
     name = "endonerf"
@@ -46,20 +46,24 @@ class EndoNerfFolder(ImageFolder):
         super().__init__(path, image_files(images) if images.is_dir() else [])
         rows = _read_rows(file)
         if self.camera is None:
-            self.camera = _camera(rows, file, (self.width, self.height))
-            self.camera_source = f"focal length in {file.name}, principal point at the centre"
+            with self._making_camera():
+                self.camera = _camera(rows, file, (self.width, self.height))
+                self.camera_source = f"focal length in {file.name}, principal point at the centre"
         self._poses = self._posed(rows, file)
-        self._depths = _numbered_images(path / "depth")
-        self.masks = next((path / name for name in _MASKS if _numbered_images(path / name)), None)
+        self._depths = _numbered_images(path / _DEPTHS)
+        self.masks = path / _MASKS if _numbered_images(path / _MASKS) else None
         self.notes.append("depth beside the images: stereo matching, no sensor; files are taken as mm")
         if self.masks is not None:
             self.notes.append(f"masks of instruments lie beside the images, in {self.masks.name}")
+        elif _numbered_images(path / _MASKS_WITH_HOLES):
+            self.notes.append(f"{_MASKS_WITH_HOLES} (instruments and holes of the depth) is not used unasked")
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `poses_bounds.npy` or `pose_bounds.npy`, and `images` with images."""
+        """Whether `path` holds poses, `images` with images, and `depth` or `gt_masks`: others write LLFF, too."""
         images = path / "images"
-        return _poses_file(path) is not None and images.is_dir() and bool(image_files(images))
+        known = any((path / name).is_dir() for name in (_DEPTHS, _MASKS))
+        return known and _poses_file(path) is not None and images.is_dir() and bool(image_files(images))
 
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose of the image's row; the identity where the camera is at rest, None where the row has none."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,11 +15,12 @@ from scopemap.calibration import read_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.decoding import decoded, read_decoded
-from scopemap.errors import InputError
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.rectification import DepthSensor
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FOLDER_RATE_HZ = 30.0
+_OWN_CALIBRATION = "camera.yaml"
 _COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
 
 
@@ -66,8 +68,8 @@ def read_depth16(file: Path) -> np.ndarray | None:
 class ImageFolder:
     """A folder of images; the layouts of data sets build on it.
 
-    The calibration is `camera.yaml` beside the images where it is there. Time stamps are frame number / 30 s. Raises
-    `InputError` where no image can be read.
+    The calibration is `camera.yaml` in the folder, else beside the images, where it is there. Time stamps are frame
+    number / 30 s. Raises `InputError` where no image can be read.
     """
 
     name = "images"
@@ -83,11 +85,13 @@ class ImageFolder:
         self.height, self.width = self._size()
         self.camera: CameraModel | None = None
         self.camera_source = ""
+        self.camera_fault: ScopemapError | None = None
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
         self.masks: Path | None = None
-        calibration_file = path / "camera.yaml"
-        if calibration_file.is_file():
+        own = (folder / _OWN_CALIBRATION for folder in (path, self.files[0].parent))
+        calibration_file = next((file for file in own if file.is_file()), None)
+        if calibration_file is not None:
             calibration = read_calibration(calibration_file, (self.width, self.height))
             self.camera, self.camera_source = calibration.camera, f"{calibration.source} beside the frames"
             self.depth_scale_mm = calibration.depth_scale_mm
@@ -131,6 +135,14 @@ class ImageFolder:
                 return image.shape[0], image.shape[1]
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
         raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
+
+    @contextmanager
+    def _making_camera(self) -> Iterator[None]:
+        """Keep what is wrong with the data set's camera in `camera_fault`: another one may have been given."""
+        try:
+            yield
+        except (CalibrationError, InputError) as fault:
+            self.camera_fault = fault
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:

@@ -31,13 +31,14 @@ _DEPTHS_PER_UNIT = 1000.0
 _TISSUE = 255
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _FOCAL_PER_WIDTH = (0.3, 5.0)
+_MOST_BYTES = 1 << 20
 
 
 class OneSlamFolder(ImageFolder):
     """A folder in OneSLAM's layout; `camera.yaml` beside `images` wins over calibration.json.
 
-    Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read,
-    `CalibrationError` for a calibration that cannot be or does not fit.
+    Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read;
+    a calibration that cannot be or does not fit is its `camera_fault`.
     """
 
     name = "oneslam"
@@ -45,10 +46,12 @@ class OneSlamFolder(ImageFolder):
     def __init__(self, path: Path) -> None:
         self._file_of = _numbered(image_files(path / "images") if (path / "images").is_dir() else [])
         super().__init__(path, list(self._file_of.values()))
-        stated = _read_calibration(path / _CALIBRATION)
-        if self.camera is None:
-            self.camera = _camera_of(stated, (self.width, self.height), path / _CALIBRATION)
-            self.camera_source = f"{_CALIBRATION} beside the frames, taken as of images without distortion"
+        stated: dict[str, Any] = {}
+        with self._making_camera():
+            stated = _read_calibration(path / _CALIBRATION)
+            if self.camera is None:
+                self.camera = _camera_of(stated, (self.width, self.height), path / _CALIBRATION)
+                self.camera_source = f"{_CALIBRATION} beside the frames, taken as of images without distortion"
         self._rate_hz = _rate_of(stated, path / _CALIBRATION)
         given = "FPS of calibration.json" if stated.get("FPS") is not None else "assumed: calibration.json has no FPS"
         self.notes = [f"time stamps: frame number / {self._rate_hz:g} s ({given})"]
@@ -65,9 +68,14 @@ class OneSlamFolder(ImageFolder):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `images` with images, and calibration.json."""
-        images = path / "images"
-        return (path / _CALIBRATION).is_file() and images.is_dir() and bool(image_files(images))
+        """Whether `path` holds `images` with images, and calibration.json with `intrinsics`."""
+        images, file = path / "images", path / _CALIBRATION
+        if not (file.is_file() and images.is_dir() and image_files(images)):
+            return False
+        try:
+            return "intrinsics" in _read_calibration(file)
+        except CalibrationError:
+            return False
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames as `ImageFolder` does, at the stated rate."""
@@ -153,7 +161,11 @@ def _numbered(files: list[Path]) -> dict[int, Path]:
 
 def _read_calibration(file: Path) -> dict[str, Any]:
     try:
-        stated = json.loads(file.read_text(encoding="utf-8"))
+        with file.open("rb") as opened:
+            content = opened.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise ValueError(f"it is larger than {_MOST_BYTES} bytes")
+        stated = json.loads(content.decode("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
     if not isinstance(stated, dict):

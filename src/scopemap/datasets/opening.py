@@ -113,7 +113,7 @@ def _open_source(path: Path, dataset: str | None) -> Reader:
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
     try:
-        path = _innermost(path)
+        path = _innermost(path, dataset) if path.is_dir() else path
     except PermissionError as error:
         raise InputError(f"reading {error.filename}: no permission to look into it") from None
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
@@ -122,25 +122,33 @@ def _open_source(path: Path, dataset: str | None) -> Reader:
     return DATASETS[kind](path)
 
 
-def _innermost(path: Path) -> Path:
-    """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only.
+def _innermost(path: Path, dataset: str | None) -> Path:
+    """Return the folder that the reader `dataset` recognises in `path`, `path` where none; None: that any reader does.
 
     Raises `InputError` where a folder holds several sequences of a data set.
     """
+    if dataset is None:
+        return _stepped_into(path, list(DATASETS.values()))
+    found = _stepped_into(path, [DATASETS[dataset]])
+    return found if DATASETS[dataset].recognises(found) else path
+
+
+def _stepped_into(path: Path, kinds: list[type[Reader]]) -> Path:
+    """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only."""
     for _ in range(_DEEPEST_NESTING):
-        if any(kind.recognises(path) for kind in DATASETS.values()):
+        if any(kind.recognises(path) for kind in kinds):
             return path
         inner = _folders_in(path)
         images = [folder for folder in inner if folder.name == "images"]
         if len(images or inner) != 1:
-            return _only_sequence_below(path) or path
+            return _only_sequence_below(path, kinds) or path
         path = (images or inner)[0]
     return path
 
 
-def _only_sequence_below(path: Path) -> Path | None:
+def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
     """Return the one sequence of a data set in the folders below, or None; several are an error that names them."""
-    kinds = [kind for kind in DATASETS.values() if kind not in (VideoFile, ImageFolder)]
+    kinds = [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
     level = _folders_in(path)
     for _ in range(_SEARCH_DEPTH):
         found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
@@ -162,6 +170,8 @@ def _calibration_of(source: Source, file: Path | str | None, fov_deg: float) -> 
     """Return the calibration, and whether the camera is known by it or only assumed."""
     if file is not None:
         return read_calibration(file, (source.width, source.height)), True
+    if source.camera_fault is not None:
+        raise source.camera_fault
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source), True
     if not 1 <= fov_deg <= 170:

@@ -12,12 +12,14 @@ from scopemap.calibration import fitted_to, read_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import CalibrationError
+from scopemap.errors import CalibrationError, ScopemapError
 from scopemap.frame import TruthQuality
 from scopemap.rectification import DepthSensor
 
 _OWN_CALIBRATION = "camera.yaml"
 _FOCAL_RANGE = (0.3, 5.0)
+# Even a picture that repeats the one before it takes more, with its place in the file's tables.
+_SMALLEST_FRAME_BYTES = 16
 
 
 class PosedVideo:
@@ -26,6 +28,7 @@ class PosedVideo:
     path : the folder. video : the file. aspect : width over height of one view, of which the video may hold two, above
     or beside each other, the left one first; None: the whole image. A frame's time stamp is its number over the
     video's rate, so that it is known before anything is decoded. `camera.yaml` in the folder is its calibration.
+    A header that claims more frames than the file has room for is not believed: `count` is None then.
 
     Raises `InputError` for a video that cannot be read, `CalibrationError` for a calibration that does not fit.
     """
@@ -37,14 +40,15 @@ class PosedVideo:
         self._video = VideoFile(video)
         self.width, self.height, view = _view(self._video.width, self._video.height, aspect)
         self.pixel_aspect = self._video.pixel_aspect
-        self.count: int | None = self._video.count
         self.camera: CameraModel | None = None
         self.camera_source = ""
+        self.camera_fault: ScopemapError | None = None
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
         self.masks: Path | None = None
         self.notes = [f"time stamps: frame number / {self._video.rate_hz:g} s", f"the view used: {view}"]
         self.warnings = self._video.warnings
+        self.count = self._believed_count(video)
         self.poses: dict[int, np.ndarray] = {}
         own = path / _OWN_CALIBRATION
         if own.is_file():
@@ -58,7 +62,7 @@ class PosedVideo:
             yield SourceFrame(frame.index, self._time_s(frame.index), rgb)
 
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
-        """Return number and time of the selected frames, as many as the header claims; None where no pose is known."""
+        """Return number and time of the selected frames, as the header counts; None without poses or count."""
         if self.count is None or not self.poses:
             return None
         return [(number, self._time_s(number)) for number in range(self.count)[selection]]
@@ -71,6 +75,17 @@ class PosedVideo:
         """Return the pose, without depth; None where the frame has none."""
         pose = self.pose(index)
         return None if pose is None else SourceTruth(pose, None, self.quality)
+
+    def _believed_count(self, video: Path) -> int | None:
+        """Return the header's count of frames, None (for the video, too) where the file has no room for so many."""
+        claimed, size = self._video.count, video.stat().st_size
+        if claimed is not None and claimed > size / _SMALLEST_FRAME_BYTES:
+            self._video.count = None
+            self.warnings.append(
+                f"{video.name} claims {claimed} frames, for which its {size} bytes have no room: how many it holds is "
+                "not known, nor a true trajectory before it is read"
+            )
+        return self._video.count
 
     def _calibrate(self, camera: CameraModel, file: Path) -> None:
         """Take `camera`, read from `file`, brought to the size of the view."""

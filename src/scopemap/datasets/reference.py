@@ -9,7 +9,7 @@ from scopemap.trajectory import Trajectory
 
 
 def reference_trajectory(sequence: Sequence) -> Trajectory | None:
-    """Return the true poses of the sequence's selected frames, or None where its source knows none.
+    """Return the true poses of the sequence's selected frames; None where none, or not which frames, are known.
 
     `indices` and `times_s` are those of the frames; a frame without a true pose is left out. What the data set holds is
     what is returned: frames that later turn out unreadable are among it. Raises `InputError` for unreadable poses.

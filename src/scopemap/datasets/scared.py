@@ -20,7 +20,7 @@ from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, image_files
 from scopemap.datasets.scared_files import KeyframeTruth, calibration_camera, read_frame_data
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.rectification import DepthSensor
 
 OWN_CALIBRATION = "camera.yaml"
@@ -58,6 +58,7 @@ class ScaredKeyframe:
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
         self.masks: Path | None = None
+        self.camera_fault: ScopemapError | None = None
         self.camera_source = ""
         self._calibrate()
         scale_mm = self.depth_scale_mm or 1.0

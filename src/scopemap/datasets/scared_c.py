@@ -21,7 +21,7 @@ from scopemap.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.datasets.scared import OWN_CALIBRATION
 from scopemap.datasets.scared_files import KeyframeTruth, read_frame_data
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.rectification import DepthSensor
 
 _INTRINSICS = "intrinsics_colmap.yaml"
@@ -55,6 +55,7 @@ class ScaredCKeyframe:
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
         self.masks: Path | None = None
+        self.camera_fault: ScopemapError | None = None
         self.camera, self.camera_source = self._calibrated()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(path, self._data, (self.width, self.height), "sfm", scale_mm)
@@ -126,7 +127,9 @@ class ScaredCKeyframe:
             self.depth_scale_mm = calibration.depth_scale_mm
             return calibration.camera, f"{calibration.source} beside the frames"
         if not (self.path / _INTRINSICS).is_file():
-            raise CalibrationError(f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)")
+            missing = f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)"
+            self.camera_fault = CalibrationError(missing)
+            return None, ""
         pinhole = read_calibration(self.path / _INTRINSICS, size).camera.central
         camera = replace(pinhole, cx=pinhole.cx - _COLMAP_CENTRE_PX, cy=pinhole.cy - _COLMAP_CENTRE_PX)
         return camera, f"{_INTRINSICS}, pixel centres moved by half a pixel"

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from scopemap.camera import CameraModel, PinholeCamera
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.frame import Frame, Truth, TruthQuality
 from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera
 
@@ -61,6 +61,7 @@ class Source(Protocol):
     count : number of frames, or None where only reading on would tell.
     camera : the camera of the images, or None where it is unknown.
     camera_source : how the camera is known, one phrase, or "".
+    camera_fault : why the data set's own camera cannot be used, None where it can.
     pixel_aspect : width of a pixel over its height.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
@@ -75,6 +76,7 @@ class Source(Protocol):
     count: int | None
     camera: CameraModel | None
     camera_source: str
+    camera_fault: ScopemapError | None
     pixel_aspect: float
     depth_scale_mm: float | None
     depth_sensor: DepthSensor | None

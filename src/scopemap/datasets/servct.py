@@ -33,7 +33,7 @@ class ServCtFolder(ImageFolder):
     """The left pictures of one experiment; a `camera.yaml` beside `Left_rectified` wins over the calibration files.
 
     Each picture has a calibration of its own. Where these differ, pictures and depth are brought to the camera of the
-    first. Raises `InputError` and `CalibrationError` for one that cannot be used.
+    first. Raises `InputError` for pictures that cannot be used; a calibration that cannot is its `camera_fault`.
     """
 
     name = "serv-ct"
@@ -45,7 +45,8 @@ class ServCtFolder(ImageFolder):
         self._truth = next((path / name for name in _TRUTHS if (path / name / "DepthL").is_dir()), None)
         self._rectifiers: dict[int, Rectifier] = {}
         if self.camera is None:
-            self._calibrate()
+            with self._making_camera():
+                self._calibrate()
         self.notes.append("stereo pictures, no video: the left ones are used, no pose is known, what they show differs")
         if self._truth is not None:
             scan = "the CT scan" if self._truth.name.endswith("_CT") else "a scanner with structured light"

@@ -44,17 +44,8 @@ class SevenScenesFolder(ImageFolder):
         super().__init__(path, [file for file in image_files(path) if file.stem.endswith(".color")])
         self._file_of = dict(zip(self.numbers, self.files, strict=True))
         if self.camera is None:
-            file = path / "camera-intrinsics.txt"
-            stated = read_intrinsics(file, (self.width, self.height)) if file.is_file() else None
-            if stated is None or stated == DEPTH_CAMERA.resized(self.width, self.height):
-                self._check_aspect()
-                self.camera = COLOUR_CAMERA.resized(self.width, self.height)
-                self.camera_source = "a Kinect's nominal colour camera"
-                self.depth_sensor = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
-                self.notes.append("depth and poses are the depth camera's: brought to the colour camera beside it")
-            else:
-                self.camera, self.camera_source = stated, "camera-intrinsics.txt"
-                self.notes.append("camera-intrinsics.txt is not a Kinect's: depth is taken as registered to colour")
+            with self._making_camera():
+                self._use_camera()
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -81,6 +72,19 @@ class SevenScenesFolder(ImageFolder):
             return None
         depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
         return np.where(np.isin(values, _UNKNOWN), np.nan, depth_mm).astype(np.float32)
+
+    def _use_camera(self) -> None:
+        file = self.path / "camera-intrinsics.txt"
+        stated = read_intrinsics(file, (self.width, self.height)) if file.is_file() else None
+        if stated is None or stated == DEPTH_CAMERA.resized(self.width, self.height):
+            self._check_aspect()
+            self.camera = COLOUR_CAMERA.resized(self.width, self.height)
+            self.camera_source = "a Kinect's nominal colour camera"
+            self.depth_sensor = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
+            self.notes.append("depth and poses are the depth camera's: brought to the colour camera beside it")
+        else:
+            self.camera, self.camera_source = stated, "camera-intrinsics.txt"
+            self.notes.append("camera-intrinsics.txt is not a Kinect's: depth is taken as registered to colour")
 
     def _check_aspect(self) -> None:
         if self.width * COLOUR_CAMERA.height != self.height * COLOUR_CAMERA.width:

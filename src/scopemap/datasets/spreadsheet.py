@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import zipfile
 import zlib
 from pathlib import Path
 from xml.etree import ElementTree
 
-from scopemap.datasets.numbered import LARGEST_FILE_BYTES
 from scopemap.errors import InputError
 
 _SHEET, _STRINGS = "xl/worksheets/sheet1.xml", "xl/sharedStrings.xml"
+# Some hundred thousand cells; as a tree they take many times as much.
+_LARGEST_MEMBER_BYTES = 16 << 20
 _DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, ElementTree.ParseError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, ElementTree.ParseError),
     *(OSError, EOFError, LookupError, RuntimeError, ValueError),
 )
 
@@ -37,8 +39,10 @@ def read_sheet(file: Path) -> list[tuple[int, dict[str, str]]]:
 
 def _xml(archive: zipfile.ZipFile, name: str, file: Path) -> ElementTree.Element:
     size = archive.getinfo(name).file_size
-    if size > LARGEST_FILE_BYTES:
-        raise InputError(f"reading {file}: its {name} holds {size >> 20} MB; is it damaged?")
+    if size > _LARGEST_MEMBER_BYTES:
+        raise InputError(
+            f"reading {file}: its {name} holds {size >> 20} MB, expected {_LARGEST_MEMBER_BYTES >> 20} at most"
+        )
     return ElementTree.fromstring(archive.read(name))
 
 

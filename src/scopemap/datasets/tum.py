@@ -48,8 +48,9 @@ _Listing = list[tuple[float, str]]
 class TumRgbdFolder(ImageFolder):
     """One TUM RGB-D sequence, or a folder in its layout; `camera.yaml` beside rgb.txt wins over published constants.
 
-    Images that rgb.txt names but that are not there are left out with a warning; the others keep their numbers. Raises
-    `InputError` for lists and poses that cannot be read, `CalibrationError` for images that no camera fits.
+    Images that a list names but that are not there are left out with a warning; the others keep their numbers. Names
+    that are absolute or lead out of the folder count as not there. Raises `InputError` for
+    lists and poses that cannot be read; images that no published camera fits are its `camera_fault`.
     """
 
     name = "tum"
@@ -57,7 +58,7 @@ class TumRgbdFolder(ImageFolder):
     def __init__(self, path: Path) -> None:
         listed = _read_list(path / _IMAGES)
         ordered = sorted(listed)
-        there = {number: entry for number, entry in enumerate(ordered) if _is_there(path / entry[1])}
+        there = {number: entry for number, entry in enumerate(ordered) if _is_there(path, entry[1])}
         if not there:
             raise InputError(f"reading {path / _IMAGES}: none of the {len(ordered)} images that it names is there")
         super().__init__(path, [path / name for _, name in there.values()])
@@ -73,8 +74,9 @@ class TumRgbdFolder(ImageFolder):
         self._depth_is_checked = room is not None  # rooms are deeper than what an endoscope sees
         if room is not None and self.camera is None:
             number = room[1] or room[2]
-            self.camera = fitted_to(CAMERAS[number], (self.width, self.height), f"shipped for freiburg{number}")
-            self.camera_source = f"published calibration of freiburg{number}"
+            with self._making_camera():
+                self.camera = fitted_to(CAMERAS[number], (self.width, self.height), f"shipped for freiburg{number}")
+                self.camera_source = f"published calibration of freiburg{number}"
         self._depth_of = self._associated_depth({name: number for number, (_, name) in there.items()})
         self._pose_of = self._associated_poses()
 
@@ -119,11 +121,13 @@ class TumRgbdFolder(ImageFolder):
     def _associated_depth(self, number_of: dict[str, int]) -> dict[int, Path]:
         """Return the depth files of frames: the pairs of associations.txt, else the nearest in time."""
         if (self.path / _PAIRS).is_file():
-            pairs = _read_pairs(self.path / _PAIRS, number_of)
+            named = _read_pairs(self.path / _PAIRS, number_of)
+            pairs = {number: name for number, name in named.items() if _is_there(self.path, name)}
+            self._tell_missing(_PAIRS, len(named), len(pairs))
             how = _PAIRS
         elif (self.path / _DEPTHS).is_file():
             listed = sorted(_read_list(self.path / _DEPTHS))
-            there = [(stamp, name) for stamp, name in listed if _is_there(self.path / name)]
+            there = [(stamp, name) for stamp, name in listed if _is_there(self.path, name)]
             self._tell_missing(_DEPTHS, len(listed), len(there))
             pairs = {number: there[row][1] for number, row in self._nearest([stamp for stamp, _ in there]).items()}
             how = f"the nearest in time, less than {ASSOCIATED_WITHIN_S:g} s away"
@@ -280,6 +284,8 @@ def _number(text: str) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _is_there(file: Path) -> bool:
+def _is_there(folder: Path, name: str) -> bool:
+    """Whether `name`, which anyone may have written, is that of a file below `folder`; links are the user's own."""
+    inside = not os.path.isabs(name) and not os.path.normpath(name).startswith("..")
     # Path.is_file raises for names that no file system allows.
-    return os.path.isfile(file)
+    return inside and os.path.isfile(folder / name)

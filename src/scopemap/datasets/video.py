@@ -13,7 +13,7 @@ from av.video.stream import VideoStream
 
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
-from scopemap.errors import InputError
+from scopemap.errors import InputError, ScopemapError
 from scopemap.rectification import DepthSensor
 
 DEFAULT_RATE_HZ = 30.0
@@ -36,6 +36,7 @@ class VideoFile:
         self.path = path
         self.camera: CameraModel | None = None
         self.camera_source = ""
+        self.camera_fault: ScopemapError | None = None
         self.depth_scale_mm: float | None = None
         self.depth_sensor: DepthSensor | None = None
         self.masks: Path | None = None

@@ -1,0 +1,178 @@
+"""What data sets claim beyond reason is refused before it takes memory; names that lead outside are not followed."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from pathlib import Path
+
+import pytest
+from drawn_inputs import picture, save
+from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
+from test_datasets_endomapper_sim import buffer, write_exr
+from test_datasets_endoslam import write_xlsx
+from test_datasets_stereomis import FRAMES, write_stereomis
+from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
+
+from scopemap.datasets import colmap_archive, open_sequence, posed_video
+from scopemap.datasets.colmap_archive import read_largest_model
+from scopemap.datasets.exr import read_exr_red
+from scopemap.datasets.reference import reference_trajectory
+from scopemap.datasets.spreadsheet import read_sheet
+from scopemap.datasets.survey import survey
+from scopemap.datasets.video import VideoFile
+from scopemap.errors import InputError
+
+MODEL = "33/sparse/0/images.bin"
+
+
+def write_damaged_lzma(file: Path, member: str, content: bytes) -> None:
+    """Write a zip of one LZMA-compressed member whose compressed bytes are damaged from the first on."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr(member, content)
+        size = archive.getinfo(member).compress_size
+    start = 30 + len(member) + 4 + 5  # behind the headers of the member and of its LZMA stream
+    damaged = bytearray(file.read_bytes())
+    damaged[start : start + size - 9] = b"\xff" * (size - 9)
+    file.write_bytes(damaged)
+
+
+# ---- workbooks
+
+
+def test_a_damaged_lzma_workbook_is_one_sentence(tmp_path: Path) -> None:
+    write_damaged_lzma(tmp_path / "a.xlsx", "xl/worksheets/sheet1.xml", bytes(range(256)) * 8)
+    with pytest.raises(InputError, match=r"a\.xlsx: no Excel workbook, or damaged"):
+        read_sheet(tmp_path / "a.xlsx")
+
+
+def test_a_workbook_of_much_text_is_refused(tmp_path: Path) -> None:
+    file = write_xlsx(tmp_path / "a.xlsx", [["a" * (17 << 20)]])
+    with pytest.raises(InputError, match=r"a\.xlsx: its xl/sharedStrings\.xml holds 17 MB, expected 16 at most"):
+        read_sheet(file)
+
+
+# ---- COLMAP's archives
+
+
+def test_a_damaged_lzma_model_is_one_sentence(tmp_path: Path) -> None:
+    write_damaged_lzma(tmp_path / "a.zip", MODEL, images_bin([1, 2, 3]))
+    with pytest.raises(InputError, match=r"a\.zip: the archive is damaged or incomplete"):
+        read_largest_model(tmp_path / "a.zip")
+
+
+def test_a_model_that_compresses_beyond_reason_is_refused(tmp_path: Path) -> None:
+    write_models(tmp_path / "a.zip", {0: images_bin([1]) + bytes(17 << 20)})
+    with pytest.raises(InputError, match=r"a\.zip: .*images\.bin claims 17 MB in \d+ bytes, expected 1024 MB and 200"):
+        read_largest_model(tmp_path / "a.zip")
+
+
+def test_a_model_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert colmap_archive._LARGEST_MODEL_BYTES == 1 << 30
+    monkeypatch.setattr(colmap_archive, "_LARGEST_MODEL_BYTES", 100)
+    write_models(tmp_path / "a.zip", {0: images_bin([1, 2, 3])})
+    with pytest.raises(InputError, match=r"a\.zip: .*images\.bin claims"):
+        read_largest_model(tmp_path / "a.zip")
+
+
+def test_a_model_of_too_many_images_is_refused(tmp_path: Path) -> None:
+    write_models(tmp_path / "a.zip", {0: struct.pack("<Q", 1_000_001) + images_bin([1])[8:]})
+    with pytest.raises(InputError, match="claims 1000001 images, expected 1000000 at most"):
+        read_largest_model(tmp_path / "a.zip")
+
+
+def test_lists_are_read_as_far_as_is_reasonable(tmp_path: Path) -> None:
+    # Ten bytes a name: of both lists only the first MB counts, so they are equally long.
+    write_models(tmp_path / "a.zip", {0: images_bin([1]), 1: images_bin([2])})
+    with zipfile.ZipFile(tmp_path / "a.zip", "a", zipfile.ZIP_DEFLATED) as archive:
+        for number, count in ((0, 110_000), (1, 900_000)):
+            archive.writestr(f"33/cluster_list/{number}.txt", b"out11.png\n" * count)
+    assert read_largest_model(tmp_path / "a.zip").number == 0
+
+
+def test_64_sub_models_are_enough(tmp_path: Path) -> None:
+    write_models(tmp_path / "a.zip", dict.fromkeys(range(64), images_bin([1])))
+    assert read_largest_model(tmp_path / "a.zip").count == 64
+    write_models(tmp_path / "a.zip", dict.fromkeys(range(65), images_bin([1])))
+    with pytest.raises(InputError, match="it holds 65 sub-models, expected 64 at most"):
+        read_largest_model(tmp_path / "a.zip")
+
+
+# ---- OpenEXR
+
+
+def test_exr_shown_at_another_size_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.exr"
+    whole = write_exr(file, {"R": buffer(), "G": buffer(), "B": buffer()})
+    kind = b"displayWindow\0box2i\0" + struct.pack("<i", 16)
+    small, large = (kind + struct.pack("<4i", 0, 0, *last) for last in ((95, 71), (9999, 9999)))
+    assert small in whole
+    # FFmpeg would pass over the second one, which is of no type that it knows for it.
+    for header in (
+        large,
+        large + small.replace(b"box2i", b"box2x"),
+        kind.replace(b"display", b"desplay") + large[-16:],
+    ):
+        file.write_bytes(whole.replace(small, header))
+        with pytest.raises(InputError, match=r"shown at another|has two displayWindow|no displayWindow"):
+            read_exr_red(file)
+
+
+def test_exr_shares_the_limit_of_other_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exr(tmp_path / "a.exr", {"R": buffer(), "G": buffer(), "B": buffer()})
+    monkeypatch.setenv("SCOPEMAP_MAX_MEGAPIXELS", "0.001")
+    with pytest.raises(InputError, match=r"a\.exr: .*more than 0\.001 million pixels.*SCOPEMAP_MAX_MEGAPIXELS"):
+        read_exr_red(tmp_path / "a.exr")
+
+
+# ---- videos
+
+
+@pytest.mark.parametrize("layout", ["stereomis", "endomapper"])
+def test_a_count_of_frames_beyond_the_file_is_not_believed(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if layout == "stereomis":
+        folder = write_stereomis(tmp_path / "P1")
+    else:
+        folder = write_endomapper(tmp_path)
+        write_models(archive_of(folder), {0: images_bin([1, 2])})
+    monkeypatch.setattr("scopemap.datasets.video._claimed_frames", lambda *_: 2_000_000_000)
+    sequence = open_sequence(folder)
+    assert (sequence.source.name, sequence.count) == (layout, None)
+    assert sequence.source.stamps(slice(None)) is None
+    assert sequence.source.pose(0) is not None
+    assert [warning for warning in sequence.warnings if "claims 2000000000 frames" in warning] == sequence.warnings
+    assert reference_trajectory(sequence) is None
+    found = survey(sequence)
+    assert (found.announced, len(found.frames), found.stopped) == (None, FRAMES, "")
+    assert not any("breaks off" in warning for warning in found.warnings)
+
+
+def test_a_count_that_the_file_has_room_for_is_believed(tmp_path: Path) -> None:
+    folder = write_stereomis(tmp_path / "P1")
+    (video,) = folder.glob("*.mp4")
+    assert VideoFile(video).count == FRAMES < video.stat().st_size / posed_video._SMALLEST_FRAME_BYTES
+    assert open_sequence(folder).count == FRAMES
+
+
+# ---- lists of names
+
+
+@pytest.mark.parametrize("way", ["absolute", "above"])
+def test_names_that_lead_out_of_a_tum_folder_are_not_there(way: str, tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / ROOM)
+    outside = tmp_path / "outside.png"
+    save(outside, picture(1, SIZE))
+    name = {"absolute": str(outside), "above": "rgb/../../outside.png"}[way]
+    for file in ("rgb.txt", "depth.txt"):
+        replace_line(folder / file, 4, f"{STAMPS[1]:.6f} {name}")
+    sequence = open_sequence(folder)
+    assert sequence.source.numbers == [0, 2, 3]
+    assert any("rgb.txt: 1 of the 4 images that it names are not there" in text for text in sequence.warnings)
+    assert any("depth.txt: 1 of the 3 images that it names are not there" in text for text in sequence.warnings)
+    rows = [f"{STAMPS[n]:.6f} rgb/{STAMPS[n]:.6f}.png {STAMPS[n]:.6f} {name}\n" for n in (0, 2)]
+    (folder / "associations.txt").write_text("".join(rows))
+    sequence = open_sequence(folder)
+    assert sequence.source.truth(0).depth_mm is None
+    assert any("associations.txt: 2 of the 2 images" in text for text in sequence.warnings)
