@@ -15,10 +15,8 @@ import numpy as np
 from scopemap.calibration import fitted_to
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files
-from scopemap.datasets.sequence import SourceTruth
 from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
-from scopemap.frame import TruthQuality
 from scopemap.lenses import OmnidirectionalCamera
 from scopemap.trajectory import read_poses
 
@@ -58,7 +56,7 @@ class C3vdFolder(ImageFolder):
             )
         self._file_of = dict(zip(self.numbers, self.files, strict=True))
         # A calibration of its own marks a rendering; C3VD proper was registered to real video.
-        self._quality: TruthQuality = "registered" if self.camera is None else "exact"
+        self.quality = "registered" if self.camera is None else "exact"
         if self.camera is None:
             self._use_published(undistorted=folder == "color" and self._is_reduced())
 
@@ -70,10 +68,6 @@ class C3vdFolder(ImageFolder):
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose of the image's line in pose.txt."""
         return self.poses[index]
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and, where the image has such a file, depth."""
-        return SourceTruth(self.poses[index], self._depth_mm(index), self._quality)
 
     def _use_published(self, undistorted: bool) -> None:
         camera: CameraModel = UNDISTORTED_CAMERA if undistorted else CAMERA

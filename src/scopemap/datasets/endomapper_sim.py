@@ -9,8 +9,6 @@ The depth buffer v runs from 1 at 1 mm to 0 at 400 mm: the depth is 1 dm / (0.25
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from scopemap.calibration import fitted_to
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.exr import can_read_exr, read_exr_red
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.datasets.unity import mirrored, numbers_of, poses_of_rows
 from scopemap.errors import CalibrationError, InputError
 from scopemap.trajectories.text import text_lines
@@ -44,6 +41,7 @@ class EndoMapperSimFolder(ImageFolder):
     """One simulated sequence; `camera.yaml` beside it wins, and its `depth_scale` is the mm that a unit (dm) has."""
 
     name = "endomapper-sim"
+    quality = "exact"
 
     def __init__(self, path: Path) -> None:
         files = _numbered(path / "rgb", _IMAGE, ".png")
@@ -74,30 +72,16 @@ class EndoMapperSimFolder(ImageFolder):
             return False
         return any((path / "rgb").glob("image_*.png")) and any((path / "depth").glob("aov_image_*.exr"))
 
-    def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected pictures with the times of the trajectory."""
-        for frame in super().frames(selection):
-            yield replace(frame, time_s=self._time_s(frame.index))
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected pictures."""
-        return [(number, self._time_s(number)) for number in self.numbers[selection]]
-
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose in the row of the picture's number, or None."""
         return self._poses.get(index)
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth, each where it is known; None where neither is."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, "exact")
-
-    def _time_s(self, index: int) -> float:
+    def _time_s(self, number: int) -> float:
         """Return the time of a picture's row; behind the last one they follow each other in 1/30 s, as all do."""
         if not self._times_s:
-            return index / FOLDER_RATE_HZ
+            return number / FOLDER_RATE_HZ
         last = len(self._times_s) - 1
-        return self._times_s[min(index, last)] + max(index - last, 0) / FOLDER_RATE_HZ
+        return self._times_s[min(number, last)] + max(number - last, 0) / FOLDER_RATE_HZ
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self._depth_files.get(index)

@@ -16,7 +16,6 @@ import numpy as np
 from scopemap.calibration import fitted_to
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import SUFFIXES, ImageFolder, frame_number, image_files
-from scopemap.datasets.sequence import SourceTruth
 from scopemap.decoding import read_decoded
 from scopemap.errors import CalibrationError, InputError
 from scopemap.trajectories.poses import rigid
@@ -38,6 +37,7 @@ class EndoNerfFolder(ImageFolder):
     """
 
     name = "endonerf"
+    quality = "stereo"
 
     def __init__(self, path: Path) -> None:
         file, images = _poses_file(path), path / "images"
@@ -68,11 +68,6 @@ class EndoNerfFolder(ImageFolder):
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose of the image's row; the identity where the camera is at rest, None where the row has none."""
         return self._poses.get(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and, where the image has such a file, depth by stereo; None where neither is known."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, "stereo")
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self._depths.get(index)

@@ -10,8 +10,6 @@ endoscopic videos", arXiv 2006.16670.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,6 @@ from scopemap.camera import PinholeCamera
 from scopemap.datasets.endoslam_poses import POSE_FILES, CameraPath, find_poses, read_camera_path
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, frame_number, image_files
 from scopemap.datasets.intrinsics import read_intrinsics
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
 
@@ -57,6 +54,7 @@ class EndoSlamFolder(ImageFolder):
         depths = next((path / name for name in _DEPTHS if (path / name).is_dir()), None)
         self._depth_of = {frame_number(f): f for f in image_files(depths)} if depths is not None else {}
         rendered = bool(self._depth_of) or (file is not None and file.suffix.lower() == ".csv")
+        self.quality = "exact" if self._track is None else self._track.quality
         self._rate_hz, rate_source = _rate_hz(path, "UnityCam" if rendered else "HighCam" if file else "")
         stated = self._track is not None and self._track.times_s is not None
         times = "those of the poses" if stated else f"image number / {self._rate_hz:g} s ({rate_source})"
@@ -74,25 +72,9 @@ class EndoSlamFolder(ImageFolder):
         known = named or any((path / name).is_dir() for name in (_POSES[0], *_DEPTHS))
         return known and bool(_frame_files(path))
 
-    def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames with the time stamps of their poses, else by the camera's published rate."""
-        for frame in super().frames(selection):
-            yield replace(frame, time_s=self._time_s(frame.index))
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected frames."""
-        return [(number, self._time_s(number)) for number in self.numbers[selection]]
-
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose of the image's row; None where it has none."""
         return None if self._track is None else self._track.poses.get(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth, whichever is there; None where neither is."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        if pose is None and depth_mm is None:
-            return None
-        return SourceTruth(pose, depth_mm, "exact" if self._track is None else self._track.quality)
 
     def _time_s(self, number: int) -> float:
         times_s = None if self._track is None else self._track.times_s

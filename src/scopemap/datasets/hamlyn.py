@@ -15,7 +15,6 @@ import numpy as np
 
 from scopemap.datasets.images import ImageFolder, image_files, read_depth16
 from scopemap.datasets.intrinsics import read_intrinsics
-from scopemap.datasets.sequence import SourceTruth
 from scopemap.frame import TruthQuality
 
 _INTRINSICS = "intrinsics.txt"
@@ -27,7 +26,7 @@ class HamlynFolder(ImageFolder):
 
     name = "hamlyn"
     _images, _depths = "image01", "depth01"
-    _quality: TruthQuality = "stereo"
+    quality: TruthQuality = "stereo"
     _origin = "stereo matching, no sensor"
 
     def __init__(self, path: Path) -> None:
@@ -46,13 +45,12 @@ class HamlynFolder(ImageFolder):
         images = path / "image01"
         return images.is_dir() and bool(image_files(images))
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return the depth that lies beside the image, without a pose; None where there is none."""
+    def _depth_mm(self, index: int) -> np.ndarray | None:
         values = read_depth16(self.path / self._depths / f"{self._file_of[index].stem}.png")
         if values is None:
             return None
         depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
-        return SourceTruth(None, np.where(values > 0, depth_mm, np.nan).astype(np.float32), self._quality)
+        return np.where(values > 0, depth_mm, np.nan).astype(np.float32)
 
     def _intrinsics_file(self) -> Path | None:
         sequence = self.path.absolute()
@@ -71,7 +69,7 @@ class HamlynTrackingFolder(HamlynFolder):
 
     name = "hamlyn-tracking"
     _images, _depths = "color", "depth"
-    _quality: TruthQuality = "predicted"
+    quality: TruthQuality = "predicted"
     _origin = "predicted by Endo-Depth, cut at 300 mm"
 
     @staticmethod

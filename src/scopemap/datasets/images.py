@@ -16,6 +16,7 @@ from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.decoding import decoded, read_decoded
 from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.frame import TruthQuality
 from scopemap.rectification import DepthSensor
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -74,6 +75,7 @@ class ImageFolder:
 
     name = "images"
     pixel_aspect = 1.0
+    quality: TruthQuality = "registered"
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
         self.path = path
@@ -114,19 +116,28 @@ class ImageFolder:
                     f"reading {file}: it is {width}x{height} px, those before it {self.width}x{self.height} px; "
                     "a sequence needs frames of one size"
                 )
-            yield SourceFrame(number, number / FOLDER_RATE_HZ, rgb, file.name)
+            yield SourceFrame(number, self._time_s(number), rgb, file.name)
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
         """Return number and time stamp of the selected frames, of files that turn out unreadable, too."""
-        return [(number, number / FOLDER_RATE_HZ) for number in self.numbers[selection]]
+        return [(number, self._time_s(number)) for number in self.numbers[selection]]
 
     def pose(self, index: int) -> np.ndarray | None:
         """A plain folder knows no pose."""
         return None
 
     def truth(self, index: int) -> SourceTruth | None:
-        """A plain folder knows no truth."""
+        """Return pose and depth, each where it is known; None where neither is. A plain folder knows none."""
+        pose, depth_mm = self.pose(index), self._depth_mm(index)
+        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        """What a data set knows of the depth of a frame, as in `SourceTruth`."""
         return None
+
+    def _time_s(self, number: int) -> float:
+        """When a frame was taken, s."""
+        return number / FOLDER_RATE_HZ
 
     def _size(self) -> tuple[int, int]:
         for file in self.files:

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ import numpy as np
 
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, frame_number, image_files, read_depth16
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.datasets.tum import read_stamped_poses, unlikely_depth
 from scopemap.decoding import read_decoded
 from scopemap.errors import CalibrationError, InputError
@@ -77,23 +74,12 @@ class OneSlamFolder(ImageFolder):
         except CalibrationError:
             return False
 
-    def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames as `ImageFolder` does, at the stated rate."""
-        for frame in super().frames(selection):
-            yield replace(frame, time_s=frame.index / self._rate_hz)
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected frames."""
-        return [(number, number / self._rate_hz) for number in self.numbers[selection]]
-
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose that is stamped with the frame's number, or None."""
         return self._poses.get(index)
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth, each where it is known; None where neither is."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, "registered")
+    def _time_s(self, number: int) -> float:
+        return number / self._rate_hz
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self._depth_of.get(index)

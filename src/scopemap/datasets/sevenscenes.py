@@ -16,7 +16,6 @@ import numpy as np
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files, read_depth16
 from scopemap.datasets.intrinsics import read_intrinsics
-from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.rectification import DepthSensor
@@ -59,15 +58,11 @@ class SevenScenesFolder(ImageFolder):
             return T_world_camera
         return T_world_camera @ inverse(self.depth_sensor.T_colour_depth)
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and measured depth."""
-        return SourceTruth(self.pose(index), self._depth_mm(self._beside(index, ".depth.png")), "registered")
-
     def _beside(self, index: int, ending: str) -> Path:
         return Path(self._file_of[index].as_posix().split(".color.")[0] + ending)
 
-    def _depth_mm(self, file: Path) -> np.ndarray | None:
-        values = read_depth16(file)
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        values = read_depth16(self._beside(index, ".depth.png"))
         if values is None:
             return None
         depth_mm = values * np.float32(self.depth_scale_mm or 1.0)

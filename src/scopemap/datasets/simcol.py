@@ -14,7 +14,6 @@ import numpy as np
 
 from scopemap.datasets.images import ImageFolder, frame_number, image_files
 from scopemap.datasets.intrinsics import read_intrinsics
-from scopemap.datasets.sequence import SourceTruth
 from scopemap.datasets.unity import mirrored, numbers_of, poses_of_rows
 from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
@@ -36,6 +35,7 @@ class SimColFolder(ImageFolder):
     """
 
     name = "simcol3d"
+    quality = "exact"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _frame_files(path))
@@ -57,11 +57,6 @@ class SimColFolder(ImageFolder):
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose of the image's line; None where it holds NaN, and where the poses are not there."""
         return self._poses.get(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth, whichever is there; None where neither is."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, "exact")
 
     def _read_poses(self) -> dict[int, np.ndarray]:
         files = _pose_files(self.path)

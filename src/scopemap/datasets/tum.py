@@ -12,7 +12,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,6 @@ import numpy as np
 from scopemap.calibration import fitted_to
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import ImageFolder, read_depth16
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
 from scopemap.errors import InputError
 from scopemap.lenses import OpenCvCamera
 from scopemap.trajectories.poses import are_frame_numbers
@@ -86,23 +85,12 @@ class TumRgbdFolder(ImageFolder):
         beside = (path / _DEPTHS).is_file() or (path / _POSES).is_file() or (path / "rgb").is_dir()
         return (path / _IMAGES).is_file() and beside
 
-    def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames as `ImageFolder` does, with the time stamps of rgb.txt."""
-        for frame in super().frames(selection):
-            yield replace(frame, time_s=self._times_s[frame.index])
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected frames."""
-        return [(number, self._times_s[number]) for number in self.numbers[selection]]
-
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose by motion capture; None where none was taken within 0.02 s of the image."""
         return self._pose_of.get(index)
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and measured depth, each where it is known; None where neither is."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, "registered")
+    def _time_s(self, number: int) -> float:
+        return self._times_s[number]
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self._depth_of.get(index)
