@@ -5,10 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +17,7 @@ from rich.table import Table
 
 from scopemap.cli.figures import without_nan
 from scopemap.cli.options import AsJson, Quiet
+from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
 
 if TYPE_CHECKING:
@@ -27,10 +25,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Data sets: list what is read, check one.", no_args_is_help=True)
 
-_SECONDS_BETWEEN_LINES = 10.0
 _COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
 _ASKED = "Whether "
-Progress = Callable[[int, int | None], None]
 
 
 @app.command("list")
@@ -81,7 +77,7 @@ def check(
     except ScopemapError as error:
         findings = [refusal(error)]
     else:
-        with _progress(quiet or as_json) as listener:
+        with count_progress("checking", "checked", silent=quiet or as_json) as listener:
             found = survey(sequence, listener)
         figures, findings = found.figures, findings_of(found)
     if as_json:
@@ -115,31 +111,3 @@ def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None
         console.print(table)
     counts = Counter(finding.severity for finding in findings)
     typer.echo(f"errors: {counts['error']}, warnings: {counts['warning']}")
-
-
-@contextmanager
-def _progress(silent: bool) -> Iterator[Progress | None]:
-    """Yield what shows (frames read, frames in all or None) on stderr; None if `silent`."""
-    if silent:
-        yield None
-    elif sys.stderr.isatty():
-        from rich.progress import Progress as Bar
-
-        with Bar(console=Console(stderr=True)) as bar:
-            task = bar.add_task("checking", total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-    else:
-        yield _Lines()
-
-
-class _Lines:
-    """One line now and then."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-
-    def __call__(self, done: int, total: int | None) -> None:
-        now = time.perf_counter()
-        if now - self._last >= _SECONDS_BETWEEN_LINES or done == total:
-            self._last = now
-            typer.echo(f"checked {done}{f' of {total}' if total else ''} frames", err=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
-from scopemap.cli.progress import render_progress, run_progress
+from scopemap.cli.progress import count_progress, run_progress
 
 if TYPE_CHECKING:
     from scopemap.demonstration import Figures
@@ -38,7 +38,7 @@ def demo(
     started = time.perf_counter()
     config = demonstration.demo_config(parse_settings(settings or []))
     demonstration.prepare_out(out, overwrite=overwrite)
-    with render_progress(silent) as progress:
+    with count_progress("rendering", "rendered", silent=silent) as progress:
         rendered = demonstration.render(out, demonstration.PHANTOM, progress)
     _tell(f"{'rendered' if rendered else 'using the earlier'} phantom in {out / 'phantom'}; reconstructing it", silent)
     with run_progress(demonstration.PHANTOM.frames, silent=silent) as observers:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_size
-from scopemap.cli.progress import render_progress
+from scopemap.cli.progress import count_progress
 
 
 def phantom(
@@ -46,7 +46,7 @@ def phantom(
         loop=loop,
         events=parse_events(events),
     ).with_settings(parse_settings(settings or []))
-    with render_progress(quiet or as_json) as progress:
+    with count_progress("rendering", "rendered", silent=quiet or as_json) as progress:
         write_phantom(spec, folder, progress)
     _report(folder, as_json, quiet)
 

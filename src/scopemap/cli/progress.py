@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from scopemap.pipeline import Step
 
 _SECONDS_BETWEEN_LINES = 10.0
-_RENDERED_LINES = 10
 
 
 @contextmanager
@@ -87,8 +86,8 @@ class _Lines:
 
 
 @contextmanager
-def render_progress(silent: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Yield what shows (done, total) frames of a phantom being rendered, on stderr; None if `silent`."""
+def count_progress(doing: str, done: str, *, silent: bool) -> Iterator[Callable[[int, int | None], None] | None]:
+    """Yield what shows (frames done, in all or None) on stderr, in these words; None if `silent`."""
     if silent:
         yield None
     elif sys.stderr.isatty():
@@ -96,12 +95,20 @@ def render_progress(silent: bool) -> Iterator[Callable[[int, int], None] | None]
         from rich.progress import Progress
 
         with Progress(console=Console(stderr=True)) as bar:
-            task = bar.add_task("rendering", total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
+            task = bar.add_task(doing, total=None)
+            yield lambda count, total: bar.update(task, completed=count, total=total)
     else:
-        yield _print_rendered
+        yield _CountLines(done)
 
 
-def _print_rendered(done: int, total: int) -> None:
-    if done == total or done % max(total // _RENDERED_LINES, 1) == 0:
-        typer.echo(f"rendered {done} of {total} frames", err=True)
+class _CountLines:
+    """One line now and then."""
+
+    def __init__(self, done: str) -> None:
+        self._done, self._last = done, time.perf_counter()
+
+    def __call__(self, count: int, total: int | None) -> None:
+        now = time.perf_counter()
+        if now - self._last >= _SECONDS_BETWEEN_LINES or count == total:
+            self._last = now
+            typer.echo(f"{self._done} {count}{f' of {total}' if total else ''} frames", err=True)

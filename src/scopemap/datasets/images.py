@@ -12,12 +12,10 @@ import cv2
 import numpy as np
 
 from scopemap.calibration import read_calibration
-from scopemap.camera import CameraModel
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.decoding import decoded, read_decoded
-from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
-from scopemap.rectification import DepthSensor
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FOLDER_RATE_HZ = 30.0
@@ -66,7 +64,7 @@ def read_depth16(file: Path) -> np.ndarray | None:
     return values
 
 
-class ImageFolder:
+class ImageFolder(KnowsNothing):
     """A folder of images; the layouts of data sets build on it.
 
     The calibration is `camera.yaml` in the folder, else beside the images, where it is there. Time stamps are frame
@@ -74,7 +72,6 @@ class ImageFolder:
     """
 
     name = "images"
-    pixel_aspect = 1.0
     quality: TruthQuality = "registered"
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
@@ -85,12 +82,6 @@ class ImageFolder:
         self.notes = [f"time stamps: frame number / {FOLDER_RATE_HZ:g} s (the folder holds none)"]
         self.warnings: list[str] = []
         self.height, self.width = self._size()
-        self.camera: CameraModel | None = None
-        self.camera_source = ""
-        self.camera_fault: ScopemapError | None = None
-        self.depth_scale_mm: float | None = None
-        self.depth_sensor: DepthSensor | None = None
-        self.masks: Path | None = None
         own = (folder / _OWN_CALIBRATION for folder in (path, self.files[0].parent))
         calibration_file = next((file for file in own if file.is_file()), None)
         if calibration_file is not None:

@@ -10,11 +10,10 @@ import numpy as np
 
 from scopemap.calibration import fitted_to, read_calibration
 from scopemap.camera import CameraModel
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import CalibrationError, ScopemapError
+from scopemap.errors import CalibrationError
 from scopemap.frame import TruthQuality
-from scopemap.rectification import DepthSensor
 
 _OWN_CALIBRATION = "camera.yaml"
 _FOCAL_RANGE = (0.3, 5.0)
@@ -22,7 +21,7 @@ _FOCAL_RANGE = (0.3, 5.0)
 _SMALLEST_FRAME_BYTES = 16
 
 
-class PosedVideo:
+class PosedVideo(KnowsNothing):
     """One view of a folder's video, with the poses that a data set fills in; no depth.
 
     path : the folder. video : the file. aspect : width over height of one view, of which the video may hold two, above
@@ -40,12 +39,6 @@ class PosedVideo:
         self._video = VideoFile(video)
         self.width, self.height, view = _view(self._video.width, self._video.height, aspect)
         self.pixel_aspect = self._video.pixel_aspect
-        self.camera: CameraModel | None = None
-        self.camera_source = ""
-        self.camera_fault: ScopemapError | None = None
-        self.depth_scale_mm: float | None = None
-        self.depth_sensor: DepthSensor | None = None
-        self.masks: Path | None = None
         self.notes = [f"time stamps: frame number / {self._video.rate_hz:g} s", f"the view used: {view}"]
         self.warnings = self._video.warnings
         self.count = self._believed_count(video)

@@ -18,10 +18,9 @@ from scopemap.calibration import read_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, image_files
 from scopemap.datasets.scared_files import KeyframeTruth, calibration_camera, read_frame_data
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
+from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import CalibrationError, InputError, ScopemapError
-from scopemap.rectification import DepthSensor
+from scopemap.errors import CalibrationError, InputError
 
 OWN_CALIBRATION = "camera.yaml"
 _CALIBRATIONS = ("endoscope_calibration.yaml", "camera_calibration.yaml")
@@ -35,14 +34,13 @@ _STACKED_ASPECT = 1.4
 _MOST_OFF_CENTRE = 0.25
 
 
-class ScaredKeyframe:
+class ScaredKeyframe(KnowsNothing):
     """The left view of one keyframe's video, with its true poses and depth where they lie beside it.
 
     Raises `InputError` for a keyframe that is a single picture, and `CalibrationError` for one that does not fit.
     """
 
     name = "scared"
-    pixel_aspect = 1.0
 
     def __init__(self, path: Path) -> None:
         self.path = _keyframe(path)
@@ -54,12 +52,6 @@ class ScaredKeyframe:
         self.warnings += _faults_of(self.path) + self._data.faults
         self._numbers = self._common_numbers()
         self.count: int | None = self._pictures.count if self._numbers is None else len(self._numbers)
-        self.camera: CameraModel | None = None
-        self.depth_scale_mm: float | None = None
-        self.depth_sensor: DepthSensor | None = None
-        self.masks: Path | None = None
-        self.camera_fault: ScopemapError | None = None
-        self.camera_source = ""
         self._calibrate()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(self.path, self._data, (self.width, self.height), "kinematic", scale_mm)

@@ -20,9 +20,8 @@ from scopemap.datasets.images import FOLDER_RATE_HZ, decoded_image
 from scopemap.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.datasets.scared import OWN_CALIBRATION
 from scopemap.datasets.scared_files import KeyframeTruth, read_frame_data
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
-from scopemap.errors import CalibrationError, InputError, ScopemapError
-from scopemap.rectification import DepthSensor
+from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.errors import CalibrationError, InputError
 
 _INTRINSICS = "intrinsics_colmap.yaml"
 _LOG = "frame_log.json"
@@ -30,14 +29,13 @@ _LOG = "frame_log.json"
 _COLMAP_CENTRE_PX = 0.5
 
 
-class ScaredCKeyframe:
+class ScaredCKeyframe(KnowsNothing):
     """The frames of one keyframe that COLMAP registered, read out of their archive one at a time.
 
     Raises `InputError` where there are no frames, and `CalibrationError` for intrinsics that do not fit.
     """
 
     name = "scared-c"
-    pixel_aspect = 1.0
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -52,10 +50,6 @@ class ScaredCKeyframe:
         times = "those of frame_data" if self._data.times_s else f"frame number / {FOLDER_RATE_HZ:g} s"
         self.notes = [f"time stamps: {times}", "truth: COLMAP's poses, scaled to the scan of the keyframe"]
         self.height, self.width = self._size()
-        self.depth_scale_mm: float | None = None
-        self.depth_sensor: DepthSensor | None = None
-        self.masks: Path | None = None
-        self.camera_fault: ScopemapError | None = None
         self.camera, self.camera_source = self._calibrated()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(path, self._data, (self.width, self.height), "sfm", scale_mm)

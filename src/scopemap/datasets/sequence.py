@@ -97,6 +97,18 @@ class Source(Protocol):
         """Return what is known of the frame with this `SourceFrame.index`, or None."""
 
 
+class KnowsNothing:
+    """What a source says beside its frames until it has something to say: see `Source`."""
+
+    pixel_aspect = 1.0
+    camera: CameraModel | None = None
+    camera_source = ""
+    camera_fault: ScopemapError | None = None
+    depth_scale_mm: float | None = None
+    depth_sensor: DepthSensor | None = None
+    masks: Path | None = None
+
+
 def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:
     """Return a pinhole camera with horizontal focal length `focal_px` and its axis through the image's centre."""
     cx, cy = (source.width - 1) / 2, (source.height - 1) / 2

@@ -11,10 +11,8 @@ import numpy as np
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from scopemap.camera import CameraModel
-from scopemap.datasets.sequence import SourceFrame, SourceTruth
-from scopemap.errors import InputError, ScopemapError
-from scopemap.rectification import DepthSensor
+from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.errors import InputError
 
 DEFAULT_RATE_HZ = 30.0
 # Headers round durations and count pictures that are never shown: less than this is not a video that breaks off.
@@ -23,7 +21,7 @@ _MISSING_SHARE, _MISSING_FRAMES = 0.02, 2
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 
 
-class VideoFile:
+class VideoFile(KnowsNothing):
     """A video; frame number = order of decoding, time stamps from the stream.
 
     A video that breaks off, or holds damaged pictures, is used as far as it goes; `warnings` says so once it was read.
@@ -34,12 +32,6 @@ class VideoFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.camera: CameraModel | None = None
-        self.camera_source = ""
-        self.camera_fault: ScopemapError | None = None
-        self.depth_scale_mm: float | None = None
-        self.depth_sensor: DepthSensor | None = None
-        self.masks: Path | None = None
         self.notes: list[str] = []
         self.warnings: list[str] = []
         first = [frame for _, frame in islice(self._decoded(), 2)]
