@@ -18,6 +18,7 @@ from scopemap.benchmark.scoring import default_protocol, pose_groups, score, wor
 from scopemap.benchmark.worker import RUN
 from scopemap.datasets import Sequence as Frames
 from scopemap.datasets import open_sequence
+from scopemap.datasets.reference import read_reference
 from scopemap.errors import InputError
 from scopemap.trajectory import Trajectory, Unit, read_trajectory
 
@@ -67,7 +68,9 @@ def _scored(place: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: U
         usual = default_protocol(frames).depth_range_mm
         figures = score(place, frames, protocol.model_copy(update={"depth_range_mm": usual}))
         return Shown(_result(place, sequence, name, figures), place, lambda: frames)
-    estimate, reference = read_trajectory(place, unit=unit), read_trajectory(truth, unit=unit)
+    estimate, reference = read_trajectory(place, unit=unit), read_reference(truth, unit=unit)
+    if reference is None:
+        raise InputError(f"comparing {place}: {truth} knows no true poses")
     figures = pose_groups(estimate, reference, protocol, protocol.align)[0]
     return Shown(_result(place, sequence, name, figures, estimate), place)
 

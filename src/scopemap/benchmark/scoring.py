@@ -148,7 +148,7 @@ def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consis
     """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
 
     True depth counts in the range that the data set's users evaluate (`DEPTH_RANGES_MM`). Raises `InputError` where the
-    run kept no depth, or was made with another camera than the data set gives.
+    run kept no depth, or was made with another camera than the data set gives, or the data set knows no depth.
     """
     depth = DepthReader(run)
     if not depth.present:
@@ -162,6 +162,8 @@ def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consis
     figures: Figures = {}
     if scaling is not None:
         figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}))
+        if not figures:
+            raise InputError(f"{truth} knows the true depth of no frame that {run} holds depth of")
     if consistency:
         figures |= _consistency(depth, sequence, read_trajectory(run), protocol)
     return figures

@@ -61,8 +61,8 @@ def evaluate(
     truth: Annotated[
         Path,
         typer.Option(
-            help="True poses: a data set's folder, or a trajectory file. With a run's mesh.ply and a true surface "
-            "there, the mesh is measured too, moved by the same alignment."
+            help="True poses: the folder of any data set's sequence, or a trajectory file. With a run's mesh.ply and a "
+            "true surface there, the mesh is measured too, moved by the same alignment."
         ),
     ],
     align: Annotated[
@@ -79,7 +79,7 @@ def evaluate(
         UnitChoice | None, typer.Option(help="The same for the truth; as --unit if left out.")
     ] = None,
     kind: Annotated[str, typer.Option(help="Form of the trajectory file where its content fits two.")] = "auto",
-    truth_kind: Annotated[str, typer.Option(help="The same for the truth.")] = "auto",
+    truth_kind: Annotated[str, typer.Option(help="The same for the truth, or the name of a data set.")] = "auto",
     paper_units: Annotated[
         bool, typer.Option("--paper-units", help="Also the figures of the paper's table 1, rotations in radians.")
     ] = False,
@@ -109,12 +109,19 @@ def evaluate(
     """
     if as_json and as_csv:
         raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
+    from scopemap.datasets.reference import read_reference
     from scopemap.evaluation.paper import paper_report
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.trajectory import read_trajectory
 
+    form = OutputForm.JSON if as_json else OutputForm.CSV if as_csv else OutputForm.LINE if quiet else OutputForm.TABLE
     estimate = read_trajectory(trajectory, unit=unit.value, kind=kind)
-    reference = read_trajectory(truth, unit=(truth_unit or unit).value, kind=truth_kind)
+    reference = read_reference(truth, unit=(truth_unit or unit).value, kind=truth_kind)
+    if reference is None:
+        if not (depth or consistency):
+            raise InputError(f"{truth} knows no true poses; if it knows depth: --depth median compares that alone")
+        show(_depths(trajectory, truth, depth, consistency=consistency), form)
+        return
     matched = match(estimate, reference, align.value, first=align_first)
     figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
     if paper_units:
@@ -125,8 +132,7 @@ def evaluate(
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
         _warn(matched)
-    form = OutputForm.LINE if quiet else OutputForm.TABLE
-    show(figures, OutputForm.JSON if as_json else OutputForm.CSV if as_csv else form)
+    show(figures, form)
 
 
 def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp: bool) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class OutputForm(Enum):
 
 
 def show(figures: dict[str, Any], form: OutputForm) -> None:
-    """Print the figures of a trajectory, and of the groups that stand in it as dictionaries."""
+    """Print the figures of a trajectory, if any, and of the groups that stand beside them as dictionaries."""
     if form is OutputForm.JSON:
         typer.echo(json.dumps(without_nan(figures), indent=2))
     elif form is OutputForm.CSV:
@@ -102,6 +102,8 @@ def _csv(figures: dict[str, Any]) -> str:
 
 
 def _one_line(figures: dict[str, Any]) -> str:
+    if "ate_rmse_mm" not in figures:  # no true poses: depth alone was measured
+        return ", ".join(f"{name} {_text(value)}" for name, value in _flat(figures) if isinstance(value, float))
     return (
         f"ATE {figures['ate_rmse_mm']:.3f} mm, rotation {figures['rotation_unaligned_mean_deg']:.2f} deg unaligned, "
         f"TLR {figures['tlr']:.3f} (align {figures['align']}, "
@@ -111,11 +113,12 @@ def _one_line(figures: dict[str, Any]) -> str:
 
 def _tables(figures: dict[str, Any]) -> None:
     console = Console()
-    title = (
-        f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
-        f"scale {figures['scale']:.5g}"
-    )
-    console.print(_table(title, {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}))
+    if "ate_rmse_mm" in figures:
+        title = (
+            f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
+            f"scale {figures['scale']:.5g}"
+        )
+        console.print(_table(title, {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}))
     for name, group in figures.items():
         if name == "paper":
             rows = {label: " +- ".join(_text(group[key]) for key in keys) for label, *keys in _PAPER_ROWS}

@@ -2,10 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
+from scopemap.datasets.opening import DATASETS, open_sequence
 from scopemap.datasets.sequence import Sequence
-from scopemap.trajectory import Trajectory
+from scopemap.errors import InputError, ScopemapError
+from scopemap.trajectories.opening import KINDS, holds_trajectory, open_trajectory
+from scopemap.trajectory import Trajectory, Unit
+
+
+def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory | None:
+    """Return the true poses of a data set's sequence, or of a trajectory file or folder; None where it knows none.
+
+    A folder is asked as a data set first: its reader knows which camera the poses are of. `unit` and `kind` are those
+    of `read_trajectory` and call for a trajectory; `kind` may be the name of a data set's reader, too. Raises
+    `InputError` where `path` is neither, `SettingsError` for an unknown `kind`.
+    """
+    path = Path(path)
+    is_trajectory = not path.is_dir() or holds_trajectory(path)
+    asked_for = kind in KINDS[1:] or (kind == "auto" and unit != "mm")
+    if not path.is_dir() or (is_trajectory and asked_for) or kind not in ("auto", *DATASETS):
+        return open_trajectory(path, unit, kind)
+    try:
+        sequence = open_sequence(path, dataset=None if kind == "auto" else kind)
+        reference = reference_trajectory(sequence)
+    except ScopemapError as fault:
+        if is_trajectory:
+            return open_trajectory(path, unit, kind)
+        raise InputError(f"no true poses in {path}: no trajectory was recognised, and as a data set: {fault}") from None
+    if reference is None:
+        return open_trajectory(path, unit, kind) if is_trajectory else None
+    return replace(reference, source=f"data set {sequence.source.name}, camera-to-world, mm")
 
 
 def reference_trajectory(sequence: Sequence) -> Trajectory | None:

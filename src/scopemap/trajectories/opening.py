@@ -75,6 +75,11 @@ def open_trajectory(path: Path, unit: Unit, kind: str) -> Trajectory:
     return (_reader_of_folder(path) if path.is_dir() else _reader_of_file(path))(path, unit)
 
 
+def holds_trajectory(folder: Path) -> bool:
+    """Whether a folder holds poses in a form that is recognised."""
+    return any(holds(folder) for _, holds, _ in _FOLDERS)
+
+
 def _reader_of_folder(folder: Path) -> Reader:
     found = [(name, reader) for name, holds, reader in _FOLDERS if holds(folder)]
     if not found:
