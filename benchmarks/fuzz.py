@@ -3,14 +3,16 @@
     python benchmarks/fuzz.py [--count 20000] [--seed 0] [--only NAME ...] [--again NUMBER]
 
 Takes the made-up copies of all layouts from the tests, damages one to three of their files (cut off, bytes changed,
-emptied, numbers replaced, lines doubled or swapped, files taken away, exchanged or renamed), opens what is left as a
-user would and reads all of it: frames, truth, depth files, masks. Anything that is neither success nor a
-`ScopemapError`, takes over 10 s or over 1 GB of memory is a finding, printed with the number that makes it again.
+emptied, numbers replaced, lines doubled or swapped, files taken away, exchanged or renamed; every other time a file
+inside an archive, which is closed again), opens what is left as a user would and reads all of it: frames, truth, depth
+files, masks, and what `datasets check` looks at. Anything that is neither success nor a `ScopemapError`, takes over
+10 s or over 1 GB of memory is a finding, printed with the number that makes it again.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import multiprocessing
 import random
 import re
@@ -18,10 +20,12 @@ import resource
 import shutil
 import signal
 import sys
+import tarfile
 import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -37,7 +41,9 @@ from drawn_datasets import WRITERS, write_cameras  # noqa: E402
 from scopemap.calibration import read_calibration  # noqa: E402
 from scopemap.config import DepthSettings  # noqa: E402
 from scopemap.datasets import open_sequence  # noqa: E402
+from scopemap.datasets.checking import check  # noqa: E402
 from scopemap.datasets.reference import reference_trajectory  # noqa: E402
+from scopemap.datasets.survey import survey  # noqa: E402
 from scopemap.depth.files import FilesDepth  # noqa: E402
 from scopemap.errors import ScopemapError  # noqa: E402
 from scopemap.mask_files import MaskFiles  # noqa: E402
@@ -47,7 +53,13 @@ MOST_MEMORY_KB = 1 << 20
 CALIBRATIONS = "calibrations"
 _STRANGE = ("nan", "inf", "-inf", "-1", "0", "1e308", "1e-320", "9" * 20, "", "x", "1,5", "0x10", "\u0661")
 _HOLLOW = (b"", b"\0" * 64, b"\n\n\n", b"%YAML:1.0\n---\n", b"<?xml version='1.0'?>", b"{}", b"[]")
+_TARS, _ZIPS = (".gz", ".tgz", ".tar"), (".zip", ".xlsx")
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+
+
+class TooSlowError(BaseException):
+    """Time is up; no reader that catches what damaged bytes end in may take this for a damage."""
+
 
 Damage: TypeAlias = Callable[[random.Random, Path], None]
 
@@ -122,10 +134,46 @@ def empty(chance: random.Random, file: Path) -> None:
     file.write_bytes(chance.choice(_HOLLOW))
 
 
+TO_CONTENT: tuple[Damage, ...] = (cut_off, change_bytes, replace_number, shuffle_lines, empty)
 DAMAGES: tuple[Damage, ...] = (
     *(cut_off, change_bytes, change_bytes, replace_number, replace_number, replace_number),
     *(shuffle_lines, exchange, take_away, rename, empty),
 )
+
+
+def damage_member(chance: random.Random, file: Path, members: dict[str, bytes]) -> str:
+    """Damage one of the `members` of an archive and write it anew; return what was done to which."""
+    name, damage = chance.choice(sorted(members)), chance.choice(TO_CONTENT)
+    with tempfile.TemporaryDirectory() as folder:
+        inner = Path(folder) / "member"
+        inner.write_bytes(members[name])
+        damage(chance, inner)
+        members[name] = inner.read_bytes()
+    if file.suffix in _ZIPS:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as zipped:
+            for member, content in members.items():
+                zipped.writestr(member, content)
+    else:
+        with tarfile.open(file, "w" if file.suffix == ".tar" else "w:gz") as archive:
+            for member, content in members.items():
+                header = tarfile.TarInfo(member)
+                header.size = len(content)
+                archive.addfile(header, io.BytesIO(content))
+    return f"{damage.__name__} {name} in"
+
+
+def members_of(file: Path) -> dict[str, bytes]:
+    """Return the files in an archive by name; nothing for other files and for archives that are damaged already."""
+    try:
+        if file.suffix in _ZIPS:
+            with zipfile.ZipFile(file) as zipped:
+                return {name: zipped.read(name) for name in zipped.namelist()}
+        if file.suffix in _TARS:
+            with tarfile.open(file) as archive:
+                return {m.name: archive.extractfile(m).read() for m in archive if m.isreg()}  # type: ignore[union-attr]
+    except Exception:
+        pass  # whatever an earlier damage has led to: it is the readers that are looked at here
+    return {}
 
 
 def damaged(number: int, template: Path, scratch: Path) -> str:
@@ -140,9 +188,14 @@ def damaged(number: int, template: Path, scratch: Path) -> str:
         # Few files say what a data set is, many are frames: let the former have their turn.
         kind = chance.choice(sorted({file.suffix for file in files}))
         file = chance.choice([file for file in files if file.suffix == kind])
-        damage = chance.choice(DAMAGES)
-        damage(chance, file)
-        done.append(f"{damage.__name__} {file.relative_to(scratch)}")
+        members = members_of(file) if chance.random() < 0.5 else {}
+        if members:
+            what = damage_member(chance, file, members)
+        else:
+            damage = chance.choice(DAMAGES)
+            what = damage.__name__
+            damage(chance, file)
+        done.append(f"{what} {file.relative_to(scratch)}")
     return ", ".join(done)
 
 
@@ -156,6 +209,7 @@ def read_all(path: Path) -> None:
     for frame, _ in sequence:
         if masks is not None:
             masks.covered(frame.index)
+    check(survey(sequence))
     try:
         files = FilesDepth(path if path.is_dir() else path.parent, sequence.depth_rectifier, DepthSettings())
         for frame in sequence.frames():
@@ -181,7 +235,7 @@ def work(connection: Connection, templates: Path, names: list[str], numbers: ran
     warnings.simplefilter("ignore")
 
     def too_slow(signum: int, frame: FrameType | None) -> None:
-        raise TimeoutError
+        raise TooSlowError
 
     signal.signal(signal.SIGALRM, too_slow)
     with tempfile.TemporaryDirectory() as folder:
@@ -196,7 +250,7 @@ def work(connection: Connection, templates: Path, names: list[str], numbers: ran
                 read_cameras(scratch) if name == CALIBRATIONS else read_all(_entry(templates / name, scratch))
             except ScopemapError:
                 verdict = "refused"
-            except TimeoutError:
+            except TooSlowError:
                 verdict, finding = "finding", f"more than {SLOWEST_S} s"
             except BaseException:
                 verdict, finding = "finding", traceback.format_exc(limit=-4)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from drawn_bags import write_bag1, write_mcap, write_ros2
+from drawn_calibrations import CAMERAS, write_forms
+from drawn_dicom import write_dicom_video, write_frames
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
-from test_calibration import CAMERAS, ROS
 from test_datasets_c3vd_layouts import write_endogslam, write_v2
 from test_datasets_colmap import write_scene as write_colmap
 from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
@@ -71,6 +73,11 @@ WRITERS: dict[str, Writer] = {
     "endomapper-sim": write_sim,
     "colmap:txt": write_colmap,
     "colmap:bin": lambda folder: write_colmap(folder, "bin"),
+    "rosbag:bag": write_bag1,
+    "rosbag:ros2": write_ros2,
+    "rosbag:mcap": write_mcap,
+    "dicom:video": write_dicom_video,
+    "dicom:frames": write_frames,
 }
 
 
@@ -84,8 +91,7 @@ def write_cameras(folder: Path) -> Path:
         storage.write("K", CAMERAS[0].matrix)
         storage.write("D", np.array([[-0.3, 0.1, 1e-3, -5e-4, -0.01]]))
         storage.release()
-    (folder / "ros.yaml").write_text(ROS)
-    (folder / "line.txt").write_text("520.5 525.25 318 245 -0.3 0.1 0.001 -0.0005\n")
+    write_forms(folder)
     return folder
 
 

@@ -21,30 +21,16 @@ from scopemap import __version__
 from scopemap.cli import main
 
 OPTIONS = {
-    "run": "--out --preset --config --dataset --camera --fov --near-far --depth --flow --frames --size --device --set"
-    " --overwrite --json --quiet",
+    "run": "--out --preset --config --dataset --camera --fov --camera-fit --stereo --deinterlace --near-far --depth"
+    " --flow --frames --fps --size --device --set --overwrite --json --quiet",
     "evaluate": "--truth --align --unit --paper-units --json --quiet",
     "phantom": "--scene --frames --size --seed --path --deform --loop --events --set --json --quiet",
     "models list": "--json --quiet",
     "models pull": "--json --quiet",
     "models verify": "--json --quiet",
 }
-JSON_KEYS = [
-    "input",
-    "dataset",
-    "frames",
-    "tracked",
-    "camera",
-    "estimators",
-    "notes",
-    "warnings",
-    "seconds",
-    "versions",
-    "machine",
-    "out",
-    "preset",
-    "mesh_faces",
-]
+JSON_KEYS = ["input", "dataset", "frames", "tracked", "skipped", "camera", "estimators", "notes"]
+JSON_KEYS += ["warnings", "seconds", "versions", "machine", "out", "preset", "mesh_faces"]
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from scopemap.errors import SettingsError
 SOURCE = Path(scopemap.config.__file__).parent
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
+    "input": ["datasets/*.py", "calibration/*.py", "focal/*.py", "runner.py"],
     "mask": ["masking.py", "mask_files.py"],
     "depth": ["depth/*.py", "depth_range.py"],
     "mapis": ["depth/mapis.py", "pipeline.py"],

@@ -10,9 +10,9 @@ import pytest
 from drawn_inputs import number_in, picture, save
 
 from scopemap.calibration import write_calibration
+from scopemap.calibration.colmap import ModelCamera, camera_model
 from scopemap.camera import PinholeCamera
 from scopemap.datasets import open_sequence
-from scopemap.datasets.colmap_files import ModelCamera, camera_model
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
 from scopemap.lenses import FisheyeCamera, OpenCvCamera
@@ -26,7 +26,8 @@ CAMERA = ("PINHOLE", *SIZE, (61.0, 62.0, 41.0, 30.0))
 MODEL_NUMBERS = {
     "SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5,
     "FULL_OPENCV": 6, "FOV": 7, "SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11, "SIMPLE_DIVISION": 12, "DIVISION": 13, "SIMPLE_FISHEYE": 14, "FISHEYE": 15,
+    "EUCM": 16, "EQUIRECTANGULAR": 17,
 }  # fmt: skip
 
 Pose = tuple[float, ...]
@@ -305,15 +306,15 @@ def test_a_camera_of_another_size_is_rescaled_about_the_corner(tmp_path: Path) -
 
 
 def test_a_calibration_beside_the_model_wins_and_does_without_its_cameras(tmp_path: Path) -> None:
-    write_scene(tmp_path, camera=("FOV", *SIZE, (61.0, 62.0, 41.0, 30.0, 0.9)))
+    write_scene(tmp_path, camera=("EUCM", *SIZE, (61.0, 62.0, 41.0, 30.0, 0.5, 1.0)))
     write_calibration(PinholeCamera(70.0, 70.0, 40.0, 32.0, *SIZE), tmp_path / "camera.yaml")
     assert open_sequence(tmp_path).camera.fx == 70.0
 
 
 @pytest.mark.parametrize("form", ["txt", "bin"])
-@pytest.mark.parametrize("model", ["FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
+@pytest.mark.parametrize("model", ["DIVISION", "EUCM", "EQUIRECTANGULAR", "RAD_TAN_THIN_PRISM_FISHEYE"])
 def test_other_models_are_named_and_what_to_do(model: str, form: str, tmp_path: Path) -> None:
-    count = {"FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RAD_TAN_THIN_PRISM_FISHEYE": 16}[model]
+    count = {"DIVISION": 5, "EUCM": 6, "EQUIRECTANGULAR": 2, "RAD_TAN_THIN_PRISM_FISHEYE": 16}[model]
     other = (model, *SIZE, (61.0,) * count)
     write_scene(tmp_path, form, camera=other)
     with pytest.raises(CalibrationError, match=rf"is of the model {model}, which is not read: reconstruct with SIMPLE"):

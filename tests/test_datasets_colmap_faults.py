@@ -23,8 +23,9 @@ from test_datasets_colmap import (
     write_scene,
 )
 
+from scopemap.calibration.colmap import read_cameras
 from scopemap.datasets import open_sequence
-from scopemap.datasets.colmap_files import read_cameras, read_images
+from scopemap.datasets.colmap_files import read_images
 from scopemap.errors import CalibrationError, InputError, ScopemapError
 
 ROW = "1 1 0 0 0 0 0 0 1 frame_2.png"
@@ -216,7 +217,7 @@ def test_damaged_binary_files(name: str, content: bytes, message: str, tmp_path:
         open_sequence(tmp_path)
 
 
-@pytest.mark.parametrize("model", [-1, 14, 2**31 - 1])
+@pytest.mark.parametrize("model", [-1, 18, 2**31 - 1])
 def test_a_binary_camera_of_an_unknown_model(model: int, tmp_path: Path) -> None:
     write_scene(tmp_path, "bin")
     content = struct.pack("<QIiQQ4d", 1, 1, model, *SIZE, *CAMERA[3])

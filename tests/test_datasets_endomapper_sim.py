@@ -296,9 +296,10 @@ def test_a_trajectory_that_is_none_is_one_sentence(text: str | bytes, message: s
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "'fx' is missing"),
-        ("fx: a\n", "could not convert"),
-        ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: nan\nrows: 720\n", "is none"),
+        ("", "expected lines `name: number`"),
+        ("fx: 500\nfy: 501\n", "'cx' is missing"),
+        ("fx: a\n", "fx must be a finite number, found 'a'"),
+        ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: nan\nrows: 720\n", "cols must be a finite number"),
         ("fx: 500\nfy: 501\ncx: 970\ncy: 350\ncols: 960\nrows: 720\n", "principal point 970"),
         ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: 960\nrows: 960\n", "another aspect"),
     ],

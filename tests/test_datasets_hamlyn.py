@@ -10,10 +10,10 @@ import pytest
 from drawn_inputs import number_in, picture, save
 
 from scopemap.calibration import write_calibration
+from scopemap.calibration.plain_numbers import read_intrinsics
 from scopemap.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.datasets import open_sequence
-from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
 from scopemap.masking import Masker
@@ -123,8 +123,8 @@ def test_every_form_of_the_matrix_is_read(form: str, tmp_path: Path) -> None:
         ("a b c", "could not convert"),
         ("70 0 400 0 70 30 0 0 1", "principal point 400, 30"),
         ("0 0 40 0 70 30 0 0 1", "not those of images of 80x64 px"),
-        ("70 0 40 5 70 30 0 0 1", "not those of images"),
-        ("70 0 40 0 70 30 0 0 7", "not those of images"),
+        ("70 0 40 5 70 30 0 0 1", "is no camera matrix"),
+        ("70 0 40 0 70 30 0 0 7", "is no camera matrix"),
         ("nan 0 40 0 70 30 0 0 1", "not those of images"),
     ],
 )

@@ -64,7 +64,7 @@ def two_cameras(folder: Path) -> Path:
 
 
 def unknown_lens(folder: Path) -> Path:
-    return write_colmap(folder, camera=("FOV", 80, 64, (61.0, 62.0, 41.0, 30.0, 0.9)))
+    return write_colmap(folder, camera=("EUCM", 80, 64, (61.0, 62.0, 41.0, 30.0, 0.5, 1.0)))
 
 
 def focal_length_of_no_camera(folder: Path) -> Path:

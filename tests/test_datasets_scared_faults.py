@@ -221,7 +221,7 @@ def test_no_permission_is_a_sentence(downloaded: Path, monkeypatch: pytest.Monke
 
 def test_a_calibration_error_names_the_file(keyframe: Path) -> None:
     (keyframe / "endoscope_calibration.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
-    with pytest.raises(CalibrationError, match=r"endoscope_calibration\.yaml has no 3x3 camera matrix"):
+    with pytest.raises(CalibrationError, match=r"endoscope_calibration\.yaml cannot be used: it has no 3x3"):
         open_sequence(keyframe)
 
 

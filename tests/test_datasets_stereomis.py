@@ -255,7 +255,7 @@ def test_a_calibration_that_is_none_is_one_sentence(changed: dict[str, object], 
         ("[StereoLeft]\nres_x=160\n", "'res_y' is missing"),
         ("[StereoLeft]\nres_x=160\nres_x=160\n", "already exists"),
         ("[StereoLeft]\nres_x=160\nres_y=128\nfc_x=130\nfc_y=130\ncc_x=80\ncc_y=64\nkc_0=1\n", "got 1"),
-        (b"\xff\x00", "codec"),
+        (b"\xff\x00", "it is binary, not text"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_one_sentence(text: str | bytes, message: str, tmp_path: Path) -> None:

@@ -1,13 +1,23 @@
-"""Videos that FFmpeg opens only half."""
+"""Videos that FFmpeg opens only half, and what a stream says of turns, colours and times."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
-from drawn_inputs import number_in, write_video
+from drawn_clips import RATE, clip, tissue, write
+from drawn_inputs import number_in, picture, write_video
+from drawn_videos import encode, one_colour
+from hypothesis import given
+from hypothesis import strategies as st
 
 from scopemap.datasets import open_sequence
+from scopemap.datasets.time_stamps import TimeStamps
+from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError
 
 
@@ -31,3 +41,140 @@ def test_a_video_of_an_unknown_codec_is_one_sentence(tmp_path: Path) -> None:
 def test_a_video_knows_neither_poses_nor_truth(tmp_path: Path) -> None:
     source = open_sequence(write_video(tmp_path / "v.mp4", 4)).source
     assert (source.pose(0), source.truth(0), source.stamps(slice(None))) == (None, None, None)
+
+
+COLOURS = [(200, 40, 60), (180, 120, 90), (255, 255, 255), (0, 0, 0), (30, 200, 220)]
+FORMS = [
+    ("libx264", "yuv420p", {"qp": "0"}),
+    ("libx264", "yuv420p10le", {"qp": "0"}),
+    ("hevc", "yuv420p10le", {"x265-params": "lossless=1:log-level=error"}),
+    ("ffv1", "yuv444p10le", {}),
+]
+
+
+@pytest.mark.parametrize(("codec", "pix_fmt", "options"), FORMS)
+@pytest.mark.parametrize("bt709", [False, True])
+@pytest.mark.parametrize("full", [False, True])
+def test_colours_are_those_that_the_stream_states(
+    codec: str, pix_fmt: str, options: dict[str, str], bt709: bool, full: bool, tmp_path: Path
+) -> None:
+    for number, rgb in enumerate(COLOURS):
+        name = f"{number}.{'mkv' if codec == 'ffv1' else 'mp4'}"
+        file = one_colour(tmp_path / name, rgb, codec, pix_fmt, bt709=bt709, full=full, options=options)
+        frame = next(VideoFile(file).frames(slice(None)))
+        assert np.abs(frame.rgb.astype(int) - rgb).max() <= 3
+
+
+def test_full_range_jpeg_colours(tmp_path: Path) -> None:
+    rgb = COLOURS[1]
+    file = one_colour(tmp_path / "v.mp4", rgb, "libx264", "yuvj420p", bt709=False, full=True, options={"qp": "0"})
+    assert np.abs(next(VideoFile(file).frames(slice(None))).rgb.astype(int) - rgb).max() <= 3
+
+
+@pytest.mark.parametrize(
+    ("degrees", "mirrored", "shown"),
+    [
+        (0, False, lambda rgb: rgb),
+        (90, False, np.rot90),
+        (-90, False, lambda rgb: np.rot90(rgb, -1)),
+        (180, False, lambda rgb: np.rot90(rgb, 2)),
+        (0, True, np.fliplr),
+    ],
+)
+def test_pictures_are_turned_as_they_are_to_be_shown(
+    degrees: int, mirrored: bool, shown: Callable[[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    pictures = [tissue(number, (160, 96)) for number in range(3)]
+
+    def prepare(stream: av.VideoStream) -> None:
+        stream.set_display_rotation(degrees, hflip=mirrored)
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+
+    source = VideoFile(encode(tmp_path / "v.mp4", pictures, prepare=prepare))
+    expected = [shown(one) for one in pictures]
+    assert (source.height, source.width) == expected[0].shape[:2]
+    assert source.pixel_aspect == pytest.approx(3 / 4 if abs(degrees) == 90 else 4 / 3)
+    for frame, wanted in zip(source.frames(slice(None)), expected, strict=True):
+        assert np.abs(frame.rgb.astype(int) - wanted).mean() < 2
+    assert all(one.shape == expected[0].shape for one in source.samples(4))
+
+
+def _times(file: Path) -> tuple[list[float], list[str]]:
+    source = VideoFile(file)
+    return [frame.time_s for frame in source.frames(slice(None))], source.warnings
+
+
+def test_a_variable_rate_is_kept(tmp_path: Path) -> None:
+    stamps = [0, 1, 3, 4, 9, 10, 11, 40, 41, 43]
+    times_s, warnings = _times(write(tmp_path / "v.mkv", clip(10, size=(64, 48)), stamps))
+    np.testing.assert_allclose(times_s, np.array(stamps) / RATE, atol=1e-3)
+    assert warnings == []
+
+
+def test_a_clock_that_jumps_is_mended_with_a_warning(tmp_path: Path) -> None:
+    day = 24 * 3600 * RATE
+    stamps = [0, 1, 2, day, day + 1, day + 2, day + 4, day + 5]
+    times_s, warnings = _times(write(tmp_path / "v.mkv", clip(8, size=(64, 48)), stamps))
+    # After the jump the clock's own steps count again.
+    assert 0 < times_s[3] - times_s[2] < 60
+    np.testing.assert_allclose(np.diff(times_s)[3:] * RATE, [1, 1, 2, 1], atol=0.05)
+    assert len(warnings) == 1
+    assert "1 time stamp(s) that are missing, do not increase or jump, first at frame 3" in warnings[0]
+
+
+STAMPS = st.lists(
+    st.none() | st.floats(-1e6, 1e6, allow_nan=False) | st.integers(0, 50).map(lambda n: n / 25), max_size=60
+)
+
+
+@given(STAMPS)
+def test_mended_times_increase(stamps: list[float | None]) -> None:
+    mend = TimeStamps(25.0)
+    times_s = [mend(index, stamp) for index, stamp in enumerate(stamps)]
+    steps = np.diff(times_s)
+    assert (steps > 0).all()
+    assert (steps <= 60.0 + 1e-6).all()
+    assert (mend.first_repaired is None) == (mend.repaired == 0)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected", "repaired"),
+    [
+        ([0.0, 0.04, 0.09, 0.2], [0.0, 0.04, 0.09, 0.2], 0),
+        ([7.5, 7.54, 7.58], [7.5, 7.54, 7.58], 0),
+        ([None, None, None], [0.0, 0.04, 0.08], 3),
+        ([0.0, None, 0.08], [0.0, 0.04, 0.08], 1),
+        ([0.0, 0.04, 0.04, 0.08], [0.0, 0.04, 0.08, 0.12], 1),
+        ([0.0, 0.04, 0.0, 0.04], [0.0, 0.04, 0.08, 0.12], 1),
+        ([0.0, 0.04, 1e5, 1e5 + 0.04], [0.0, 0.04, 0.08, 0.12], 1),
+    ],
+)
+def test_how_times_are_mended(stamps: list[float | None], expected: list[float], repaired: int) -> None:
+    mend = TimeStamps(25.0)
+    assert [mend(index, stamp) for index, stamp in enumerate(stamps)] == pytest.approx(expected)
+    assert mend.repaired == repaired
+
+
+def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:
+    file = encode(tmp_path / "v.h264", clip(6, size=(64, 48)), pix_fmt="yuv420p")
+    source = VideoFile(file)
+    times_s = [frame.time_s for frame in source.frames(slice(None))]
+    assert (np.diff(times_s) > 0).all()
+    np.testing.assert_allclose(np.diff(times_s), 1 / source.rate_hz, rtol=0.01)
+
+
+def test_samples_come_from_all_parts(tmp_path: Path) -> None:
+    pictures = [picture(i // 4, (160, 120)) for i in range(80)]
+    source = VideoFile(write(tmp_path / "v.mp4", pictures))
+    numbers = [number_in(one) for one in source.samples(8)]
+    assert len(numbers) == 8
+    assert min(numbers) < 3
+    assert max(numbers) > 14
+
+
+def test_samples_of_a_video_that_cannot_be_searched_are_read_in_order(tmp_path: Path) -> None:
+    pictures = [picture(i // 4, (160, 120)) for i in range(80)]
+    one_key_frame = encode(tmp_path / "v.mp4", pictures, options={"qp": "0", "g": "600", "sc_threshold": "0"})
+    numbers = [number_in(one) for one in VideoFile(one_key_frame).samples(8)]
+    assert numbers == sorted(numbers)
+    assert (len(numbers), max(numbers)) == (8, 17)

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
 BOTTOM = {"errors", "presets", "camera", "frame", "geometry", "config", "lenses", "calibration", "rectification"} | {
     *("weights", "checkpoints", "device", "trajectory", "trajectories", "mask_files", "decoding"),
+    *("overlays", "field_of_view", "pictures"),
 }
 STAGES = {"masking", "depth", "flow", "perceptual", "odometry", "fusion"}
 # What a room may import besides itself; rooms that are not named may import all but the command line.
@@ -27,7 +28,7 @@ MAY_IMPORT = (
     dict.fromkeys(BOTTOM, BOTTOM)
     | dict.fromkeys(STAGES, BOTTOM)
     | dict.fromkeys(("datasets", "phantom", "report"), BOTTOM)
-    | {"backend": BOTTOM | {"flow"}}
+    | {"backend": BOTTOM | {"flow"}, "boards": BOTTOM | {"datasets", "report"}}
 )
 MAY_NOT_IMPORT = {"evaluation": STAGES | {"pipeline", "runner", "reconstruction", "cli"}}
 NETWORKS = {"torch", "torchvision", "transformers", "lpips"}

@@ -12,7 +12,8 @@ from scopemap.camera import PinholeCamera
 from scopemap.config import MaskSettings
 from scopemap.datasets import open_sequence
 from scopemap.frame import Frame
-from scopemap.masking import Masker, is_constant
+from scopemap.masking import Masker
+from scopemap.pictures.constant import is_constant
 
 SETTINGS = MaskSettings(
     dark_level=12, bright_level=240, highlight_ratio=1.5, highlight_grow_px=2, border_px=3, field_of_view=True,

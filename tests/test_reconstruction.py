@@ -15,6 +15,7 @@ from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.calibration import read_calibration
+from scopemap.camera import source_pixel
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.pipeline import Step
@@ -58,6 +59,7 @@ def test_contents(run: _Run) -> None:
         "mesh.glb",
         "mesh.ply",
         "provenance.json",
+        "source_camera.yaml",
         "trajectory.tum",
     ]
     assert sorted(path.name for path in run.out.iterdir()) == names
@@ -135,6 +137,12 @@ def test_camera_and_settings_are_read_back(run: _Run) -> None:
     camera = run.result.camera
     back = read_calibration(run.out / "camera.yaml", (camera.width, camera.height)).camera.central
     np.testing.assert_allclose(back.matrix, camera.matrix, rtol=1e-9)
+    source = run.result.source_camera
+    assert source is not None
+    assert read_calibration(run.out / "source_camera.yaml", (source.width, source.height)).camera == source
+    pixels = np.array([[3.0, 4.0], [20.5, 11.0]])
+    rays = back.unproject(pixels)
+    np.testing.assert_allclose(source_pixel(pixels, back, source), source.project(7.0 * rays), atol=1e-9)
     assert Config.load(file=run.out / "config.toml") == run.result.config
 
 
@@ -253,7 +261,7 @@ def test_what_cannot_be_written_is_an_input_error(run: _Run, tmp_path: Path) -> 
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="cannot write depth to"):
         DepthWriter(tmp_path / "file")
-    with pytest.raises(InputError, match="cannot write the result to"):
+    with pytest.raises(InputError, match=r"cannot write the result to"):
         run.result.save(tmp_path / "file")
 
 
@@ -286,3 +294,29 @@ def test_overwrite_spares_a_folder_that_is_no_run(run: _Run, tmp_path: Path) -> 
         prepare_folder(tmp_path, overwrite=True)
     assert (tmp_path / "depth" / "0000.png").read_text() == "measured"
     assert (tmp_path / "camera.yaml").read_text() == "calibrated"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a full disk is played by /dev/full")
+def test_a_full_disk_is_a_sentence(run: _Run, tmp_path: Path) -> None:
+    writer = DepthWriter(tmp_path)
+    name = f"{run.steps[0].frame.index:06d}.png"
+    (tmp_path / "depth" / name).symlink_to("/dev/full")
+    with pytest.raises(InputError, match=rf"cannot write .*{name}: the disk is full"):
+        writer(run.steps[0])
+    for file in ("trajectory.tum", "mesh.ply", "frames.csv", "provenance.json"):
+        folder = tmp_path / file.replace(".", "_")
+        folder.mkdir()
+        (folder / file).symlink_to("/dev/full")
+        with pytest.raises(InputError, match=r"cannot write the result to .*No space left"):
+            run.result.save(folder)
+
+
+def test_a_folder_that_cannot_be_looked_into_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(InputError, match=r"cannot write a run to .*Permission denied"):
+        prepare_folder(tmp_path, overwrite=False)
+    with pytest.raises(InputError, match=r"cannot write a run to .*File name too long"):
+        prepare_folder(tmp_path / ("x" * 300), overwrite=False)

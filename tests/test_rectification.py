@@ -8,7 +8,7 @@ import pytest
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import inverse, se3_exp, transform
-from scopemap.lenses import FisheyeCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera, working_size
 
 PINHOLE = PinholeCamera(300.0, 302.0, 318.0, 245.0, 640, 480)
@@ -16,6 +16,7 @@ LENSES = {
     "pinhole": PINHOLE,
     "opencv": OpenCvCamera(PINHOLE, (-0.2, 0.03, 1e-3, -5e-4)),
     "fisheye": FisheyeCamera(PINHOLE, (-0.05, 2e-3, 0.0, 0.0)),
+    "fov": FovCamera(PINHOLE, 0.9),
     "omnidirectional": OmnidirectionalCamera((300.0, 0.0, -1e-3), 318.0, 245.0, 640, 480, (0.999, 0.002, -0.003)),
 }
 
@@ -84,6 +85,20 @@ def test_a_straight_edge_in_the_world_is_straight_in_the_rectified_image() -> No
     edge_px = 320 - rectified[rows].sum(1) / 255 - 0.5
     y = (rows - target.cy) / target.fy
     np.testing.assert_allclose(edge_px, target.fx * (0.3 + 0.2 * y) + target.cx, atol=0.35)
+
+
+def test_known_points_lie_where_the_pinhole_sees_them(source: CameraModel) -> None:
+    """Dots drawn where the lens sees points of the world are, rectified, where the pinhole camera sees these."""
+    target = working_camera(source, (320, 240))
+    x, y = np.meshgrid([-0.3, -0.1, 0.0, 0.2, 0.35], [-0.2, 0.0, 0.25])
+    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) * 42.0
+    u, v = coordinates(640, 480)
+    for point, seen in zip(points, source.project(points), strict=True):
+        dot = 255 * np.exp(-((u - seen[0]) ** 2 + (v - seen[1]) ** 2) / (2 * 4.0**2))
+        rectified = Rectifier(source, target).image(np.rint(dot).astype(np.uint8)).astype(float)
+        columns, rows = coordinates(320, 240)
+        centre = [(rectified * axis).sum() / rectified.sum() for axis in (columns, rows)]
+        np.testing.assert_allclose(centre, target.project(point), atol=0.1)
 
 
 def test_a_wider_view_has_an_invalid_border_and_says_so(source: CameraModel) -> None:

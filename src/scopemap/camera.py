@@ -6,7 +6,7 @@ points of any unit and unprojects to rays with z = 1. Lenses that bend straight 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -14,7 +14,7 @@ import numpy as np
 
 
 class CameraModel(Protocol):
-    """What every camera model can do: pinhole, OpenCV, fisheye, omnidirectional."""
+    """What every camera model can do: pinhole, OpenCV, fisheye, field of view, omnidirectional."""
 
     @property
     def width(self) -> int:
@@ -36,6 +36,17 @@ class CameraModel(Protocol):
 
     def resized(self, width: int, height: int) -> CameraModel:
         """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> CameraModel:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+
+
+def source_pixel(pixels: np.ndarray, working: PinholeCamera, source: CameraModel) -> np.ndarray:
+    """Return where pixels (..., 2) of the rectified, working image lie in the source's image, px; NaN beyond its field.
+
+    A run's folder holds both cameras: `camera.yaml` is `working`, `source_camera.yaml` is `source`.
+    """
+    return source.project(working.unproject(pixels))
 
 
 @dataclass(frozen=True)
@@ -82,3 +93,7 @@ class PinholeCamera:
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return PinholeCamera(self.fx * sx, self.fy * sy, cx, cy, width, height)
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> PinholeCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)

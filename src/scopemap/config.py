@@ -29,6 +29,29 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class InputSettings(Settings):
+    """How the input is read."""
+
+    camera_fit: str = Field(
+        "exact",
+        pattern=r"^(exact|scale|crop:\d+,\d+)$",
+        description="what a calibration of another size means, exact: refused; scale: the images were resized from its "
+        "size; crop:X,Y: they were cut out of it, X px from the left, Y px from the top",
+    )
+    focal: Literal["auto", "assume", "flow"] = Field(
+        "auto",
+        description="focal length of an unknown camera, assume: by the assumed field of view; flow: from the motion "
+        "of the first frames; auto: flow where that tells it, Depth Pro's where that is in use",
+    )
+    stereo: Literal["auto", "none", "left-right", "top-bottom"] = Field(
+        "auto",
+        description="two views in one picture, of which the left or upper is used; auto: told from a video's pictures",
+    )
+    deinterlace: bool = Field(False, description="one field of each picture only, its missing rows interpolated")
+    fps: float | None = Field(None, gt=0, description="at most so many frames per second, by the time stamps")
+    skip_duplicates: bool = Field(True, description="leave out pictures of a video that repeat the one before")
+
+
 class MaskSettings(Settings):
     """Which pixels count as usable tissue."""
 
@@ -39,6 +62,7 @@ class MaskSettings(Settings):
     highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median in a highlight")
     highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
     border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
+    overlays: bool = Field(True, description="find burned-in text and logos, which stay while all else moves")
     files: str = Field(
         "",
         description="folder of masks, one image per frame, found by the number in its name: what is not 0 is left out "
@@ -286,6 +310,7 @@ class Config(Settings):
     """All settings of a run."""
 
     preset: Preset = "default"
+    input: InputSettings = InputSettings()
     mask: MaskSettings = MaskSettings()
     depth: DepthSettings = DepthSettings()
     mapis: MapisSettings = MapisSettings()

@@ -55,18 +55,20 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
 
 def check_pixels(claimed: float) -> None:
     """Raise `InputError` where an image claims more pixels than the limit."""
-    most = _most_megapixels()
-    if claimed > most * 1e6:
-        raise InputError(
-            f"decoding an image: its header claims more than {most:g} million pixels; if it is sound, set the "
-            f"environment variable {_VARIABLE}"
-        )
+    if claimed > most_pixels():
+        raise InputError(f"decoding an image: its header claims {limit_in_words()}")
 
 
-def _most_megapixels() -> float:
+def limit_in_words() -> str:
+    """Return the limit, and how to set another, as the end of a sentence."""
+    return f"more than {most_pixels() / 1e6:g} million pixels; if it is sound, set the environment variable {_VARIABLE}"
+
+
+def most_pixels() -> float:
+    """Return the limit, pixels. Raises `InputError` where the environment variable is no number."""
     text = os.environ.get(_VARIABLE, "")
     try:
-        return float(text) if text else _MOST_MEGAPIXELS
+        return 1e6 * (float(text) if text else _MOST_MEGAPIXELS)
     except ValueError:
         raise InputError(f"the environment variable {_VARIABLE} must be a number, got '{text}'") from None
 

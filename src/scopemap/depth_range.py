@@ -29,7 +29,8 @@ from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
 from scopemap.geometry.warp import pull
 from scopemap.mask_files import create_masks
-from scopemap.masking import Masker, is_constant
+from scopemap.masking import Masker
+from scopemap.pictures.constant import is_constant
 
 _REFERENCE_EVERY, _REFERENCES = 4, 20
 _GAPS = (12, 8, 5, 3, 2)  # frames from a reference to its partner, tried in this order

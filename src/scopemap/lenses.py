@@ -1,6 +1,6 @@
-"""Lenses that bend straight lines: OpenCV radial-tangential, Kannala-Brandt fisheye, Scaramuzza omnidirectional.
+"""Lenses that bend straight lines: OpenCV radial-tangential, Kannala-Brandt fisheye, FOV, Scaramuzza omnidirectional.
 
-All three are one increasing radial function, plus a small correction in the plane. The field of a lens ends where its
+All are one increasing radial function, plus a small correction in the plane. The field of a lens ends where its
 radial function stops increasing (there two rays would share a pixel) or where rays no longer point forward; beyond it
 `project` and `unproject` answer NaN.
 """
@@ -104,6 +104,10 @@ class OpenCvCamera:
         """Return the camera of the same view at another size; pixel centres stay pixel centres."""
         return replace(self, central=self.central.resized(width, height))
 
+    def cropped(self, x: int, y: int, width: int, height: int) -> OpenCvCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, central=self.central.cropped(x, y, width, height))
+
 
 @dataclass(frozen=True)
 class FisheyeCamera:
@@ -167,6 +171,71 @@ class FisheyeCamera:
     def resized(self, width: int, height: int) -> FisheyeCamera:
         """Return the camera of the same view at another size; pixel centres stay pixel centres."""
         return replace(self, central=self.central.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> FisheyeCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, central=self.central.cropped(x, y, width, height))
+
+
+@dataclass(frozen=True)
+class FovCamera:
+    """Lens of one parameter (Devernay and Faugeras, Machine Vision and Applications 13, 2001, section 3.2).
+
+    The distance r from the axis on the plane z = 1 becomes atan(2 r tan(omega / 2)) / omega.
+
+    Attributes
+    ----------
+    plane : takes the bent plane to pixels: scales (fx, fy), principal point and image size, px.
+    omega : the lens' angle of view in the model, rad, 0 < omega < pi.
+    """
+
+    plane: PinholeCamera
+    omega: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.omega < np.pi:
+            raise ValueError(f"FovCamera.omega: expected an angle between 0 and pi, got {self.omega:g}")
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.plane.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.plane.height
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The pinhole camera that agrees with this one near its principal point."""
+        return replace(self.plane, fx=self.plane.fx * self._slope, fy=self.plane.fy * self._slope)
+
+    @property
+    def _slope(self) -> float:
+        return float(2 * np.tan(self.omega / 2) / self.omega)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = _on_plane(points)
+        r = np.linalg.norm(xy, axis=-1)
+        r = np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)
+        return _to_pixels(self.plane, _with_radius(xy, np.arctan(r * self._slope * self.omega) / self.omega))
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        bent = self.plane.unproject(pixels)[..., :2]
+        angle = np.linalg.norm(bent, axis=-1) * self.omega
+        r = np.tan(np.where(angle < np.pi / 2, angle, np.nan)) / (self._slope * self.omega)
+        return _ray(_with_radius(bent, np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)))
+
+    def resized(self, width: int, height: int) -> FovCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        return replace(self, plane=self.plane.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> FovCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, plane=self.plane.cropped(x, y, width, height))
 
 
 @dataclass(frozen=True)
@@ -247,6 +316,10 @@ class OmnidirectionalCamera:
         polynomial = tuple(a * sy ** (1 - power) for power, a in enumerate(self.polynomial))
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return OmnidirectionalCamera(polynomial, cx, cy, width, height, (c * sx / sy, d * sx / sy, e))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> OmnidirectionalCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)
 
 
 def _on_plane(points: np.ndarray) -> np.ndarray:

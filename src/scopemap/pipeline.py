@@ -36,9 +36,10 @@ from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, fol
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
 from scopemap.mask_files import MaskFiles, create_masks
-from scopemap.masking import Masker, is_constant
+from scopemap.masking import Masker
 from scopemap.odometry import FrameTracker, Track, Tracker, create_smoother
 from scopemap.perceptual import PerceptualDistance, create_perceptual
+from scopemap.pictures.constant import is_constant
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,9 @@ from typing import Any
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "paper": {
+        "input.focal": "assume",
+        "input.skip_duplicates": False,
+        "mask.overlays": False,
         "depth.backend": "depth-anything",
         "depth.anchor": "depth-pro",
         "depth.fit_shift": False,

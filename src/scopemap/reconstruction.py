@@ -1,7 +1,7 @@
 """What a run gives back, and the folder it is kept in.
 
-out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  depth/000000.png (16 bit, depth/depth.json has the scale)
-      frames.csv  config.toml  provenance.json
+out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
+      depth/000000.png (16 bit, depth/depth.json has the scale)
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,13 +21,14 @@ import trimesh
 
 from scopemap.backend import Correction
 from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.config import Config
+from scopemap.datasets import SkippedFrame
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import save_mesh
 from scopemap.odometry import Track
 from scopemap.pipeline import Step
-from scopemap.trajectory import Trajectory, write_tum
+from scopemap.trajectory import SKIPPED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
 """The finest step of depth/*.png, which reaches 655 mm."""
@@ -38,7 +40,8 @@ _COLUMNS = [
     *("depth_scale", "warped_share"),
 ]
 _OWN_FILES = (
-    *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "frames.csv", "config.toml", "provenance.json"),
+    *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
+    *("config.toml", "provenance.json"),
 )
 _OWN_FOLDERS = ("depth", "pictures")
 # What tells a run's folder from any other: the first is written last, the second first.
@@ -79,6 +82,12 @@ class FrameRecord:
         ]
 
 
+def _skipped_row(frame: SkippedFrame) -> list[str]:
+    """Return the columns of frames.csv as text for a frame that was not used."""
+    known = [str(frame.index), f"{frame.time_s:.6f}", frame.name, SKIPPED, frame.reason]
+    return known + [""] * (len(_COLUMNS) - len(known))
+
+
 def corrected(records: list[FrameRecord], correction: Correction) -> list[FrameRecord]:
     """Return the records with the poses and scales of the back end; a lost frame repeats the last pose known."""
     out: list[FrameRecord] = []
@@ -117,6 +126,10 @@ class Reconstruction:
     mesh : world mm, vertex colours; may be empty. config : the resolved settings.
     provenance : what the result depends on and what was assumed: input, camera, scale, weights, versions, machine,
         time.
+    source_camera : the camera of the input's images, as they lie in it; None where it is not kept. With `camera` it
+        tells where a pixel was before (`camera.source_pixel`).
+    skipped : frames that were read and not used.
+    focal_sigma_px : standard deviation of the focal length of `camera` where it is an estimate, or None.
     """
 
     camera: PinholeCamera
@@ -124,6 +137,9 @@ class Reconstruction:
     mesh: trimesh.Trimesh
     config: Config
     provenance: dict[str, Any] = field(default_factory=dict)
+    source_camera: CameraModel | None = None
+    skipped: list[SkippedFrame] = field(default_factory=list)
+    focal_sigma_px: float | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -151,9 +167,14 @@ class Reconstruction:
             folder.mkdir(parents=True, exist_ok=True)
             write_tum(folder / "trajectory.tum", self.trajectory)
             save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb")
-            write_calibration(self.camera, folder / "camera.yaml")
+            sigma_px = self.focal_sigma_px
+            write_calibration(self.camera, folder / "camera.yaml", focal_sigma_px=sigma_px)
+            if (source := self.source_camera) is not None:
+                sigma_px = None if sigma_px is None else sigma_px * source.central.fx / self.camera.fx
+                write_calibration(source, folder / "source_camera.yaml", focal_sigma_px=sigma_px)
+            rows = [*map(FrameRecord.row, self.records), *map(_skipped_row, self.skipped)]
             with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerows([_COLUMNS, *(record.row() for record in self.records)])
+                csv.writer(file).writerows([_COLUMNS, *sorted(rows, key=lambda row: int(row[0]))])
             (folder / "config.toml").write_text(self.config.toml(), encoding="utf-8")
             provenance = json.dumps(self.provenance, indent=2) + "\n"
             (folder / "provenance.json").write_text(provenance, encoding="utf-8")
@@ -198,7 +219,11 @@ class DepthWriter:
     def _write(self, index: int, units: np.ndarray) -> None:
         units = np.nan_to_num(units, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
-        if not cv2.imwrite(str(self._file(index)), image):
+        try:
+            written = cv2.imwrite(str(self._file(index)), image)
+        except cv2.error:
+            written = False
+        if not written:
             raise InputError(f"cannot write {self._file(index)}: the disk is full or the folder may not be written")
 
 
@@ -240,6 +265,13 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
     Raises `InputError` if something is in the way, or if the folder to overwrite holds no run.
     """
     folder = Path(folder)
+    try:
+        _make_empty(folder, overwrite=overwrite)
+    except OSError as error:
+        raise InputError(f"cannot write a run to {folder}: {error.strerror or error}") from None
+
+
+def _make_empty(folder: Path, *, overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"cannot write a run to {folder}: a file of that name is in the way")
     if folder.is_dir() and any(folder.iterdir()):
@@ -251,7 +283,6 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
             (folder / name).unlink(missing_ok=True)
         for name in _OWN_FOLDERS:
             shutil.rmtree(folder / name, ignore_errors=True)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write a run to {folder}: {error.strerror or error}") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write a run to {folder}: the folder is read-only; name another one")

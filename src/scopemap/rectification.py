@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.camera import CameraModel, PinholeCamera, source_pixel
 from scopemap.errors import CalibrationError, check_shape
 from scopemap.geometry.se3 import transform
 
@@ -70,7 +70,7 @@ class Rectifier:
 
     def source_pixel(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return source pixels (..., 2) of target pixels `u`, `v` (...); NaN where the source has none."""
-        return self.source.project(self.target.unproject(np.stack([u, v], -1)))
+        return source_pixel(np.stack([u, v], -1), self.target, self.source)
 
     def image(self, image: np.ndarray) -> np.ndarray:
         """Return the rectified image.
@@ -78,7 +78,7 @@ class Rectifier:
         `image` is (h, w, 3) or (h, w) uint8 of the source's size; the result (H, W, ...) uint8, 0 where not `valid`.
         A coarser target sees the source blurred first, so that fine texture does not alias.
         """
-        check_shape("image", image[..., :1].reshape(image.shape[:2]), (self.source.height, self.source.width))
+        check_shape("image", image[..., 0] if image.ndim == 3 else image, (self.source.height, self.source.width))
         if self.only_resizes:
             return self._resize(image)
         if self._shrink > 1:

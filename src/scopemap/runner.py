@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import platform
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.metadata import version
@@ -18,10 +19,12 @@ import numpy as np
 
 from scopemap.config import Config, FusionSettings
 from scopemap.datasets import Sequence
+from scopemap.depth import DepthEstimator
 from scopemap.depth_range import described, fit_exponent, with_exponent
 from scopemap.errors import InputError
-from scopemap.masking import is_constant
+from scopemap.focal import with_focal_from_motion
 from scopemap.odometry import FrameTracker
+from scopemap.pictures.constant import is_constant
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_map, prepare_folder
 
@@ -65,7 +68,8 @@ def reconstruct(
         prepare_folder(Path(out), overwrite=overwrite)
         writer = DepthWriter(Path(out), _most_depth_mm(config, estimators))
         observers = (writer, *observers)
-    sequence, clock = _with_best_camera(sequence, estimators), _Clock()
+    clock = _Clock()
+    sequence, camera_note = _with_best_camera(sequence, config, estimators, clock)
     config, exponent_note = _with_exponent(sequence, config, estimators, clock)
     if exponent_note:
         # Some estimators remember the first frame that they saw, and the anchor holds the settings.
@@ -90,11 +94,14 @@ def reconstruct(
     clock.seconds["total"] = time.perf_counter() - started
     provenance = _provenance(sequence, estimators, clock, records)
     provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
-    provenance["notes"] += exponent_note
+    provenance["notes"] += camera_note + exponent_note
     provenance["warnings"] += distances.warnings(config.fusion) + maps_note
     provenance["notes"] += [] if correction is None else [correction.description]
     provenance["notes"] += pipeline.fusion_note
-    result = Reconstruction(sequence.camera, records, mesh, config, provenance)
+    camera, source_camera = sequence.camera, sequence.rectifier.source
+    result = Reconstruction(
+        camera, records, mesh, config, provenance, source_camera, sequence.skipped, sequence.focal_sigma_px
+    )
     if out is not None:
         result.save(Path(out))
     return result
@@ -173,11 +180,22 @@ def _most_depth_mm(config: Config, estimators: Estimators) -> float:
     return estimators.reach_mm(config.depth, room)
 
 
-def _with_best_camera(sequence: Sequence, estimators: Estimators) -> Sequence:
-    """Take an unknown camera's focal length from Depth Pro's view of the first lit frame, where it is in use anyway."""
+def _with_best_camera(
+    sequence: Sequence, config: Config, estimators: Estimators, clock: _Clock
+) -> tuple[Sequence, list[str]]:
+    """Give an unknown camera the focal length that `input.focal` asks for, with notes on what the motion tells."""
+    unasked = config.input.focal == "auto" and sequence.focal_is_stated
+    if sequence.calibrated or unasked or config.input.focal == "assume":
+        return sequence, []
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
-    if sequence.calibrated or network is None:
-        return sequence
+    if config.input.focal == "auto" and network is not None:
+        return _with_networks_focal(sequence, network), []
+    taken: tuple[Sequence, list[str]] = clock.timed("focal length", with_focal_from_motion, sequence, config)
+    return taken
+
+
+def _with_networks_focal(sequence: Sequence, network: DepthEstimator) -> Sequence:
+    """Take the focal length from Depth Pro's view of the first lit frame: it is in use anyway."""
     first = next((frame for frame in sequence.frames() if not is_constant(frame.rgb)), None)
     focal_px = None if first is None else network.estimate(first).focal_px
     if first is None or focal_px is None:
@@ -205,6 +223,7 @@ def _provenance(
         "dataset": sequence.source.name,
         "frames": len(records),
         "tracked": len(records) - len(lost),
+        "skipped": dict(Counter(frame.kind for frame in sequence.skipped)),
         "camera": {
             "source": sequence.camera_source,
             "width": camera.width,
@@ -213,6 +232,7 @@ def _provenance(
             "fy": camera.fy,
             "cx": camera.cx,
             "cy": camera.cy,
+            "focal_sigma_px": sequence.focal_sigma_px,
             "size": sequence.size_source,
         },
         "estimators": estimators.provenance(),

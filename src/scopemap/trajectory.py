@@ -21,6 +21,8 @@ from scopemap.errors import check_shape
 
 Unit = Literal["mm", "m"]
 STATUSES = ("initial", "ok", "lost")
+SKIPPED = "skipped"
+"""Status in frames.csv of a frame that a run left out: it has no line in trajectory.tum."""
 ASSUMED_FRAMES_PER_S = 30.0
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 

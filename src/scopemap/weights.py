@@ -222,10 +222,8 @@ def _stamp(path: Path, sha256: str) -> dict[str, Any]:
 
 def _read_lock() -> dict[str, Any]:
     path = weights_folder() / LOCK_NAME
-    if not path.is_file():
-        return {}
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except (OSError, ValueError) as error:
         raise WeightsError(
             f"cannot read the record of pulled weights {path}: {error}. Delete it and pull again"

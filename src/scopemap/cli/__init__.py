@@ -11,9 +11,11 @@ import typer
 
 from scopemap.cli import datasets, models
 from scopemap.cli.bench import bench
+from scopemap.cli.calibrate import calibrate
 from scopemap.cli.compare import compare
 from scopemap.cli.demo import demo
 from scopemap.cli.evaluate import evaluate
+from scopemap.cli.inspect import inspect
 from scopemap.cli.phantom import phantom
 from scopemap.cli.run import run
 from scopemap.errors import ScopemapError
@@ -24,7 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, demo, evaluate, compare, bench, phantom):
+for command in (run, demo, inspect, evaluate, compare, bench, phantom, calibrate):
     app.command()(command)
 app.add_typer(models.app, name="models")
 app.add_typer(datasets.app, name="datasets")

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from scopemap.cli.figures import without_nan
-from scopemap.cli.options import AsJson, Quiet
+from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
 
@@ -62,18 +62,22 @@ def check(
     camera: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Calibration to check with, instead of the data set's.")
     ] = None,
+    settings: SetPairs = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Read a data set once and say what is wrong with its frames, camera, poses and depth; exit code 1 with errors."""
+    from scopemap.config import Config
     from scopemap.datasets import open_sequence
     from scopemap.datasets.checking import check as findings_of
     from scopemap.datasets.checking import refusal
     from scopemap.datasets.survey import survey
 
     figures: dict[str, Any] = {}
+    # Pictures that repeat are to be found here, not left out.
+    reading = Config.load(settings={"input.skip_duplicates": False} | parse_settings(settings or [])).input
     try:
-        sequence = open_sequence(path, dataset=dataset, camera=camera)
+        sequence = open_sequence(path, dataset=dataset, camera=camera, settings=reading)
     except ScopemapError as error:
         findings = [refusal(error)]
     else:

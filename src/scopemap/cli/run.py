@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from scopemap.reconstruction import Reconstruction
 
 
+_SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
+
+
 class PresetChoice(StrEnum):
     """Presets of settings."""
 
@@ -31,6 +34,15 @@ class DeviceChoice(StrEnum):
     AUTO = "auto"
     CPU = "cpu"
     CUDA = "cuda"
+
+
+class StereoChoice(StrEnum):
+    """How two views lie in one picture."""
+
+    AUTO = "auto"
+    NONE = "none"
+    LEFT_RIGHT = "left-right"
+    TOP_BOTTOM = "top-bottom"
 
 
 def run(
@@ -56,9 +68,28 @@ def run(
             metavar="FILE", help="Calibration: OpenCV YAML, or text 'fx fy cx cy', then k1 k2 p1 p2 k3 if any."
         ),
     ] = None,
+    camera_fit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIT",
+            help="What a calibration of another size means: exact (refused), scale (images were resized), crop:X,Y.",
+        ),
+    ] = None,
     fov: Annotated[
-        float, typer.Option(min=5.0, max=170.0, help="Horizontal field of view, degrees, where the camera is unknown.")
-    ] = 70.0,
+        float | None,
+        typer.Option(
+            min=5.0,
+            max=170.0,
+            help="Horizontal field of view, degrees, where the camera is unknown; else what the motion tells, or 70.",
+        ),
+    ] = None,
+    stereo: Annotated[
+        StereoChoice | None,
+        typer.Option(help="Two views in one picture, of which the left or upper is used; auto: told from the video."),
+    ] = None,
+    deinterlace: Annotated[
+        bool, typer.Option("--deinterlace", help="Use one field of interlaced pictures, its missing rows interpolated.")
+    ] = False,
     near_far: Annotated[
         str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
     ] = None,
@@ -72,6 +103,9 @@ def run(
     ] = None,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Use at most so many frames per second, by the time stamps.")
     ] = None,
     size: Annotated[
         str | None,
@@ -87,6 +121,10 @@ def run(
     from scopemap.config import Config
 
     given: dict[str, Any] = {
+        "input.camera_fit": camera_fit,
+        "input.stereo": stereo.value if stereo else None,
+        "input.deinterlace": deinterlace or None,
+        "input.fps": fps,
         "depth.backend": depth,
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
         "networks.flow": flow,
@@ -105,6 +143,7 @@ def run(
         fov_deg=fov,
         size=parse_size(size) if size else None,
         frames=parse_slice(frames) if frames else None,
+        settings=resolved.input,
     )
     with run_progress(sequence.count, silent=quiet or as_json) as observers:
         result = reconstruct(sequence, resolved, out=out, overwrite=overwrite, observers=observers)
@@ -135,6 +174,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces",
         f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s",
     ]
+    lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     lines += [f"lost: frame {record.index}, {record.track.reason}" for record in result.lost[:5]]
     if len(result.lost) > 5:
         lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import fitted_to
+from scopemap.calibration import fitted_to, rescaled_note
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files
 from scopemap.decoding import read_decoded
@@ -76,6 +76,7 @@ class C3vdFolder(ImageFolder):
         if undistorted:
             self.camera_source = "EndoGSLAM's calibration of undistorted C3VD (pinhole)"
             self.notes.append("depth of 8 bit, in steps of 0.39 mm: images undistorted and reduced by EndoGSLAM")
+        self.camera_source += rescaled_note(camera, self.camera)
 
     def _is_reduced(self) -> bool:
         """Whether the first depth is of 8 bit, as in EndoGSLAM's copy; 16 bit are C3VD's, only sorted into folders."""

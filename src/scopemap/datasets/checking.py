@@ -39,6 +39,8 @@ _MOST_UNKNOWN = 0.95
 _COARSE = 256
 _COUNTED_IN = 4 * _COARSE
 _LARGEST_ERROR, _SMALLEST_ERROR, _FAR_BETTER = 0.1, 0.005, 4.0
+_OUTLYING, _OUTLYING_TIMES = 0.05, 8.0
+_OTHER_DEPTH_TIMES = 30.0
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def check_pictures(survey: Survey) -> list[Finding]:
     return [
         *_about(black, "frame-black", "black: {}"),
         *_about(even, "frame-constant", "of one colour: {}"),
-        *_about(again, "frame-repeated", "exactly the same picture as before: {}"),
+        *_about(again, "frame-repeated", "the same picture as before: {}"),
     ]
 
 
@@ -163,7 +165,7 @@ def check_poses(survey: Survey) -> list[Finding]:
     bent = [index for index, T in finite if index not in set(left) and deviation(T) > RIGID_TOLERANCE]
     odd = [index for index, T in posed if not np.isfinite(T).all()]
     return [
-        *_missing(survey, len(posed), "pose"),
+        *_missing(survey, [index for index, _ in posed], "pose"),
         *_about(odd, "pose-not-finite", "the pose holds NaN or infinity: {}", "error"),
         *_about(left, "pose-left-handed", "the pose is left-handed (negative determinant): {}", "error"),
         *_about(bent, "pose-not-rigid", "the pose is no rigid motion (scaled, sheared, transposed): {}", "error"),
@@ -200,7 +202,7 @@ def check_depth(survey: Survey) -> list[Finding]:
     full = [(index, depth) for index, depth in known if depth.looked_at]
     flat = [index for index, depth in full if depth.is_constant]
     return [
-        *_missing(survey, len(known), "depth"),
+        *_missing(survey, [index for index, _ in known], "depth"),
         *_about([i for i, d in known if d.impossible_share > 0], "depth-impossible",
                 "depth is infinite, zero or negative in places: {}", "error"),
         *_about([i for i, d in known if 1 - d.known_share > _MOST_UNKNOWN], "depth-unknown",
@@ -209,6 +211,9 @@ def check_depth(survey: Survey) -> list[Finding]:
         *_about([i for i, d in full if _is_coarse(d)], "depth-coarse",
                 f"depth has fewer than {_COARSE} different values, as of 8 bit or whole units: {{}}"),
         *_depth_unit([depth.median_mm for _, depth in full]),
+        *_about(_of_another_depth(full), "depth-jump",
+                f"the median depth is {_OTHER_DEPTH_TIMES:g} times that of the others, or a {_OTHER_DEPTH_TIMES:g}th: "
+                "{}, of another unit?"),
     ]  # fmt: skip
 
 
@@ -229,7 +234,12 @@ def check_agreement(survey: Survey) -> list[Finding]:
         rest = f", {near.at_rest:.2%} if nothing moved" if near.at_rest < near.given else ""
         off = f"depth moved by the poses is off by {near.given:.2%}{rest}"
         return [Finding("error", "pose-depth-disagree", f"{off}: poses, depth or camera do not belong together")]
-    return []
+    limit = max(_OUTLYING, _OUTLYING_TIMES * near.given)
+    return _about(
+        [index for index, error in survey.off.items() if error > limit],
+        "pose-depth-frame",
+        f"depth moved by the poses is off by more than {limit:.2%}, usually by {near.given:.2%}: {{}}",
+    )
 
 
 def check_assumptions(survey: Survey) -> list[Finding]:
@@ -297,17 +307,25 @@ def _depth_unit(medians_mm: list[float]) -> list[Finding]:
     return [Finding("warning", "depth-unit", f"a median depth of {median_mm:.4g} mm looks like {unit}")]
 
 
+def _of_another_depth(full: list[tuple[int, DepthRecord]]) -> list[int]:
+    """Frames whose depth is of another order of magnitude than that of most."""
+    usual_mm = float(np.median([depth.median_mm for _, depth in full])) if full else 1.0
+    return [i for i, d in full if not 1 / _OTHER_DEPTH_TIMES < d.median_mm / usual_mm < _OTHER_DEPTH_TIMES]
+
+
 def _is_coarse(depth: DepthRecord) -> bool:
     return not depth.is_constant and depth.distinct < _COARSE and depth.looked_at >= _COUNTED_IN
 
 
-def _missing(survey: Survey, known: int, what: str) -> list[Finding]:
+def _missing(survey: Survey, known: list[int], what: str) -> list[Finding]:
     """A few frames without truth are a fault; truth of a few frames is how the data set is."""
-    total = len(survey.frames)
-    if known in (0, total):
+    without = sorted({frame.index for frame in survey.frames} - set(known))
+    if not known or not without:
         return []
-    severity: Severity = "warning" if 2 * known >= total else "info"
-    return [Finding(severity, f"{what}-missing", f"{total - known} of {total} frames have no {what}")]
+    total = len(survey.frames)
+    severity: Severity = "warning" if 2 * len(known) >= total else "info"
+    message = f"{len(without)} of {total} frames have no {what}: {_frames(without)}"
+    return [Finding(severity, f"{what}-missing", message)]
 
 
 def _about(

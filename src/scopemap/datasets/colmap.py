@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import fitted_to
-from scopemap.datasets.colmap_files import camera_model, image_path, model_files, read_cameras, read_images
+from scopemap.calibration import fitted_to, rescaled_note
+from scopemap.calibration.colmap import camera_model, read_cameras
+from scopemap.datasets.colmap_files import image_path, model_files, read_images
 from scopemap.datasets.images import ImageFolder, image_files
 from scopemap.datasets.sequence import SourceTruth
 from scopemap.errors import InputError
@@ -90,7 +91,7 @@ class ColmapFolder(ImageFolder):
             )
         camera = models[most_used[0]]
         self.camera = fitted_to(camera, (self.width, self.height), f"camera {most_used[0]} of {file}")
-        note = "" if self.camera is camera else f", rescaled from {camera.width}x{camera.height} px"
+        note = rescaled_note(camera, self.camera)
         self.camera_source = f"COLMAP {file.name}, {cameras[most_used[0]].model}{note}"
 
     def _say(self, file: Path, in_model: int, here: int) -> None:

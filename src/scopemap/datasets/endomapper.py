@@ -11,26 +11,19 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 
-import numpy as np
-
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.calibration.calibu import read_calibu
 from scopemap.datasets.colmap_archive import read_largest_model
 from scopemap.datasets.posed_video import PosedVideo
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
-from scopemap.lenses import FisheyeCamera, OpenCvCamera
 
 _PROCEDURE = re.compile(r"Seq_\d+")
 _FRAME = re.compile(r"out(\d{1,9})\.\w+")
 _ENDOSCOPE = re.compile(r"(?:Endoscope_)?(\d{1,4})")
 _UNKNOWN = ("", "n/a", "none")
 _GEOMETRICAL = "_geometrical.xml"
-_PINHOLE = "calibu_fu_fv_u0_v0"
-_PARAMETERS = {_PINHOLE: 4, f"{_PINHOLE}_k1_k2": 6, f"{_PINHOLE}_kb4": 8}
 _LEVELS_UP = 3
-_LARGEST_SIDE_PX = 100_000
 
 
 class EndoMapperSequence(PosedVideo):
@@ -119,39 +112,6 @@ def read_endoscope(info: Path) -> int | None:
     if match is None:
         raise InputError(f"reading {info}: endoscope_number {text[:40]!r} is none: expected 1, 'Endoscope_01' or 'N/A'")
     return int(match[1])
-
-
-def read_calibu(file: Path) -> CameraModel:
-    """Return the camera of a Calibu XML file, at the size that it was calibrated at.
-
-    `calibu_fu_fv_u0_v0` is a pinhole, `..._k1_k2` has OpenCV's two radial terms, `..._kb4` is Kannala-Brandt's fisheye.
-    Raises `CalibrationError` where the file holds none of them.
-    """
-    try:
-        model = ElementTree.fromstring(file.read_bytes()).find(".//camera_model")
-        if model is None:
-            raise ValueError("it has no camera_model")
-        kind = model.get("type", "")
-        if kind not in _PARAMETERS:
-            raise ValueError(f"the type {kind!r} is not known ({', '.join(_PARAMETERS)})")
-        width, height = (int(model.findtext(side, "")) for side in ("width", "height"))
-        values = [float(value) for value in re.findall(r"[^\s\[\];,]+", model.findtext("params", ""))]
-    except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
-        raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
-    if len(values) != _PARAMETERS[kind] or not np.isfinite(values).all() or not _is_size(width, height):
-        raise CalibrationError(
-            f"the calibration {file} holds {len(values)} parameters for {width}x{height} px, expected "
-            f"{_PARAMETERS[kind]} finite ones for {kind}"
-        )
-    fx, fy, cx, cy, *lens = values
-    pinhole = PinholeCamera(fx, fy, cx, cy, width, height)
-    if not any(lens):
-        return pinhole
-    return FisheyeCamera(pinhole, tuple(lens)) if len(lens) == 4 else OpenCvCamera(pinhole, (*lens, 0.0, 0.0))
-
-
-def _is_size(width: int, height: int) -> bool:
-    return 0 < width <= _LARGEST_SIDE_PX and 0 < height <= _LARGEST_SIDE_PX
 
 
 def _videos_in(path: Path) -> list[Path]:

@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import fitted_to
+from scopemap.calibration import fitted_to, rescaled_note
+from scopemap.calibration.contents import calibration_text
+from scopemap.calibration.named_numbers import numbers_of_pairs
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.exr import can_read_exr, read_exr_red
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder
@@ -101,8 +103,9 @@ class EndoMapperSimFolder(ImageFolder):
     def _use_published(self) -> None:
         file = self.path / _CALIBRATION
         camera = read_calibration_txt(file) if file.is_file() else CAMERA
-        self.camera_source = _CALIBRATION if file.is_file() else "published calibration of the simulated sequences"
+        known = _CALIBRATION if file.is_file() else "published calibration of the simulated sequences"
         self.camera = fitted_to(camera, (self.width, self.height), str(file) if file.is_file() else "shipped for it")
+        self.camera_source = known + rescaled_note(camera, self.camera)
 
 
 def read_trajectory_csv(file: Path) -> tuple[dict[int, np.ndarray], list[float], str]:
@@ -140,12 +143,11 @@ def read_trajectory_csv(file: Path) -> tuple[dict[int, np.ndarray], list[float],
 def read_calibration_txt(file: Path) -> PinholeCamera:
     """Return the camera of lines `fx: 472.6`, also fy, cx, cy, cols, rows; `CalibrationError` where one is missing."""
     try:
-        pairs = (line.split(":", 1) for line in file.read_text(encoding="utf-8-sig").splitlines() if ":" in line)
-        values = {key.strip().lower(): float(value) for key, value in pairs}
+        values = numbers_of_pairs(calibration_text(file))
         fx, fy, cx, cy, columns, rows = (values[key] for key in ("fx", "fy", "cx", "cy", "cols", "rows"))
     except KeyError as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error} is missing") from None
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
     if not (fx > 0 and fy > 0 and 0 <= cx < columns <= _LARGEST_SIDE_PX and 0 <= cy < rows <= _LARGEST_SIDE_PX):
         raise CalibrationError(

@@ -13,8 +13,8 @@ from tokenize import TokenError
 
 import numpy as np
 
-from scopemap.calibration import fitted_to
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.calibration import fitted_to, rescaled_note
+from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import SUFFIXES, ImageFolder, frame_number, image_files
 from scopemap.decoding import read_decoded
 from scopemap.errors import CalibrationError, InputError
@@ -47,8 +47,10 @@ class EndoNerfFolder(ImageFolder):
         rows = _read_rows(file)
         if self.camera is None:
             with self._making_camera():
-                self.camera = _camera(rows, file, (self.width, self.height))
-                self.camera_source = f"focal length in {file.name}, principal point at the centre"
+                camera = _camera(rows, file)
+                self.camera = fitted_to(camera, (self.width, self.height), str(file))
+                note = rescaled_note(camera, self.camera)
+                self.camera_source = f"focal length in {file.name}, principal point at the centre{note}"
         self._poses = self._posed(rows, file)
         self._depths = _numbered_images(path / _DEPTHS)
         self.masks = path / _MASKS if _numbered_images(path / _MASKS) else None
@@ -138,8 +140,8 @@ def _read_rows(file: Path) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def _camera(rows: np.ndarray, file: Path, size: tuple[int, int]) -> CameraModel:
-    """Return the camera that all rows agree on, for images of `size` (width, height), px."""
+def _camera(rows: np.ndarray, file: Path) -> PinholeCamera:
+    """Return the camera that all rows agree on, at the size that they state."""
     stated = rows[:, [4, 9, 14]]
     stated = stated[np.isfinite(stated).all(axis=1)]
     if not len(stated) or not np.allclose(stated, stated[0]):
@@ -147,8 +149,7 @@ def _camera(rows: np.ndarray, file: Path, size: tuple[int, int]) -> CameraModel:
     else:
         height, width, focal_px = (float(value) for value in stated[0])
         if min(height, width) >= 1 and 0.3 * width < focal_px < 5 * width:
-            camera = PinholeCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, round(width), round(height))
-            return fitted_to(camera, size, str(file))
+            return PinholeCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, round(width), round(height))
         found = f"height {height:g}, width {width:g}, focal length {focal_px:g}"
     raise CalibrationError(
         f"the camera in {file} cannot be used: expected one height, width and focal length, px, in columns 5, 10 and "

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.calibration.plain_numbers import read_intrinsics
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.endoslam_poses import POSE_FILES, CameraPath, find_poses, read_camera_path
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, frame_number, image_files
-from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.decoding import read_decoded
 from scopemap.errors import InputError
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.calibration.plain_numbers import read_intrinsics
 from scopemap.datasets.images import ImageFolder, image_files, read_depth16
-from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.frame import TruthQuality
 
 _INTRINSICS = "intrinsics.txt"

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.calibration import read_calibration
+from scopemap.calibration import stated_calibration
 from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.decoding import decoded, read_decoded
 from scopemap.errors import CalibrationError, InputError
@@ -85,9 +85,7 @@ class ImageFolder(KnowsNothing):
         own = (folder / _OWN_CALIBRATION for folder in (path, self.files[0].parent))
         calibration_file = next((file for file in own if file.is_file()), None)
         if calibration_file is not None:
-            calibration = read_calibration(calibration_file, (self.width, self.height))
-            self.camera, self.camera_source = calibration.camera, f"{calibration.source} beside the frames"
-            self.depth_scale_mm = calibration.depth_scale_mm
+            self._take(stated_calibration(calibration_file, (self.width, self.height)))
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -8,7 +8,6 @@ Teufel et al., "OneSLAM to map them all", IJCARS 2024.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from scopemap.calibration import read_calibration
+from scopemap.calibration.contents import calibration_text
+from scopemap.calibration.trees import read_tree
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, frame_number, image_files, read_depth16
 from scopemap.datasets.tum import read_stamped_poses, unlikely_depth
@@ -26,9 +28,6 @@ from scopemap.trajectories.poses import are_frame_numbers
 _CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
 _DEPTHS_PER_UNIT = 1000.0
 _TISSUE = 255
-_INTRINSICS = ("fx", "fy", "cx", "cy")
-_FOCAL_PER_WIDTH = (0.3, 5.0)
-_MOST_BYTES = 1 << 20
 
 
 class OneSlamFolder(ImageFolder):
@@ -47,8 +46,10 @@ class OneSlamFolder(ImageFolder):
         with self._making_camera():
             stated = _read_calibration(path / _CALIBRATION)
             if self.camera is None:
-                self.camera = _camera_of(stated, (self.width, self.height), path / _CALIBRATION)
-                self.camera_source = f"{_CALIBRATION} beside the frames, taken as of images without distortion"
+                self.camera = read_calibration(path / _CALIBRATION, (self.width, self.height)).camera
+                straight = isinstance(self.camera, PinholeCamera)
+                taken = ", taken as of images without distortion" if straight else ""
+                self.camera_source = f"{_CALIBRATION} beside the frames{taken}"
         self._rate_hz = _rate_of(stated, path / _CALIBRATION)
         given = "FPS of calibration.json" if stated.get("FPS") is not None else "assumed: calibration.json has no FPS"
         self.notes = [f"time stamps: frame number / {self._rate_hz:g} s ({given})"]
@@ -147,31 +148,12 @@ def _numbered(files: list[Path]) -> dict[int, Path]:
 
 def _read_calibration(file: Path) -> dict[str, Any]:
     try:
-        with file.open("rb") as opened:
-            content = opened.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise ValueError(f"it is larger than {_MOST_BYTES} bytes")
-        stated = json.loads(content.decode("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        stated = read_tree(calibration_text(file))
+    except ValueError as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
     if not isinstance(stated, dict):
         raise CalibrationError(f'the calibration {file} is no object with "intrinsics"')
     return stated
-
-
-def _camera_of(stated: dict[str, Any], size: tuple[int, int], file: Path) -> PinholeCamera:
-    try:
-        fx, fy, cx, cy = (float(stated["intrinsics"][name]) for name in _INTRINSICS)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise CalibrationError(f'the calibration {file} has no "intrinsics" with fx, fy, cx, cy: {error!r}') from None
-    width, height = size
-    narrowest, widest = (share * width for share in _FOCAL_PER_WIDTH)
-    if not (narrowest < fx < widest and narrowest < fy < widest and 0 <= cx < width and 0 <= cy < height):
-        raise CalibrationError(
-            f"the calibration {file} is not that of images of {width}x{height} px: found focal length {fx:g}, {fy:g} "
-            f"and principal point {cx:g}, {cy:g} px"
-        )
-    return PinholeCamera(fx, fy, cx, cy, width, height)
 
 
 def _rate_of(stated: dict[str, Any], file: Path) -> float:

@@ -7,16 +7,22 @@ from typing import TypeAlias
 
 import numpy as np
 
-from scopemap.calibration import Calibration, read_calibration
+from scopemap.calibration import Calibration, fitted, read_calibration
+from scopemap.config import InputSettings
 from scopemap.datasets.c3vd import C3vdFolder
 from scopemap.datasets.colmap import ColmapFolder
+from scopemap.datasets.dicom import Dicom
 from scopemap.datasets.endomapper import EndoMapperSequence
 from scopemap.datasets.endomapper_sim import EndoMapperSimFolder
 from scopemap.datasets.endonerf import EndoNerfFolder
 from scopemap.datasets.endoslam import EndoSlamFolder
+from scopemap.datasets.frame_choice import FrameChoice
 from scopemap.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
 from scopemap.datasets.images import ImageFolder
 from scopemap.datasets.oneslam import OneSlamFolder
+from scopemap.datasets.permissions import check_readable
+from scopemap.datasets.prepared import UNKNOWN_MAKE, of_one_view, prepared
+from scopemap.datasets.rosbag import RosBag
 from scopemap.datasets.scared import ScaredKeyframe
 from scopemap.datasets.scared_c import ScaredCKeyframe
 from scopemap.datasets.sequence import Sequence, Source, assumed_camera
@@ -26,11 +32,13 @@ from scopemap.datasets.simcol import SimColFolder
 from scopemap.datasets.stereomis import StereoMisFolder
 from scopemap.datasets.tum import TumRgbdFolder
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import InputError
+from scopemap.errors import CalibrationError, InputError
 from scopemap.rectification import Rectifier, working_camera, working_size
 
 # Data sets of folders of images are ImageFolders.
-Reader: TypeAlias = ScaredCKeyframe | ScaredKeyframe | EndoMapperSequence | StereoMisFolder | VideoFile | ImageFolder
+Reader: TypeAlias = (
+    ScaredCKeyframe | ScaredKeyframe | EndoMapperSequence | StereoMisFolder | RosBag | Dicom | VideoFile | ImageFolder
+)
 
 _KINDS: tuple[type[Reader], ...] = (
     ScaredCKeyframe,
@@ -49,12 +57,16 @@ _KINDS: tuple[type[Reader], ...] = (
     TumRgbdFolder,
     OneSlamFolder,
     ColmapFolder,
+    RosBag,
+    Dicom,
     VideoFile,
     ImageFolder,
 )
 DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
 """The readers by name, in the order in which they are asked whether they recognise an input."""
 
+_OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
+_USUAL_FOV_DEG = 70.0
 _SMALLEST_SIDE_PX = 32
 _DEEPEST_NESTING = 3
 _SEARCH_DEPTH = 2
@@ -66,22 +78,30 @@ def open_sequence(
     *,
     dataset: str | None = None,
     camera: Path | str | None = None,
-    fov_deg: float = 70.0,
+    fov_deg: float | None = None,
     size: tuple[int, int] | None = None,
     frames: slice | None = None,
+    settings: InputSettings | None = None,
 ) -> Sequence:
     """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
 
-    `dataset` names the reader (`DATASETS`), None: told from what lies there. The camera comes from the calibration
-    file `camera`, else from the data set, else it is a pinhole with horizontal field of view `fov_deg`. `size` is the
-    working size (width, height), px; None: the input's, divided by the smallest whole number that brings it to 400 px.
-    `frames` selects positions in the input. Raises `InputError` and `CalibrationError`.
+    `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` names the topic, too), None: told from what lies there. The
+    camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
+    of view `fov_deg`, None: 70 deg until a run knows better. `size` is the working size (width, height), px; None: the
+    input's, divided by the smallest whole number that brings it to 400 px. `frames` selects positions in the input.
+    `settings` say how it is read. Raises `InputError` and `CalibrationError`.
     """
-    selection = slice(None) if frames is None else frames
+    selection, settings = frames or slice(None), settings or InputSettings()
     if selection.step is not None and selection.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
-    source = _open_source(Path(path), dataset)
-    calibration, calibrated = _calibration_of(source, camera, fov_deg)
+    try:
+        reader = _open_source(Path(path), dataset)
+        source = prepared(reader, settings)
+        calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
+    except PermissionError as error:
+        raise InputError(f"reading {error.filename or path}: no permission to look into it") from None
+    except OSError as error:  # names that no file system allows, a share that is gone
+        raise InputError(f"reading {error.filename or path}: {error.strerror or error}") from None
     if size is None:
         size, size_source = working_size(source.width, source.height), "chosen"
     else:
@@ -99,26 +119,34 @@ def open_sequence(
         camera_source=calibration.source,
         size_source=size_source,
         calibrated=calibrated,
+        focal_is_stated=fov_deg is not None,
         selection=selection,
         depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
+        choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
     )
-    if sequence.count is not None and sequence.count < 2 and not isinstance(source, VideoFile):
+    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
         raise InputError(f"reading {source.path}: {sequence.count} frame(s) selected, two are needed")
     return sequence
 
 
 def _open_source(path: Path, dataset: str | None) -> Reader:
-    if dataset is not None and dataset not in DATASETS:
+    dataset, _, part = (dataset or "").partition(":")
+    if dataset and dataset not in DATASETS:
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
-    try:
-        path = _innermost(path, dataset) if path.is_dir() else path
-    except PermissionError as error:
-        raise InputError(f"reading {error.filename}: no permission to look into it") from None
+    if path.is_dir():
+        path = _innermost(path, dataset or None)
+        check_readable(path)
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
-    if (kind == VideoFile.name) != path.is_file():
+    if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
+    if kind == RosBag.name:
+        return RosBag(path, part or None)
+    if part:
+        raise InputError(
+            f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon, got '{part}'"
+        )
     return DATASETS[kind](path)
 
 
@@ -166,16 +194,30 @@ def _folders_in(path: Path) -> list[Path]:
     return sorted(folder for folder in folders if not folder.name.startswith(".") and folder.name != _LEAVINGS)
 
 
-def _calibration_of(source: Source, file: Path | str | None, fov_deg: float) -> tuple[Calibration, bool]:
+def _calibration_of(
+    source: Source, file: Path | str | None, fov_deg: float | None, camera_fit: str
+) -> tuple[Calibration, bool]:
     """Return the calibration, and whether the camera is known by it or only assumed."""
-    if file is not None:
-        return read_calibration(file, (source.width, source.height)), True
+    size = (source.width, source.height)
+    try:
+        if file is not None:
+            return read_calibration(file, size, camera_fit), True
+        if source.calibration is not None:
+            return fitted(source.calibration, size, camera_fit), True
+    except CalibrationError as fault:
+        raise CalibrationError(f"{fault}{of_one_view(source)}") from None
     if source.camera_fault is not None:
         raise source.camera_fault
+    if camera_fit.startswith("crop"):
+        raise CalibrationError(
+            f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit}): give the one "
+            "that was made before they were cut (--camera)"
+        )
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source), True
+    known, fov_deg = ("assumed", _USUAL_FOV_DEG) if fov_deg is None else ("stated", fov_deg)
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
     focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
-    assumed = f"assumed: horizontal field of view {fov_deg:g} deg (--fov)"
+    assumed = f"{known}: horizontal field of view {fov_deg:g} deg (--fov)"
     return Calibration(assumed_camera(source, float(focal_px)), None, assumed), False

@@ -121,6 +121,11 @@ class PoseDepthTest:
         self._count += 1
 
     @property
+    def near_errors(self) -> list[float]:
+        """Error as given of each frame but the first against one about 10 before it, as in `Agreement`."""
+        return [errors[0] for errors in self._errors[LAGS[0]]]
+
+    @property
     def agreements(self) -> tuple[Agreement, ...]:
         """What was found so far, by lag; nothing of lags that no pair has."""
         found = []

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import fitted_to, read_calibration
+from scopemap.calibration import fitted_to, rescaled_note, stated_calibration
+from scopemap.calibration.fitting import check_plausible
 from scopemap.camera import CameraModel
 from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import CalibrationError
 from scopemap.frame import TruthQuality
 
 _OWN_CALIBRATION = "camera.yaml"
-_FOCAL_RANGE = (0.3, 5.0)
 # Even a picture that repeats the one before it takes more, with its place in the file's tables.
 _SMALLEST_FRAME_BYTES = 16
 
@@ -45,8 +44,7 @@ class PosedVideo(KnowsNothing):
         self.poses: dict[int, np.ndarray] = {}
         own = path / _OWN_CALIBRATION
         if own.is_file():
-            calibration = read_calibration(own, (self.width, self.height))
-            self.camera, self.camera_source = calibration.camera, f"{calibration.source} beside the frames"
+            self._take(stated_calibration(own, (self.width, self.height)))
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames of the view, decoded in order."""
@@ -83,16 +81,9 @@ class PosedVideo(KnowsNothing):
     def _calibrate(self, camera: CameraModel, file: Path) -> None:
         """Take `camera`, read from `file`, brought to the size of the view."""
         fitted = fitted_to(camera, (self.width, self.height), str(file))
-        central, (least, most) = fitted.central, _FOCAL_RANGE
-        focal = all(least * self.width < f < most * self.width for f in (central.fx, central.fy))
-        if not (focal and 0 <= central.cx < self.width and 0 <= central.cy < self.height):
-            raise CalibrationError(
-                f"the calibration {file} does not fit images of {self.width}x{self.height} px: focal length "
-                f"{central.fx:g}, {central.fy:g} px, principal point {central.cx:g}, {central.cy:g} px"
-            )
+        check_plausible(fitted, f"the calibration {file}")
         self.camera = fitted
-        rescaled = "" if fitted is camera else f", rescaled from {camera.width}x{camera.height} px"
-        self.camera_source = f"calibration of the data set, {file.name}{rescaled}"
+        self.camera_source = f"calibration of the data set, {file.name}{rescaled_note(camera, fitted)}"
 
     def _time_s(self, index: int) -> float:
         return index / self._video.rate_hz

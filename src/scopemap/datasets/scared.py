@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import read_calibration
+from scopemap.calibration import read_calibration, stated_calibration
 from scopemap.camera import CameraModel
 from scopemap.datasets.images import FOLDER_RATE_HZ, ImageFolder, image_files
 from scopemap.datasets.scared_files import KeyframeTruth, calibration_camera, read_frame_data
@@ -134,7 +134,9 @@ class ScaredKeyframe(KnowsNothing):
     def _calibrate(self) -> None:
         size = (self.width, self.height)
         file = next((self.path / n for n in (OWN_CALIBRATION, *_CALIBRATIONS) if (self.path / n).is_file()), None)
-        if file is not None:
+        if file is not None and file.name == OWN_CALIBRATION:
+            self._take(stated_calibration(file, size))
+        elif file is not None:
             calibration = read_calibration(file, size)
             self.camera, self.depth_scale_mm = calibration.camera, calibration.depth_scale_mm
             self.camera_source = f"{calibration.source} beside the frames"

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import read_calibration
-from scopemap.camera import CameraModel
+from scopemap.calibration import read_calibration, stated_calibration
 from scopemap.datasets.images import FOLDER_RATE_HZ, decoded_image
 from scopemap.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.datasets.scared import OWN_CALIBRATION
@@ -50,7 +49,7 @@ class ScaredCKeyframe(KnowsNothing):
         times = "those of frame_data" if self._data.times_s else f"frame number / {FOLDER_RATE_HZ:g} s"
         self.notes = [f"time stamps: {times}", "truth: COLMAP's poses, scaled to the scan of the keyframe"]
         self.height, self.width = self._size()
-        self.camera, self.camera_source = self._calibrated()
+        self._calibrate()
         scale_mm = self.depth_scale_mm or 1.0
         self._truth = KeyframeTruth(path, self._data, (self.width, self.height), "sfm", scale_mm)
 
@@ -113,20 +112,19 @@ class ScaredCKeyframe(KnowsNothing):
     def _time_s(self, number: int) -> float:
         return self._data.times_s.get(number, number / FOLDER_RATE_HZ)
 
-    def _calibrated(self) -> tuple[CameraModel | None, str]:
+    def _calibrate(self) -> None:
         size = (self.width, self.height)
         own = self.path / OWN_CALIBRATION
         if own.is_file():
-            calibration = read_calibration(own, size)
-            self.depth_scale_mm = calibration.depth_scale_mm
-            return calibration.camera, f"{calibration.source} beside the frames"
+            self._take(stated_calibration(own, size))
+            return
         if not (self.path / _INTRINSICS).is_file():
             missing = f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)"
             self.camera_fault = CalibrationError(missing)
-            return None, ""
+            return
         pinhole = read_calibration(self.path / _INTRINSICS, size).camera.central
-        camera = replace(pinhole, cx=pinhole.cx - _COLMAP_CENTRE_PX, cy=pinhole.cy - _COLMAP_CENTRE_PX)
-        return camera, f"{_INTRINSICS}, pixel centres moved by half a pixel"
+        self.camera = replace(pinhole, cx=pinhole.cx - _COLMAP_CENTRE_PX, cy=pinhole.cy - _COLMAP_CENTRE_PX)
+        self.camera_source = f"{_INTRINSICS}, pixel centres moved by half a pixel"
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.calibration.opencv import of_matrices
+from scopemap.camera import CameraModel
 from scopemap.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.datasets.sequence import SourceTruth
 from scopemap.decoding import decoded
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.geometry.se3 import inverse, orthonormalised
-from scopemap.lenses import OpenCvCamera
 
 # The last place are files that lie loose in `data`; an archive of that name is not meant.
 _FRAME_DATA = ("data/frame_data", "frame_data", "image_02/data/frame_data", "data/.")
@@ -76,8 +76,12 @@ def read_frame_data(folder: Path) -> FrameData:
             stamps.setdefault(number, None)
         else:
             calibration = found if calibration is None and isinstance(found, dict) else calibration
+    stamps = dict(sorted(stamps.items()))
     faults = [] if not bad or files is None else [_told(files.path, bad, len(stamps))]
-    return FrameData(sorted(stamps), poses, _seconds(dict(sorted(stamps.items()))), calibration, faults)
+    back = _first_not_later(stamps)
+    if files is not None and back is not None:
+        faults.append(f"{files.path}: the time stamp of frame {back} is not after the one before; none is used")
+    return FrameData(sorted(stamps), poses, _seconds(stamps), calibration, faults)
 
 
 def calibration_camera(calibration: dict[str, Any], size: tuple[int, int], source: str) -> CameraModel:
@@ -86,11 +90,8 @@ def calibration_camera(calibration: dict[str, Any], size: tuple[int, int], sourc
     `KL` is its matrix, `DL` holds k1 k2 p1 p2 k3. Raises `CalibrationError` where they are not there.
     """
     try:
-        K = np.array(calibration["KL"], dtype=np.float64).reshape(3, 3)
-        lens = tuple(float(k) for k in np.array(calibration.get("DL", []), dtype=np.float64).ravel())
-        pinhole = PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *size)
-        return OpenCvCamera(pinhole, lens) if any(lens) else pinhole
-    except (KeyError, TypeError, ValueError) as error:
+        return of_matrices(calibration, size).camera
+    except ValueError as error:
         raise CalibrationError(f"the calibration in {source} cannot be used: {error}") from None
 
 
@@ -177,8 +178,7 @@ def _seconds(stamps: dict[int, Any]) -> dict[int, float]:
     of ten merely count frames: they have none.
     """
     values = list(stamps.values())
-    numeric = all(isinstance(value, int | float) and abs(value) < _LARGEST_STAMP for value in values)
-    if len(values) < 2 or not numeric:
+    if len(values) < 2 or not _are_numbers(values):
         return {}
     # Whole numbers of nanoseconds since 1970 have more digits than a float.
     since_first = [float(value - values[0]) for value in values]
@@ -190,6 +190,22 @@ def _seconds(stamps: dict[int, Any]) -> dict[int, float]:
         return {}
     unit_s = 10.0 ** (_SHORTEST_STEP_POWER - math.floor(math.log10(np.median(steps))))
     return {number: since * unit_s for number, since in zip(stamps, since_first, strict=True)}
+
+
+def _are_numbers(values: list[Any]) -> bool:
+    return all(isinstance(value, int | float) and abs(value) < _LARGEST_STAMP for value in values)
+
+
+def _first_not_later(stamps: dict[int, Any]) -> int | None:
+    """Return the first frame whose stamp is not after that of the frame before; None where all are, or are no times.
+
+    Stamps that are all the same, as zeros are, were never times.
+    """
+    values = list(stamps.values())
+    if not _are_numbers(values) or len(set(values)) < 2:
+        return None
+    pairs = zip(list(stamps)[1:], values, values[1:], strict=False)
+    return next((number for number, before, stamp in pairs if not stamp > before), None)
 
 
 def _told(path: Path, bad: list[str], count: int) -> str:

@@ -10,7 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
+from scopemap.calibration import Calibration
 from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.datasets.frame_choice import FrameChoice, SkippedFrame
 from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.frame import Frame, Truth, TruthQuality
 from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera
@@ -57,9 +59,11 @@ class Source(Protocol):
     Attributes
     ----------
     name : the data set's name.
+    path : the file or folder.
     width, height : size of the images, px.
     count : number of frames, or None where only reading on would tell.
-    camera : the camera of the images, or None where it is unknown.
+    calibration : what the calibration file beside the frames says, of whatever size; None where there is none.
+    camera : the camera of the images, or None where it is unknown; that of `calibration` where there is one.
     camera_source : how the camera is known, one phrase, or "".
     camera_fault : why the data set's own camera cannot be used, None where it can.
     pixel_aspect : width of a pixel over its height.
@@ -71,9 +75,11 @@ class Source(Protocol):
     """
 
     name: str
+    path: Path
     width: int
     height: int
     count: int | None
+    calibration: Calibration | None
     camera: CameraModel | None
     camera_source: str
     camera_fault: ScopemapError | None
@@ -101,12 +107,19 @@ class KnowsNothing:
     """What a source says beside its frames until it has something to say: see `Source`."""
 
     pixel_aspect = 1.0
+    calibration: Calibration | None = None
     camera: CameraModel | None = None
     camera_source = ""
     camera_fault: ScopemapError | None = None
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
+
+    def _take(self, calibration: Calibration) -> None:
+        """Use the calibration beside the frames, which comes before a data set's own; opening fits it."""
+        self.calibration = replace(calibration, source=f"{calibration.source} beside the frames")
+        self.camera, self.camera_source = calibration.camera, self.calibration.source
+        self.depth_scale_mm = calibration.depth_scale_mm
 
 
 def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:
@@ -130,8 +143,11 @@ class Sequence:
     camera_source : how the camera is known, one phrase.
     size_source : where the working size comes from, one phrase.
     calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
+    focal_is_stated : whether the field of view was given, not assumed.
     selection : slice over the input's frames.
     depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
+    focal_sigma_px : standard deviation of an estimated focal length at the working size, None where none is known.
+    choice : which of the selected frames are left out.
     """
 
     source: Source
@@ -140,8 +156,11 @@ class Sequence:
     camera_source: str
     size_source: str
     calibrated: bool
+    focal_is_stated: bool = False
     selection: slice = field(default_factory=lambda: slice(None))
     depth_scale_mm: float | None = None
+    focal_sigma_px: float | None = None
+    choice: FrameChoice = field(default_factory=FrameChoice)
 
     @property
     def name(self) -> str:
@@ -161,8 +180,16 @@ class Sequence:
 
     @property
     def count(self) -> int | None:
-        """Number of selected frames, or None where only reading on would tell; a video's is its header's claim."""
+        """Number of selected frames, those that will be skipped too, or None where only reading on would tell.
+
+        A video's is its header's claim.
+        """
         return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
+
+    @property
+    def skipped(self) -> list[SkippedFrame]:
+        """The selected frames that were left out so far, as `choice` has it, in order."""
+        return [frame for _, frame in sorted(self.choice.skipped.items())]
 
     @property
     def notes(self) -> list[str]:
@@ -182,24 +209,35 @@ class Sequence:
     def frames(self) -> Iterator[Frame]:
         """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two."""
         found = 0
-        for item in self.source.frames(self.selection):
+        for item in self.choice(self.source.frames(self.selection)):
             rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
             yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
             found += 1
         if found < 2:
-            raise InputError(f"reading {self.path}: {found} readable frame(s) in the selection, two are needed")
+            raise InputError(
+                f"reading {self.path}: {found} readable frame(s) in the selection, two are needed{self._why_so_few()}"
+            )
 
-    def with_focal(self, focal_px: float, source: str) -> Sequence:
+    def with_focal(self, focal_px: float, source: str, sigma_px: float | None = None) -> Sequence:
         """Return the sequence with another guess of an unknown camera.
 
-        `focal_px` is the horizontal focal length at the working size; `source` says how it is known. Raises
-        `CalibrationError` where the camera is known.
+        `focal_px` is the horizontal focal length at the working size, `sigma_px` its standard deviation where one is
+        known; `source` says how it is known. Raises `CalibrationError` where the camera is known.
         """
         if self.calibrated:
             raise CalibrationError(f"the focal length of {self.path} is known ({self.camera_source}); it stays")
         camera = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
         target = working_camera(camera, (self.camera.width, self.camera.height))
-        return replace(self, rectifier=Rectifier(camera, target), camera_source=source)
+        return replace(self, rectifier=Rectifier(camera, target), camera_source=source, focal_sigma_px=sigma_px)
+
+    def _why_so_few(self) -> str:
+        if not self.skipped:
+            return ""
+        frame = self.skipped[-1]
+        return (
+            f" ({len(self.skipped)} skipped: frame {frame.index} {frame.reason}; a higher input.fps or "
+            "input.skip_duplicates=false uses more)"
+        )
 
     def _truth(self, index: int) -> Truth | None:
         truth = self.source.truth(index)

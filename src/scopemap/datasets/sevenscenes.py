@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.calibration import rescaled_note
+from scopemap.calibration.plain_numbers import read_intrinsics
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.images import ImageFolder, image_files, read_depth16
-from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.rectification import DepthSensor
@@ -74,7 +75,7 @@ class SevenScenesFolder(ImageFolder):
         if stated is None or stated == DEPTH_CAMERA.resized(self.width, self.height):
             self._check_aspect()
             self.camera = COLOUR_CAMERA.resized(self.width, self.height)
-            self.camera_source = "a Kinect's nominal colour camera"
+            self.camera_source = f"a Kinect's nominal colour camera{rescaled_note(COLOUR_CAMERA, self.camera)}"
             self.depth_sensor = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
             self.notes.append("depth and poses are the depth camera's: brought to the colour camera beside it")
         else:

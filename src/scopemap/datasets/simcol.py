@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.calibration.plain_numbers import read_intrinsics
 from scopemap.datasets.images import ImageFolder, frame_number, image_files
-from scopemap.datasets.intrinsics import read_intrinsics
 from scopemap.datasets.unity import mirrored, numbers_of, poses_of_rows
 from scopemap.decoding import read_decoded
 from scopemap.errors import InputError

@@ -8,27 +8,22 @@ videos", IJCARS 2023, arXiv 2304.08023.
 
 from __future__ import annotations
 
-import configparser
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.calibration.stereo_ini import read_left_camera
 from scopemap.datasets.posed_video import PosedVideo
 from scopemap.datasets.unity import numbers_of, poses_of_rows
-from scopemap.errors import CalibrationError, InputError
-from scopemap.lenses import OpenCvCamera
+from scopemap.errors import InputError
 from scopemap.trajectories.poses import are_frame_numbers
 from scopemap.trajectories.text import fields_of, text_lines
 
 _CALIBRATION = "StereoCalibration.ini"
 _POSES = "groundtruth.txt"
-_LEFT = "StereoLeft"
 _PUBLISHED_ASPECT = 1280 / 1024
 _MM_PER_METRE = 1000.0
-_MOST_LENS_TERMS = 8
-_LARGEST_SIDE_PX = 100_000
 
 
 class StereoMisFolder(PosedVideo):
@@ -124,30 +119,6 @@ def read_groundtruth(file: Path) -> Groundtruth:
     known, T = poses_of_rows(values[:, -7:], _MM_PER_METRE, where)
     poses = {int(number) - offset: pose for number, pose in zip(numbers[known], T, strict=True)}
     return Groundtruth(poses, offset, columns == 8, len(rows))
-
-
-def read_left_camera(file: Path) -> CameraModel:
-    """Return the left camera of a `StereoCalibration.ini`, at the size that it was calibrated at.
-
-    `[StereoLeft]` holds res_x, res_y, fc_x, fc_y, cc_x, cc_y and the lens kc_0 ... in OpenCV's order. Raises
-    `CalibrationError` where one of them is missing or no number.
-    """
-    parser = configparser.ConfigParser(interpolation=None)
-    try:
-        parser.read_string(file.read_text(encoding="utf-8-sig"))
-        left = parser[_LEFT]
-        size = [float(left[key]) for key in ("res_x", "res_y")]
-        fx, fy, cx, cy = (float(left[key]) for key in ("fc_x", "fc_y", "cc_x", "cc_y"))
-        lens = tuple(float(left[key]) for i in range(_MOST_LENS_TERMS) if (key := f"kc_{i}") in left)
-        if not np.isfinite([*size, fx, fy, cx, cy, *lens]).all() or min(size) < 1 or max(size) > _LARGEST_SIDE_PX:
-            raise ValueError(f"[{_LEFT}] holds NaN, infinity or a size that is none")
-        pinhole = PinholeCamera(fx, fy, cx, cy, round(size[0]), round(size[1]))
-        return OpenCvCamera(pinhole, lens) if any(lens) else pinhole
-    except KeyError as error:
-        raise CalibrationError(f"cannot read the calibration in {file}: {error} is missing") from None
-    except (OSError, ValueError, configparser.Error) as error:
-        what = str(error).partition("\n")[0]
-        raise CalibrationError(f"cannot read the calibration in {file}: {what}") from None
 
 
 def _videos_in(path: Path) -> list[Path]:

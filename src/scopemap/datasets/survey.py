@@ -11,8 +11,9 @@ import numpy as np
 
 from scopemap.camera import PinholeCamera
 from scopemap.datasets.pose_depth import Agreement, PoseDepthTest
-from scopemap.datasets.sequence import Sequence, SourceFrame
+from scopemap.datasets.sequence import Sequence
 from scopemap.errors import ScopemapError
+from scopemap.pictures.duplicates import repeats
 from scopemap.trajectory import path_length_mm
 
 RIGID_TOLERANCE = 1e-2
@@ -47,7 +48,8 @@ class FrameRecord:
     """Figures of one frame.
 
     brightest : level, of 255, that 1 % of the pixels exceed. spread : largest standard deviation of a channel.
-    repeats : whether it shows exactly what the frame before it shows. T_world_camera : as the source has it, or None.
+    repeats : whether it shows what the frame before it shows, but for lossy coding. T_world_camera : as the source has
+    it, or None.
     """
 
     index: int
@@ -71,7 +73,9 @@ class Survey:
     announced : numbers of the frames that should be there, None where only reading on tells.
     frames : what could be read.
     agreements : of poses and depth, by growing lag; empty where there are no two frames with both.
-    stopped : the error that ended the reading, or "". truth_faults : errors in reading poses and depth.
+    off : relative error of a frame's depth against that of one about 10 before it, moved by the poses, by frame number.
+    stopped : the error that ended the reading, or "". truth_faults : errors in reading poses and depth, each with the
+    first frame that it concerns.
     notes, warnings : the source's.
     """
 
@@ -83,6 +87,7 @@ class Survey:
     announced: tuple[int, ...] | None
     frames: tuple[FrameRecord, ...]
     agreements: tuple[Agreement, ...]
+    off: dict[int, float]
     stopped: str
     truth_faults: tuple[str, ...]
     notes: tuple[str, ...]
@@ -155,12 +160,12 @@ def survey(sequence: Sequence, listener: Callable[[int, int | None], None] | Non
     """
     source, camera = sequence.source, sequence.rectifier.source.central
     stamps = source.stamps(sequence.selection)
-    faults: list[str] = []
+    faults: dict[str, int] = {}
     records: list[FrameRecord] = []
-    test = PoseDepthTest(sequence.camera)
+    test, compared = PoseDepthTest(sequence.camera), list[int]()
     stopped = ""
     try:
-        for record in _records(sequence, test, faults):
+        for record in _records(sequence, test, compared, faults):
             records.append(record)
             if listener is not None:
                 listener(len(records), sequence.count)
@@ -175,22 +180,26 @@ def survey(sequence: Sequence, listener: Callable[[int, int | None], None] | Non
         announced=None if stamps is None else tuple(index for index, _ in stamps),
         frames=tuple(records),
         agreements=test.agreements,
+        off=dict(zip(compared[1:], test.near_errors, strict=True)),
         stopped=stopped,
-        truth_faults=tuple(faults),
+        truth_faults=tuple(f"frame {index}: {fault}" for fault, index in faults.items()),
         notes=tuple(sequence.notes),
         warnings=tuple(sequence.warnings),
     )
 
 
-def _records(sequence: Sequence, test: PoseDepthTest, faults: list[str]) -> Iterator[FrameRecord]:
-    before: SourceFrame | None = None
+def _records(
+    sequence: Sequence, test: PoseDepthTest, compared: list[int], faults: dict[str, int]
+) -> Iterator[FrameRecord]:
+    before: np.ndarray | None = None
     for frame in sequence.source.frames(sequence.selection):
         T_world_camera, depth_mm = _truth(sequence, frame.index, faults)
         depth = None if depth_mm is None else _depth_record(depth_mm)
         if depth_mm is not None and depth is not None and depth.looked_at and not depth.is_constant:
-            working_mm = _attempt(partial(sequence.depth_rectifier.nearest, depth_mm), faults)
+            working_mm = _attempt(partial(sequence.depth_rectifier.nearest, depth_mm), frame.index, faults)
             if working_mm is not None and T_world_camera is not None and is_rigid(T_world_camera):
                 test.add(working_mm, T_world_camera)
+                compared.append(frame.index)
         sample = _thinned(frame.rgb)
         yield FrameRecord(
             frame.index,
@@ -198,27 +207,26 @@ def _records(sequence: Sequence, test: PoseDepthTest, faults: list[str]) -> Iter
             frame.name,
             brightest=float(np.percentile(sample, 99)),
             spread=float(sample.std(axis=(0, 1)).max()),
-            repeats=before is not None and np.array_equal(frame.rgb, before.rgb),
+            repeats=before is not None and before.shape == sample.shape and repeats(sample, before),
             T_world_camera=T_world_camera,
             depth=depth,
         )
-        before = frame
+        before = sample
 
 
-def _truth(sequence: Sequence, index: int, faults: list[str]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    truth = _attempt(partial(sequence.source.truth, index), faults)
+def _truth(sequence: Sequence, index: int, faults: dict[str, int]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    truth = _attempt(partial(sequence.source.truth, index), index, faults)
     if truth is not None:
         return truth.T_world_camera, truth.depth_mm
     # Depth that cannot be read does not take the pose with it.
-    return _attempt(partial(sequence.source.pose, index), faults), None
+    return _attempt(partial(sequence.source.pose, index), index, faults), None
 
 
-def _attempt(read: Callable[[], _T], faults: list[str]) -> _T | None:
+def _attempt(read: Callable[[], _T], index: int, faults: dict[str, int]) -> _T | None:
     try:
         return read()
     except ScopemapError as error:
-        if str(error) not in faults:
-            faults.append(str(error))
+        faults.setdefault(str(error), index)
     return None
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.calibration import fitted_to
+from scopemap.calibration import fitted_to, rescaled_note
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.datasets.images import ImageFolder, read_depth16
 from scopemap.errors import InputError
@@ -75,7 +75,8 @@ class TumRgbdFolder(ImageFolder):
             number = room[1] or room[2]
             with self._making_camera():
                 self.camera = fitted_to(CAMERAS[number], (self.width, self.height), f"shipped for freiburg{number}")
-                self.camera_source = f"published calibration of freiburg{number}"
+                note = rescaled_note(CAMERAS[number], self.camera)
+                self.camera_source = f"published calibration of freiburg{number}{note}"
         self._depth_of = self._associated_depth({name: number for number, (_, name) in there.items()})
         self._pose_of = self._associated_poses()
 

@@ -15,13 +15,16 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.trajectories.poses import rigid, stamped
 from scopemap.trajectories.text import read_numbers, tum_poses
-from scopemap.trajectory import MM_PER_UNIT, STATUSES, Trajectory, Unit
+from scopemap.trajectory import MM_PER_UNIT, SKIPPED, STATUSES, Trajectory, Unit
 
 _SAME_TIME_S = 2e-3
 
 
 def read_run(folder: Path, unit: Unit) -> Trajectory:
-    """Read `trajectory.tum` and `frames.csv` of a run, always mm, with frame numbers and lost frames."""
+    """Read `trajectory.tum` and `frames.csv` of a run, always mm, with frame numbers and lost frames.
+
+    Frames that the run skipped have no pose, and are not among them.
+    """
     table = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
     indices, times_s, status = _read_frames(folder / "frames.csv")
     same_run = len(indices) == len(table.values) and np.abs(times_s - table.values[:, 0]).max() <= _SAME_TIME_S
@@ -36,7 +39,8 @@ def read_run(folder: Path, unit: Unit) -> Trajectory:
 
 def _read_frames(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        read = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        rows = [row for row in read if row["status"] != SKIPPED]
         indices = np.array([int(row["index"]) for row in rows], dtype=np.int64)
         times_s = np.array([float(row["time_s"]) for row in rows])
         status = np.array([row["status"] for row in rows])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -67,7 +68,8 @@ def open_trajectory(path: Path, unit: Unit, kind: str) -> Trajectory:
     """Return the trajectory in `path`; arguments and errors as of `scopemap.trajectory.read_trajectory`."""
     if kind not in KINDS:
         raise SettingsError(f"unknown kind of trajectory '{kind}'; known are {', '.join(KINDS)}")
-    if not path.exists():
+    # Path.exists raises for names that no file system allows.
+    if not os.path.exists(path):
         raise InputError(f"cannot read a trajectory: no file or folder {path}")
     _refuse_pickle(path)
     if kind != "auto":

@@ -1,0 +1,181 @@
+"""Calibration boards: a checkerboard, or a ChArUco board, of which a part is enough; how each is found in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from scopemap.errors import SettingsError
+
+_FEWEST, _MOST = 3, 100  # a side, inner corners or squares
+_FEWEST_CORNERS = 8
+# A board is first looked for in a picture of this size: where there is none, a large one takes seconds to say so.
+_SEARCH_SIDE_PX = 800
+_REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners of a board in a picture.
+
+    Attributes
+    ----------
+    board_mm : (N, 3) float64, where they lie on the board, z = 0.
+    pixels : (N, 2) float64, where they are seen.
+    """
+
+    board_mm: np.ndarray
+    pixels: np.ndarray
+
+
+class Board(Protocol):
+    """What is printed on the plate."""
+
+    @property
+    def described(self) -> str:
+        """The board in a few words."""
+
+    def find(self, grey: np.ndarray) -> Corners | None:
+        """Return the board's corners in a picture (h, w) uint8, None where it is not seen or too little of it."""
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the picture.
+
+    Raises `SettingsError` for a board that cannot be.
+    """
+
+    columns: int
+    rows: int
+    square_mm: float
+
+    def __post_init__(self) -> None:
+        _check(self.columns, self.rows, self.square_mm)
+
+    @property
+    def described(self) -> str:
+        """The board in a few words."""
+        return f"checkerboard of {self.columns}x{self.rows} inner corners, squares of {self.square_mm:g} mm"
+
+    @cached_property
+    def corners_mm(self) -> np.ndarray:
+        """All corners (N, 3), row by row."""
+        rows, columns = np.mgrid[: self.rows, : self.columns]
+        grid = np.stack([columns.ravel(), rows.ravel(), np.zeros(self.rows * self.columns)], -1)
+        return grid * self.square_mm
+
+    def find(self, grey: np.ndarray) -> Corners | None:
+        """Return all corners, None where one is missing.
+
+        Found by Duda and Frese (BMVC 2018), else by OpenCV's older search; then placed where gradients agree.
+        """
+        shrink = min(1.0, _SEARCH_SIDE_PX / max(grey.shape))
+        small = grey if shrink == 1 else cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        size = (self.columns, self.rows)
+        found, pixels = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if not found:
+            found, pixels = cv2.findChessboardCorners(small, size, flags=_CLASSIC)
+        if not found:
+            return None
+        scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+        pixels = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+        return Corners(self.corners_mm, _refined(grey, pixels))
+
+
+@dataclass(frozen=True)
+class CharucoBoard:
+    """A ChArUco board: `columns` x `rows` squares, the white ones with a marker that tells which they are.
+
+    `dictionary` is OpenCV's name of the markers' set; `legacy`: laid out as by OpenCV before 4.6. Raises
+    `SettingsError` for a board that cannot be.
+    """
+
+    columns: int
+    rows: int
+    square_mm: float
+    marker_mm: float
+    dictionary: str = "DICT_4X4_50"
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        _check(self.columns, self.rows, self.square_mm)
+        if not 0 < self.marker_mm < self.square_mm:
+            raise SettingsError(
+                f"a marker of {self.marker_mm:g} mm does not lie within a square of {self.square_mm:g} mm"
+            )
+        if self.dictionary not in DICTIONARIES:
+            raise SettingsError(f"unknown markers '{self.dictionary}': choose one of {', '.join(DICTIONARIES)}")
+        known, wanted = len(self._markers.bytesList), self.columns * self.rows // 2
+        if wanted > known:
+            raise SettingsError(
+                f"a ChArUco board of {self.columns}x{self.rows} squares has {wanted} markers, {self.dictionary} only "
+                f"{known}: count squares, not corners, or name its dictionary"
+            )
+
+    @property
+    def described(self) -> str:
+        """The board in a few words."""
+        return (
+            f"ChArUco board of {self.columns}x{self.rows} squares of {self.square_mm:g} mm, markers of "
+            f"{self.marker_mm:g} mm from {self.dictionary}{', legacy layout' if self.legacy else ''}"
+        )
+
+    @property
+    def _markers(self) -> cv2.aruco.Dictionary:
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+
+    @cached_property
+    def layout(self) -> cv2.aruco.CharucoBoard:
+        """The board as OpenCV knows it."""
+        size = (self.columns, self.rows)
+        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, self._markers)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @cached_property
+    def _detector(self) -> cv2.aruco.CharucoDetector:
+        return cv2.aruco.CharucoDetector(self.layout)
+
+    def find(self, grey: np.ndarray) -> Corners | None:
+        """Return the corners that are told by markers beside them, None for fewer than 8 or all in one line."""
+        # In a small picture markers have few pixels: doubled, more are read, and corners are twice as exact.
+        grow = 2 if max(grey.shape) <= _SEARCH_SIDE_PX else 1
+        large = grey if grow == 1 else cv2.resize(grey, None, fx=grow, fy=grow, interpolation=cv2.INTER_CUBIC)
+        pixels, ids, _, _ = self._detector.detectBoard(large)
+        if ids is None or len(ids) < _FEWEST_CORNERS:
+            return None
+        board_mm = np.asarray(self.layout.getChessboardCorners(), dtype=np.float64)[ids.ravel()]
+        if np.any(np.ptp(board_mm[:, :2], axis=0) == 0):
+            return None
+        return Corners(board_mm, (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) / grow - 0.5)
+
+
+DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+"""Names of the sets of markers that OpenCV brings along."""
+
+
+def _check(columns: int, rows: int, square_mm: float) -> None:
+    if not all(_FEWEST <= side <= _MOST for side in (columns, rows)):
+        raise SettingsError(f"a board of {columns}x{rows} cannot be: {_FEWEST} to {_MOST} a side are possible")
+    if not 0 < square_mm < np.inf:
+        raise SettingsError(f"the squares of a board must be larger than 0 mm, got {square_mm:g}")
+
+
+def _refined(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return `pixels` (N, 2) moved onto the corners nearby, to a fraction of a pixel."""
+    reach = max(2, int(0.4 * nearest_px(pixels)))
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    return cv2.cornerSubPix(grey, start, (reach, reach), (-1, -1), _REFINED).reshape(-1, 2).astype(np.float64)
+
+
+def nearest_px(pixels: np.ndarray) -> float:
+    """Return the median distance of corners (N, 2) from their nearest neighbour, px."""
+    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return float(np.median(distance.min(axis=1)))

@@ -1,0 +1,156 @@
+"""`scopemap calibrate`: the camera from a video of a checkerboard or a ChArUco board."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from enum import StrEnum
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from scopemap.cli.figures import without_nan
+from scopemap.cli.options import AsJson, Quiet, parse_slice
+from scopemap.cli.progress import count_progress
+from scopemap.errors import InputError, SettingsError
+
+if TYPE_CHECKING:
+    from scopemap.boards import Board, BoardCalibration
+
+_ENDINGS = (".yaml", ".yml")
+
+
+class ModelChoice(StrEnum):
+    """Camera models to fit."""
+
+    AUTO = "auto"
+    PINHOLE = "pinhole"
+    FISHEYE = "fisheye"
+
+
+def calibrate(
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="A video or a folder of images of the board.")],
+    board: Annotated[
+        str, typer.Option(metavar="CxR", help="The board: inner corners, 9x6; of a ChArUco board squares.")
+    ],
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    charuco: Annotated[bool, typer.Option("--charuco", help="A ChArUco board: markers in its white squares.")] = False,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker, mm.")] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Its set of markers, by OpenCV's name; else DICT_4X4_50.")
+    ] = None,
+    legacy: Annotated[bool, typer.Option("--legacy", help="It was laid out by OpenCV before 4.6.")] = False,
+    model: Annotated[
+        ModelChoice, typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen.")
+    ] = ModelChoice.AUTO,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Calibration to write; its picture lies beside it.")] = Path(
+        "calibration.yaml"
+    ),
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Look at every N-th of them; else at about 300 in all.")
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Name of a reader (see `scopemap datasets list`); told from what lies there if left out."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier calibration.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate the camera with a board held before it; the file serves every command as --camera."""
+    picture = _prepared(out, overwrite)
+    target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
+    selection = parse_slice(frames) if frames else None
+    # Imported here, so that --help does not wait for it.
+    from scopemap import boards
+    from scopemap.boards.picture import draw_calibration
+    from scopemap.datasets import open_sequence
+
+    silent = quiet or as_json
+    sequence = open_sequence(source, dataset=dataset, frames=selection)
+    with count_progress("looking for the board", "looked at", silent=silent) as listener:
+        search = boards.find_views(sequence, target, every, listener)
+    if not silent:
+        typer.echo(f"the board was found in {len(search.views)} of {search.looked_at} frames; fitting", err=True)
+    done = boards.calibrate(search, target, model.value, sequence.source.pixel_aspect)
+    boards.save_calibration(done, out)
+    draw_calibration(done, boards.picture_of(done.example, sequence, search.every), picture)
+    for warning in [] if quiet else [*sequence.warnings, *done.warnings]:
+        typer.echo(f"warning: {warning}", err=True)
+    if as_json:
+        looked = {"looked_at": search.looked_at, "every": search.every, "found": len(search.views)}
+        places = {"calibration": str(out), "picture": str(picture), "board": target.described}
+        typer.echo(json.dumps(without_nan(places | looked | done.summary()), indent=2))
+    elif not quiet:
+        _print(done)
+        typer.echo(f"calibration: {out} (use it as --camera {out}); picture: {picture}")
+
+
+def _prepared(out: Path, overwrite: bool) -> Path:
+    """Return where the picture goes; an error now rather than after the work where nothing can be written."""
+    if out.suffix.lower() not in _ENDINGS:
+        raise SettingsError(f"cannot write the calibration to {out}: its name has to end in {' or '.join(_ENDINGS)}")
+    picture = out.with_suffix(".png")
+    for file in (out, picture):
+        if file.is_dir() or (file.exists() and not overwrite):
+            raise InputError(f"writing the calibration: {file} is there already; give --overwrite or another --out")
+    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise InputError(f"writing the calibration: the folder {out.parent} is not there or not writable")
+    return picture
+
+
+def _board(
+    text: str, square_mm: float, *, charuco: bool, marker_mm: float | None, dictionary: str | None, legacy: bool
+) -> Board:
+    from scopemap.boards import CharucoBoard, Checkerboard
+
+    match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", text)
+    if not match:
+        raise SettingsError(f"cannot read the board '{text}': expected COLUMNSxROWS such as 9x6")
+    columns, rows = int(match[1]), int(match[2])
+    if charuco and marker_mm is None:
+        raise SettingsError("a ChArUco board needs the side of its markers: give --marker-mm")
+    if charuco and marker_mm is not None:
+        return CharucoBoard(columns, rows, square_mm, marker_mm, dictionary or "DICT_4X4_50", legacy)
+    if marker_mm is not None or dictionary is not None or legacy:
+        raise SettingsError("--marker-mm, --dictionary and --legacy are for a ChArUco board: give --charuco, too")
+    return Checkerboard(columns, rows, square_mm)
+
+
+def _print(done: BoardCalibration) -> None:
+    facts, console = done.summary(), Console()
+    table = Table("frame", "name")
+    for title in ("corners", "error (px RMS)", "tilt (deg)", "distance (mm)"):
+        table.add_column(title, justify="right")
+    for view in facts["views"]:
+        figures = (f"{view['rms_px']:.3f}", f"{view['tilt_deg']:.0f}", f"{view['distance_mm']:.1f}")
+        table.add_row(str(view["frame"]), escape(view["name"]), str(view["corners"]), *figures)
+    console.print(table)
+    table = Table("camera")
+    for title in ("value", "standard deviation"):
+        table.add_column(title, justify="right")
+    for name, deviation in facts["deviations"].items():
+        table.add_row(name, f"{done.fit.parameters[name]:.5g}", f"{deviation:.2g}")
+    console.print(table)
+    for out in facts["left_out"]:
+        typer.echo(f"left out: frame {out['frame']}, {out['reason']}")
+    typer.echo(
+        f"left out besides: {len(done.blurred)} blurred view(s), {done.alike} that show what another one shows, "
+        f"{done.stray_corners} corner(s) that do not fit"
+    )
+    typer.echo(
+        f"model: {done.fit.form.described}; {done.fit.rms_px:.3f} px RMS over {len(done.views)} views, which cover "
+        f"{100 * done.coverage:.0f} % of the picture"
+    )
+    tried = sorted(done.held_out_px.items(), key=lambda item: item[1])
+    told = [f"{form.described} " + (f"{error:.3f} px" if error < inf else "impossible") for form, error in tried]
+    typer.echo("error in views held out: " + "; ".join(told))

@@ -1,0 +1,111 @@
+"""`scopemap inspect`: what is peculiar about a clinical video, and which option answers it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from scopemap.cli.figures import without_nan
+from scopemap.cli.options import AsJson, Quiet
+from scopemap.cli.progress import count_progress
+from scopemap.errors import InputError
+
+if TYPE_CHECKING:
+    from scopemap.inspection.inspecting import Inspection
+
+_COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
+
+
+def inspect(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="VIDEO", help="A video file, a folder of images, the folder of a data set's sequence."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The picture, a PNG; by default NAME_inspection.png in this folder."),
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write masks of overlays and of pictures in the picture, for mask.files."),
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Calibration, for the mask that a run with it would find.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier picture and masks.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Read a video once and show what was found in it: format, timing, field of view, overlays, bad stretches."""
+    file = out or Path(f"{source.resolve().stem if source.is_file() else source.resolve().name}_inspection.png")
+    _refuse(file, masks, overwrite)
+
+    from scopemap.inspection.inspecting import inspect as inspection_of
+    from scopemap.inspection.masks import write_masks
+    from scopemap.inspection.picture import draw_inspection
+
+    with count_progress("inspecting", "inspected", silent=quiet or as_json) as listener:
+        found = inspection_of(source, dataset=dataset, camera=camera, listener=listener)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        draw_inspection(found, file)
+        written = 0 if masks is None else write_masks(found, masks)
+    except OSError as error:
+        raise InputError(f"writing the inspection of {source}: {error.strerror or error}") from None
+    if as_json:
+        report = found.report | {"path": str(source), "picture": str(file)}
+        typer.echo(json.dumps(without_nan(report), indent=2))
+    elif not quiet:
+        _print(source, found)
+        typer.echo(f"picture: {file}")
+        if masks is not None:
+            typer.echo(f"masks: {written} in {masks}" if written else "masks: none, there is nothing to leave out")
+
+
+def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
+    if file.suffix.lower() != ".png":
+        raise InputError(f"cannot write the picture {file}: its name must end in .png")
+    if file.is_dir():
+        raise InputError(f"cannot write the picture {file}: there is a folder of that name")
+    if file.exists() and not overwrite:
+        raise InputError(f"{file} exists; give another name with --out, or --overwrite")
+    if masks is not None and masks.exists() and not masks.is_dir():
+        raise InputError(f"cannot write masks into {masks}: it is no folder")
+    if masks is not None and masks.is_dir() and any(masks.iterdir()) and not overwrite:
+        raise InputError(f"{masks} is not empty; give another folder with --masks, or --overwrite")
+
+
+def _print(source: Path, found: Inspection) -> None:
+    console = Console()
+    typer.echo(str(source))
+    table = Table("fact")
+    table.add_column("value", justify="right")
+    for name, value in found.facts.items():
+        table.add_row(name, _text(value))
+    console.print(table)
+    if found.findings:
+        table = Table("severity", "code", "what was found")
+        for finding in found.findings:
+            table.add_row(finding.severity, finding.code, escape(finding.message), style=_COLOURS[finding.severity])
+        console.print(table)
+    advised = [finding for finding in found.findings if finding.advice]
+    for finding in advised:
+        typer.echo(f"advice: {finding.code}: {finding.advice}")
+    if not found.findings:
+        typer.echo("nothing peculiar was found")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

@@ -1,0 +1,61 @@
+"""The MPEG stream inside a DICOM file, decoded in place."""
+
+from __future__ import annotations
+
+import io
+from bisect import bisect_right
+from itertools import accumulate
+from typing import BinaryIO
+
+from scopemap.datasets.dicom_files import Header, fragments
+from scopemap.datasets.video import VideoFile
+from scopemap.errors import InputError
+
+
+class EncapsulatedVideo(VideoFile):
+    """A video (MPEG-2, MPEG-4 AVC, HEVC) that is packed into the pixel data of a DICOM file, in fragments."""
+
+    def __init__(self, header: Header) -> None:
+        self._pieces = [(header.start, header.length)] if header.length is not None else fragments(header)
+        if not any(length for _, length in self._pieces):
+            raise InputError(f"reading {header.path}: the DICOM file says that it holds a video, but that is empty")
+        super().__init__(header.path)
+
+    def _media(self) -> BinaryIO:
+        return io.BufferedReader(_Pieces(self.path.open("rb"), self._pieces))
+
+
+class _Pieces(io.RawIOBase):
+    """Stretches (start, length) of a file, read as if they were one file."""
+
+    def __init__(self, file: BinaryIO, pieces: list[tuple[int, int]]) -> None:
+        self._file, self._pieces = file, pieces
+        self._ends = list(accumulate(length for _, length in pieces))
+        self._place = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._ends[-1]}[whence]
+        self._place = max(base + offset, 0)
+        return self._place
+
+    def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override]
+        piece = bisect_right(self._ends, self._place)
+        if piece == len(self._pieces):
+            return 0
+        left = self._ends[piece] - self._place
+        start, length = self._pieces[piece]
+        self._file.seek(start + length - left)
+        data = self._file.read(min(left, len(buffer)))
+        buffer[: len(data)] = data
+        self._place += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

@@ -1,0 +1,49 @@
+"""Time stamps of a video's frames as they are used: those of the stream where these can be meant."""
+
+from __future__ import annotations
+
+# A recording may pause; a stamp that runs ahead by more is of another clock.
+_LONGEST_GAP_S = 60.0
+
+
+class TimeStamps:
+    """Repairs stamps while frames are read in order.
+
+    rate_hz : frames per second. A stamp that is missing is put at the rate after the last one that was there. One that
+    does not increase, or runs ahead by more than a minute, is too, and all that follow are moved with it: files that
+    were joined each begin at 0.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz, self._shift_s = rate_hz, 0.0
+        self._known = (0, 0.0)
+        self._last_s: float | None = None
+        self.repaired = 0
+        """How many stamps were missing or moved."""
+        self.first_repaired: int | None = None
+        """Number of the first such frame."""
+        self._stated_s: tuple[float, float] | None = None
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first to the last stamp as the stream has them, s."""
+        return 0.0 if self._stated_s is None else self._stated_s[1] - self._stated_s[0]
+
+    def __call__(self, index: int, stamp_s: float | None) -> float:
+        """Return when the frame with number `index` was taken, s, by its stamp, s or None."""
+        number, known_s = self._known
+        time_s = known_s + (index - number) / self._rate_hz
+        if stamp_s is not None and self._is_meant(stamp_s + self._shift_s):
+            time_s = stamp_s + self._shift_s
+        else:
+            self._shift_s += 0.0 if stamp_s is None else time_s - (stamp_s + self._shift_s)
+            self.first_repaired = index if self.first_repaired is None else self.first_repaired
+            self.repaired += 1
+        if stamp_s is not None:
+            self._known = (index, time_s)
+            self._stated_s = (stamp_s if self._stated_s is None else self._stated_s[0], stamp_s)
+        self._last_s = time_s
+        return time_s
+
+    def _is_meant(self, time_s: float) -> bool:
+        return self._last_s is None or 0 < time_s - self._last_s <= _LONGEST_GAP_S

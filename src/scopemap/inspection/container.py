@@ -1,0 +1,90 @@
+"""What a video file's header says: codec, size, rate, shape of pixels, bits, range, rotation, fields, length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+
+from scopemap.inspection.finding import Finding
+
+_FULL_RANGE = 2
+# FFmpeg's numbers for the order of fields: 0 unknown, 1 progressive, then the four kinds of interlaced.
+_PROGRESSIVE = 1
+
+
+@dataclass(frozen=True)
+class Container:
+    """Facts of a video file; None: the header does not say.
+
+    Attributes
+    ----------
+    pixel_aspect : width of a pixel over its height. bits : per colour channel. full_range : whether levels use 0..255
+    (as opposed to 16..235). rotation_deg : by which a player turns the picture. interlaced : whether it says so.
+    """
+
+    container: str
+    codec: str
+    width: int
+    height: int
+    rate_hz: float | None
+    pixel_aspect: float
+    pixel_format: str
+    bits: int
+    full_range: bool
+    rotation_deg: int
+    interlaced: bool
+    frames: int | None
+    length_s: float | None
+
+
+def read_container(file: Path) -> Container | None:
+    """Return what the header and first picture of a video say, None for what is no video that can be opened."""
+    try:
+        with av.open(str(file), metadata_errors="replace") as container:
+            stream = next(iter(container.streams.video), None)
+            if stream is None or stream.codec_context is None:
+                return None
+            first = next(container.decode(stream), None)
+            if first is None:
+                return None
+            length_s = container.duration / av.time_base if container.duration else None
+            if stream.duration and stream.time_base:
+                length_s = float(stream.duration * stream.time_base)
+            return Container(
+                container=container.format.name,
+                codec=stream.codec_context.name,
+                width=first.width,
+                height=first.height,
+                rate_hz=float(stream.average_rate) if stream.average_rate else None,
+                pixel_aspect=float(stream.sample_aspect_ratio or 1),
+                pixel_format=first.format.name,
+                bits=max(component.bits for component in first.format.components),
+                full_range=first.color_range == _FULL_RANGE or first.format.name.startswith("yuvj"),
+                rotation_deg=int(first.rotation),
+                interlaced=bool(first.interlaced_frame or stream.codec_context.field_order > _PROGRESSIVE),
+                frames=stream.frames or None,
+                length_s=length_s,
+            )
+    except (av.FFmpegError, OSError, ValueError):
+        return None
+
+
+def check_container(facts: Container) -> list[Finding]:
+    """Return what in the header is unusual."""
+    found = []
+    if abs(facts.pixel_aspect - 1) > 1e-3:
+        message = f"pixels are {facts.pixel_aspect:.4g} times as wide as high; runs reckon with it"
+        found.append(Finding("info", "pixel-aspect", message))
+    if facts.bits > 8:
+        found.append(Finding("info", "bit-depth", f"{facts.bits} bits per channel; runs work on 8"))
+    if facts.rotation_deg:
+        message = (
+            f"players turn the picture by {facts.rotation_deg} deg; a calibration must fit the picture that runs see"
+        )
+        found.append(Finding("info", "rotation", message))
+    if facts.interlaced:
+        message = "the header says that the pictures are interlaced"
+        found.append(Finding("info", "field-order", message, "--deinterlace, where combs are found, too"))
+    return found

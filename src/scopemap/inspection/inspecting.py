@@ -1,0 +1,208 @@
+"""The one pass over a video: every picture is looked at once, in order, and only small copies are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scopemap.config import InputSettings
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.datasets.video import VideoFile
+from scopemap.errors import InputError, ScopemapError
+from scopemap.frame import Frame
+from scopemap.inspection.blank import check_blank
+from scopemap.inspection.blurred import check_blurred
+from scopemap.inspection.burned_in import Overlay, OverlayWatcher
+from scopemap.inspection.clip import Clip
+from scopemap.inspection.colour import check_colour
+from scopemap.inspection.container import Container, check_container, read_container
+from scopemap.inspection.exposure import check_exposure, exposure_figures
+from scopemap.inspection.field import Field, FieldWatcher
+from scopemap.inspection.finding import Finding
+from scopemap.inspection.insets import InsetWatcher
+from scopemap.inspection.packed import interlacing_findings, stereo_findings
+from scopemap.inspection.repeats import check_repeats, repeated
+from scopemap.inspection.timing import check_timing
+from scopemap.inspection.view import View, Viewer
+from scopemap.pictures.stereo_packing import Packing, packing
+
+_KEPT = 8
+# What stereo packing is told from: pictures from all parts of a video, else every tenth of the beginning.
+_PEEKED, _PEEK_EVERY = 9, 10
+_ORDER = ("error", "warning", "info")
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in a video.
+
+    Attributes
+    ----------
+    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : figures of every picture.
+    container : what the file's header says, None for folders. packed : how two views lie in a picture, or None.
+    field, overlays : as found. insets : left, top, right, bottom, shares of width and height.
+    findings : worst first. samples : a few views, evenly spread.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    clip: Clip
+    container: Container | None
+    packed: Packing | None
+    field: Field
+    overlays: tuple[Overlay, ...]
+    insets: tuple[tuple[float, float, float, float], ...]
+    findings: tuple[Finding, ...]
+    samples: tuple[View, ...]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the video is, and the usual shares of its pictures; what is not known is left out."""
+        times_s = self.clip["time_s"]
+        facts: dict[str, Any] = {} if self.container is None else asdict(self.container)
+        facts |= {"width": self.size[0], "height": self.size[1], "pictures": len(self.clip)}
+        facts |= {"span_s": float(times_s[-1] - times_s[0]), "usual_rate_hz": self.clip.rate_hz}
+        facts |= {
+            "repeated": int(repeated(self.clip).sum()),
+            "field": self.field.shape,
+            "field_share": self.field.share,
+        }
+        facts |= exposure_figures(self.clip)
+        return {name: value for name, value in facts.items() if value is not None}
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """All of it but the pictures, as JSON has it; boxes as left, top, right, bottom, shares of width and height."""
+        return {
+            "path": str(self.path),
+            "facts": self.facts,
+            "findings": [asdict(finding) for finding in self.findings],
+            "field": {"shape": self.field.shape, "share": self.field.share, "box": list(self.field.box)},
+            "overlays": [asdict(overlay) for overlay in self.overlays],
+            "insets": [list(box) for box in self.insets],
+        }
+
+
+def inspect(
+    path: Path,
+    *,
+    dataset: str | None = None,
+    camera: Path | None = None,
+    listener: Callable[[int, int | None], None] | None = None,
+) -> Inspection:
+    """Read a video, a folder of images or a data set's folder once and return what was found.
+
+    `dataset` and `camera` as in `open_sequence`; `listener(pictures read, in all or None)` is called after each. Raises
+    `InputError` and `CalibrationError` where it cannot be opened, or holds fewer than two pictures. Where reading stops
+    later, that is part of what was found.
+    """
+    plain = InputSettings(stereo="none", skip_duplicates=False)
+    sequence = open_sequence(path, dataset=dataset, camera=camera, settings=plain)
+    packed = _packed(sequence)
+    if packed is not None:
+        settings = plain.model_copy(update={"stereo": packed.layout})
+        sequence = open_sequence(path, dataset=dataset, camera=camera, settings=settings)
+    container = read_container(sequence.path) if sequence.path.is_file() else None
+    return _Pass(sequence, container, packed).inspection(listener)
+
+
+def _packed(sequence: Sequence) -> Packing | None:
+    source = sequence.source
+    pictures: list[np.ndarray] = []
+    # Where reading stops, the pass over all of it says why.
+    with suppress(ScopemapError):
+        if isinstance(source, VideoFile):
+            pictures = source.samples(_PEEKED)
+        else:
+            pictures.extend(frame.rgb for frame in source.frames(slice(0, _PEEKED * _PEEK_EVERY, _PEEK_EVERY)))
+    return packing(pictures, source.pixel_aspect)
+
+
+class _Sampled:
+    """Keeps a few views of a video of unknown length, evenly spread."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._step, self._seen = most, 1, 0
+        self.kept: list[View] = []
+
+    def add(self, view: View) -> None:
+        if self._seen % self._step == 0 and len(self.kept) == self._most:
+            self.kept = self.kept[::2]
+            self._step *= 2
+        if self._seen % self._step == 0:
+            self.kept.append(view)
+        self._seen += 1
+
+
+class _Pass:
+    """One pass over a sequence."""
+
+    def __init__(self, sequence: Sequence, container: Container | None, packed: Packing | None) -> None:
+        self._sequence, self._container, self._packed = sequence, container, packed
+        self._field, self._overlays, self._insets = FieldWatcher(), OverlayWatcher(), InsetWatcher()
+        self._sampled = _Sampled(_KEPT)
+
+    def inspection(self, listener: Callable[[int, int | None], None] | None) -> Inspection:
+        """Read all pictures and return what was found."""
+        sequence = self._sequence
+        figures, stopped = [], ""
+        try:
+            for view in self._views():
+                figures.append(view.figures)
+                if listener is not None:
+                    listener(len(figures), sequence.count)
+        except ScopemapError as error:
+            stopped = str(error)
+        if len(figures) < 2:
+            found = stopped or f"{len(figures)} picture(s) could be read, two are needed"
+            raise InputError(f"inspecting {sequence.path}: {found}")
+        clip = Clip(tuple(figures), not any(note.startswith("time stamps:") for note in sequence.source.notes))
+        findings = sorted(self._findings(clip, stopped), key=lambda finding: _ORDER.index(finding.severity))
+        samples = tuple(self._sampled.kept)
+        height, width = samples[0].small.shape[:2]
+        return Inspection(
+            path=sequence.path,
+            size=(sequence.source.width, sequence.source.height),
+            clip=clip,
+            container=self._container,
+            packed=self._packed,
+            field=self._field.field(),
+            overlays=tuple(self._overlays.overlays()),
+            insets=tuple((a / width, b / height, c / width, d / height) for a, b, c, d in self._insets.boxes()),
+            findings=tuple(findings),
+            samples=samples,
+        )
+
+    def _views(self) -> Iterator[View]:
+        viewer, sequence = Viewer(), self._sequence
+        for item in sequence.source.frames(sequence.selection):
+            rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
+            frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
+            view = viewer(item.rgb, frame)
+            for watcher in (self._field, self._overlays, self._insets, self._sampled):
+                watcher.add(view)
+            yield view
+
+    def _findings(self, clip: Clip, stopped: str) -> list[Finding]:
+        pictures = [view.rgb for view in self._sampled.kept if not view.figures.blank]
+        return [
+            *([Finding("error", "reading-stopped", stopped)] if stopped else []),
+            *(Finding("warning", "source", warning) for warning in self._sequence.warnings),
+            *(check_container(self._container) if self._container is not None else []),
+            *check_timing(clip, self._container.length_s if self._container is not None else None),
+            *stereo_findings(self._packed),
+            *interlacing_findings(pictures),
+            *check_repeats(clip),
+            *self._field.findings(),
+            *self._overlays.findings(),
+            *self._insets.findings(),
+            *check_blank(clip),
+            *check_blurred(clip),
+            *check_colour(clip),
+            *check_exposure(clip),
+        ]

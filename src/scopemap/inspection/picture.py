@@ -1,0 +1,134 @@
+"""What was found, as one picture: a few frames with what is drawn on them, the mask of a run, and a time line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scopemap.inspection.inspecting import Inspection
+from scopemap.inspection.repeats import repeated
+from scopemap.inspection.view import View, smaller
+from scopemap.report.canvas import headline, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SHOWN, _SHOWN_PX = 4, 640
+_WIDTH_IN, _LINE_IN, _BANDS_IN = 13.0, 1.0, 0.22
+_FIELD_COLOUR, _OVERLAY_COLOUR, _INSET_COLOUR = "#00e5ff", "#ffea00", "#ff00ff"
+_MASK_TINT = np.array([0.0, 90.0, 255.0])
+_LINES = (("detail", "detail"), ("brightness", "brightness"), ("motion", "motion, % of width"))
+_BANDS = {
+    "black": "#000000",
+    "one-colour": "#777777",
+    "frozen": "#b2182b",
+    "duplicates": "#ef8a62",
+    "blurred": "#762a83",
+    "not-tissue": "#1b7837",
+    "clipped": "#e6c200",
+    "dark": "#2166ac",
+    "highlights": "#80cdc1",
+    "frames-dropped": "#8c510a",
+    "time-order": "#c51b7d",
+}
+
+
+def draw_inspection(inspection: Inspection, file: Path) -> None:
+    """Draw an inspection as a PNG.
+
+    Above, frames of the video: field of view cyan, overlays yellow, pictures in the picture magenta. Below them, the
+    same as a run sees them: what its mask leaves out is tinted blue. Then figures over time, and a band for each
+    kind of stretch that was found.
+    """
+    views = _chosen(inspection.samples)
+    bands = [(f.code, f.stretches) for f in inspection.findings if f.stretches and f.code in _BANDS]
+    aspects = [_height_share(views[0].rgb), _height_share(views[0].frame.rgb)]
+    rows_in = [_WIDTH_IN / _SHOWN * min(aspect, 1.6) + 0.25 for aspect in aspects]
+    heights = [*rows_in, *[_LINE_IN] * len(_LINES), *([_BANDS_IN * len(bands) + 0.4] if bands else [])]
+    figure = new_figure(_WIDTH_IN, sum(heights) + 0.6)
+    grid = figure.add_gridspec(len(heights), _SHOWN, height_ratios=heights)
+    for column, view in enumerate(views):
+        _draw_found(figure.add_subplot(grid[0, column]), view, inspection)
+        _draw_masked(figure.add_subplot(grid[1, column]), view)
+    first: Axes | None = None
+    for row, (name, label) in enumerate(_LINES, start=2):
+        axes = figure.add_subplot(grid[row, :], sharex=first)
+        first = first or axes
+        values = inspection.clip[name] * (100 if name == "motion" else 1)
+        axes.plot(values, color="#404040", linewidth=1.0)
+        again = np.flatnonzero(repeated(inspection.clip))
+        axes.plot(again, values[again], ".", color=_BANDS["duplicates"], markersize=4)
+        axes.set_ylabel(label, fontsize=8)
+        axes.set_ylim(bottom=0)
+        _finish(axes, inspection, views)
+    if bands:
+        axes = figure.add_subplot(grid[len(heights) - 1, :], sharex=first)
+        _draw_bands(axes, bands)
+        _finish(axes, inspection, views)
+    figure.axes[-1].set_xlabel(
+        "frame, counted from 0" + (" (orange dots: repeated)" if repeated(inspection.clip).any() else "")
+    )
+    headline(figure, _title(inspection))
+    figure.savefig(file)
+
+
+def _chosen(samples: tuple[View, ...]) -> list[View]:
+    """Return four views, evenly spread, of those that show something where there are any."""
+    shown = [view for view in samples if not view.figures.blank] or list(samples)
+    places = np.unique(np.linspace(0, len(shown) - 1, _SHOWN).round().astype(int))
+    return [shown[place] for place in places]
+
+
+def _height_share(rgb: np.ndarray) -> float:
+    return float(rgb.shape[0] / rgb.shape[1])
+
+
+def _draw_found(axes: Axes, view: View, inspection: Inspection) -> None:
+    from matplotlib.patches import Polygon
+
+    picture = smaller(view.rgb, _SHOWN_PX)
+    size = np.array([picture.shape[1], picture.shape[0]])
+    axes.imshow(picture)
+    # Polygons are drawn in pixel centres.
+    if inspection.field.shape != "full":
+        axes.add_patch(Polygon(inspection.field.outline * size - 0.5, fill=False, color=_FIELD_COLOUR, linewidth=1.2))
+    boxes = [(one.box, _OVERLAY_COLOUR) for one in inspection.overlays]
+    boxes += [(box, _INSET_COLOUR) for box in inspection.insets]
+    for (left, top, right, bottom), colour in boxes:
+        corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        axes.add_patch(Polygon(corners * size - 0.5, fill=False, color=colour, linewidth=1.4))
+    axes.set_title(f"frame {view.figures.position}, {view.figures.time_s:.2f} s", fontsize=8)
+    axes.set_axis_off()
+
+
+def _draw_masked(axes: Axes, view: View) -> None:
+    rgb = view.frame.rgb.astype(np.float64)
+    rgb[~view.frame.valid] = 0.4 * rgb[~view.frame.valid] + 0.6 * _MASK_TINT
+    axes.imshow(rgb.round().astype(np.uint8))
+    axes.set_title(f"in a run: {view.figures.usable:.0%} usable", fontsize=8)
+    axes.set_axis_off()
+
+
+def _draw_bands(axes: Axes, bands: list[tuple[str, tuple[tuple[int, int], ...]]]) -> None:
+    for row, (code, stretches) in enumerate(bands):
+        spans = [(first - 0.5, last - first + 1) for first, last in stretches]
+        axes.broken_barh(spans, (row - 0.4, 0.8), color=_BANDS[code])
+    axes.set_yticks(range(len(bands)), [code for code, _ in bands], fontsize=8)
+    axes.set_ylim(len(bands) - 0.5, -0.5)
+
+
+def _finish(axes: Axes, inspection: Inspection, views: list[View]) -> None:
+    for view in views:
+        axes.axvline(view.figures.position, color="#9ecae1", linewidth=0.8, zorder=0)
+    axes.set_xlim(-0.5, len(inspection.clip) - 0.5)
+    axes.tick_params(labelsize=7)
+    axes.grid(alpha=0.3)
+
+
+def _title(inspection: Inspection) -> str:
+    width, height = inspection.size
+    facts = f"{inspection.path.name}: {len(inspection.clip)} pictures of {width}x{height} px"
+    codes = [finding.code for finding in inspection.findings if finding.severity != "info"]
+    return f"{facts}; {', '.join(dict.fromkeys(codes)) or 'nothing to warn of'}"

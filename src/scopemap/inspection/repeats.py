@@ -1,0 +1,40 @@
+"""Pictures that repeat the last one, singly as conversions between rates make them, or frozen for a while."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.inspection.clip import Clip
+from scopemap.inspection.finding import Finding, covered, frames_of, stretches_of
+from scopemap.pictures.duplicates import LEAST_DIFFERENCE
+
+_FREEZE_S, _FREEZE_FRAMES = 0.3, 4
+
+
+def repeated(clip: Clip) -> np.ndarray:
+    """Return which pictures repeat the last one that did not, (N,) bool; what shows nothing repeats nothing."""
+    return (clip["change"] < LEAST_DIFFERENCE) & ~clip["blank"]
+
+
+def check_repeats(clip: Clip) -> list[Finding]:
+    """Return duplicates and frozen stretches."""
+    flags = repeated(clip)
+    frozen = stretches_of(flags, clip.frames_in(_FREEZE_S, _FREEZE_FRAMES))
+    single = stretches_of(flags & ~covered(frozen, len(clip)))
+    left_out = "runs leave them out (--set input.skip_duplicates=false keeps them)"
+    found = []
+    if frozen:
+        message = f"the picture is frozen for {frames_of(frozen)}"
+        found.append(Finding("warning", "frozen", message, left_out, frozen))
+    if single:
+        message = f"the same picture as before: {frames_of(single)}{_rhythm(single)}"
+        found.append(Finding("info", "duplicates", message, left_out, single))
+    return found
+
+
+def _rhythm(single: tuple[tuple[int, int], ...]) -> str:
+    """Say so where duplicates come at an even pace, as from 25 to 30 pictures per second."""
+    steps = np.diff([first for first, _ in single])
+    if steps.size < 3 or np.percentile(steps, 90) - np.percentile(steps, 10) > 1:
+        return ""
+    return f", about every {np.median(steps):.0f}th: the video was converted to a higher rate"

@@ -1,0 +1,159 @@
+"""What every kind of finding looks at: one picture of the video after the other, small, and figures of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from scopemap.config import MaskSettings
+from scopemap.field_of_view import FieldOfView
+from scopemap.frame import Frame
+from scopemap.inspection.finding import Finding
+from scopemap.masking import Masker, is_lit, specular
+from scopemap.odometry.clarity import detail_of
+from scopemap.pictures.constant import is_constant
+from scopemap.pictures.duplicates import LEAST_DIFFERENCE, difference
+
+SMALL_PX = 320
+"""Longer side of the small copies."""
+
+_FLOW_PX = 160
+_MASK = MaskSettings()
+# Text on black is no picture.
+_LEAST_LIT = 0.05
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of one picture.
+
+    Attributes
+    ----------
+    position : in the input, from 0. index, time_s : as the reader has them.
+    blank : whether it shows nothing, or next to nothing that is not black. brightness : mean level in the field, of
+    255.
+    detail : as the tracker measures how clear a picture is. change : mean difference from the last picture that was no
+    repetition, grey levels; infinite for the first. motion : median flow since the picture before, share of the width.
+    redness : mean red over the mean of the stronger of green and blue. clipped, dark, highlights : shares of the field.
+    usable : share of the picture that a run would use.
+    """
+
+    position: int
+    index: int
+    time_s: float
+    blank: bool
+    brightness: float
+    detail: float
+    change: float
+    motion: float
+    redness: float
+    clipped: float
+    dark: float
+    highlights: float
+    usable: float
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture.
+
+    Attributes
+    ----------
+    rgb : (H, W, 3) uint8 as in the video. small : (h, w, 3) uint8, its longer side at most 320 px.
+    lit : (h, w) bool, which pixels are not black. field : (h, w) bool, field of view as known so far.
+    frame : as a run sees it, rectified and masked. figures : of it.
+    """
+
+    rgb: np.ndarray
+    small: np.ndarray
+    lit: np.ndarray
+    field: np.ndarray
+    frame: Frame
+    figures: Figures
+
+
+class Watcher(Protocol):
+    """Looks at each picture in turn and says at the end what it found."""
+
+    def add(self, view: View) -> None:
+        """Look at the next picture."""
+
+    def findings(self) -> list[Finding]:
+        """Return what was found."""
+
+
+class Viewer:
+    """Makes views of pictures in their order; keeps the last one that was no repetition."""
+
+    def __init__(self) -> None:
+        self._field, self._masker = FieldOfView(_MASK.border_px), Masker(_MASK)
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._kept: tuple[np.ndarray, np.ndarray] | None = None
+        self._before: np.ndarray | None = None
+        self._position = 0
+
+    def __call__(self, rgb: np.ndarray, frame: Frame) -> View:
+        """Return the view of a picture (H, W, 3) uint8, and of the frame that a run makes of it."""
+        small = smaller(rgb, SMALL_PX)
+        lit = is_lit(small, _MASK.dark_level)
+        field = self._field(lit, np.ones_like(lit))
+        masked = self._masker(frame)
+        figures = self._figures(rgb, small, lit, field, masked)
+        self._position += 1
+        return View(rgb, small, lit, field, masked, figures)
+
+    def _figures(
+        self, rgb: np.ndarray, small: np.ndarray, lit: np.ndarray, field: np.ndarray, masked: Frame
+    ) -> Figures:
+        inside = field if field.any() else np.ones_like(field)
+        pixels = small[inside]
+        middle = np.sort(pixels, axis=1)[:, 1]
+        red, green, blue = (
+            pixels[middle < _MASK.bright_level].mean(0) if (middle < _MASK.bright_level).any() else (0, 0, 0)
+        )
+        return Figures(
+            position=self._position,
+            index=masked.index,
+            time_s=masked.time_s,
+            blank=is_constant(small) or float(lit[inside].mean()) < _LEAST_LIT,
+            brightness=float(pixels.mean()),
+            detail=detail_of(masked),
+            change=self._change(rgb, small),
+            motion=self._motion(small),
+            redness=float(red / max(green, blue, 1.0)),
+            clipped=float((middle >= _MASK.bright_level).mean()),
+            dark=1 - float(lit[inside].mean()),
+            highlights=float(specular(small.min(-1), inside, _MASK.highlight_ratio)[inside].mean()),
+            usable=float(masked.valid.mean()),
+        )
+
+    def _change(self, rgb: np.ndarray, small: np.ndarray) -> float:
+        if self._kept is None or self._kept[0].shape != rgb.shape:
+            self._kept = rgb, small
+            return np.inf
+        # Means of pixels differ less than the pixels do: only where they agree, all pixels must be asked.
+        change = difference(small, self._kept[1])
+        if change < LEAST_DIFFERENCE:
+            change = difference(rgb, self._kept[0])
+        if change >= LEAST_DIFFERENCE:
+            self._kept = rgb, small
+        return change
+
+    def _motion(self, small: np.ndarray) -> float:
+        grey = cv2.cvtColor(smaller(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
+        before, self._before = self._before, grey
+        if before is None or before.shape != grey.shape:
+            return 0.0
+        flow = self._flow.calc(before, grey, np.zeros((*grey.shape, 2), np.float32))
+        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1]
+
+
+def smaller(rgb: np.ndarray, longest_px: int) -> np.ndarray:
+    """Return a copy of a picture whose longer side is at most `longest_px`, means of its pixels."""
+    height, width = rgb.shape[:2]
+    factor = min(1.0, longest_px / max(height, width))
+    size = max(1, round(factor * width)), max(1, round(factor * height))
+    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,25 @@
+"""The command `scopemap` by its own door: its exit code, and the one sentence by which it refuses."""
+
+from __future__ import annotations
+
+import sys
+from unittest.mock import patch
+
+import pytest
+
+from scopemap.cli import main
+
+
+def call(*arguments: object) -> int:
+    """Return the exit code of `scopemap ARGUMENTS`."""
+    with patch.object(sys, "argv", ["scopemap", *map(str, arguments)]), pytest.raises(SystemExit) as caught:
+        main()
+    return caught.value.code if isinstance(caught.value.code, int) else int(caught.value.code is not None)
+
+
+def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Return the only line that `scopemap ARGUMENTS` says, with exit code 1."""
+    code, said = call(*arguments), capfd.readouterr()
+    assert (code, said.err.count("\n"), said.out) == (1, 1, ""), (code, said)
+    assert said.err.startswith("scopemap: ")
+    return said.err

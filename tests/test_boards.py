@@ -1,0 +1,300 @@
+"""Calibration with boards: known cameras are found again from rendered views, and what cannot serve is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
+from PIL import Image
+
+from scopemap.boards import BoardCalibration, CharucoBoard, Checkerboard, Search, calibrate, save_calibration
+from scopemap.boards.choosing import FORMS, chosen
+from scopemap.boards.diagnosis import what_is_seen_instead
+from scopemap.boards.fitting import LensForm
+from scopemap.boards.judging import warnings_about
+from scopemap.boards.picture import draw_calibration
+from scopemap.boards.selection import select_views
+from scopemap.boards.targets import Board, Corners
+from scopemap.boards.views import View, edge_width_px
+from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.errors import CalibrationError, InputError, SettingsError
+
+CHARUCO = CharucoBoard(7, 5, 4.0, 3.0)
+WRONG, BLURRED = 100, 101
+
+
+def searched(board: Board, pictures: dict[int, np.ndarray]) -> Search:
+    search = Search(SIZE, 1)
+    for index, picture in pictures.items():
+        grey = picture[..., 0]
+        corners = board.find(grey)
+        search.looked_at += 1
+        if corners is None:
+            search.without.append(grey)
+        else:
+            search.views.append(View(index, f"{index}.png", corners, edge_width_px(grey, corners.pixels), corners))
+    return search
+
+
+def pictures(camera: CameraModel, board: Checkerboard | CharucoBoard, count: int) -> dict[int, np.ndarray]:
+    studio = Studio(camera, board)
+    return {i: studio.shot(pose, seed=i) for i, pose in enumerate(studio.poses(count))}
+
+
+@pytest.fixture(scope="module")
+def pinhole_search() -> Search:
+    """Views of a checkerboard, one of them of a board whose squares are no squares, one out of focus."""
+    taken = pictures(PINHOLE, CHECKERBOARD, 18)
+    studio = Studio(PINHOLE, CHECKERBOARD)
+    pose = list(studio.poses(8))[7]
+    taken[BLURRED] = studio.shot(pose, blur_px=1.8)
+    studio.print = cv2.resize(studio.print, None, fx=1.0, fy=0.9)
+    taken[WRONG] = studio.shot(pose)
+    return searched(CHECKERBOARD, taken)
+
+
+@pytest.fixture(scope="module")
+def pinhole(pinhole_search: Search) -> BoardCalibration:
+    return calibrate(pinhole_search, CHECKERBOARD)
+
+
+@pytest.fixture(scope="module")
+def fisheye() -> BoardCalibration:
+    return calibrate(searched(CHECKERBOARD, pictures(FISHEYE, CHECKERBOARD, 16)), CHECKERBOARD)
+
+
+@pytest.fixture(scope="module")
+def charuco() -> BoardCalibration:
+    return calibrate(searched(CHARUCO, pictures(PINHOLE, CHARUCO, 16)), CHARUCO, "pinhole")
+
+
+def bend_px(camera: CameraModel, rays: np.ndarray) -> np.ndarray:
+    return camera.project(rays) - camera.central.project(rays)
+
+
+@pytest.mark.parametrize(
+    ("name", "truth", "off_px", "bend_rms_px"),
+    [("pinhole", PINHOLE, 0.5, 0.15), ("fisheye", FISHEYE, 0.5, 0.3), ("charuco", PINHOLE, 1.5, 0.5)],
+)
+def test_a_known_camera_is_found_again(
+    name: str, truth: CameraModel, off_px: float, bend_rms_px: float, request: pytest.FixtureRequest
+) -> None:
+    done: BoardCalibration = request.getfixturevalue(name)
+    found, true = done.fit.camera.central, truth.central
+    assert type(done.fit.camera) is type(truth)
+    assert abs(found.fx / true.fx - 1) < 0.005
+    assert abs(found.fy / true.fy - 1) < 0.005
+    assert np.hypot(found.cx - true.cx, found.cy - true.cy) < off_px
+    rays = truth.unproject(np.stack(np.meshgrid(np.arange(8, SIZE[0], 8), np.arange(8, SIZE[1], 8)), -1))
+    rays = rays[np.hypot(rays[..., 0], rays[..., 1]) < 2]  # up to 63 deg from the axis
+    off = bend_px(done.fit.camera, rays) - bend_px(truth, rays)
+    assert np.sqrt(np.mean(np.sum(off**2, axis=-1))) < bend_rms_px
+    assert done.fit.rms_px < 0.12
+
+
+def test_the_deviations_are_of_the_size_of_the_errors(pinhole: BoardCalibration, fisheye: BoardCalibration) -> None:
+    for done, truth in ((pinhole, PINHOLE), (fisheye, FISHEYE)):
+        assert set(done.fit.deviations) == set(done.fit.parameters) == {"fx", "fy", "cx", "cy", *done.fit.form.terms}
+        for name in ("fx", "fy", "cx", "cy"):
+            off = abs(done.fit.parameters[name] - getattr(truth.central, name))
+            assert 0 < done.fit.deviations[name] < 1
+            assert off < 6 * done.fit.deviations[name] + 0.05
+
+
+def test_the_wrong_and_the_blurred_view_are_left_out_with_the_reason(
+    pinhole_search: Search, pinhole: BoardCalibration
+) -> None:
+    assert {WRONG, BLURRED} <= {view.index for view in pinhole_search.views}
+    reasons = {out.view.index: out.reason for out in pinhole.left_out}
+    assert reasons[WRONG].startswith("it does not fit: ")
+    assert len(reasons) <= 3
+    assert pinhole.blurred[0].reason.startswith("blurred: its edges are ")
+    assert BLURRED in {out.view.index for out in pinhole.blurred}
+
+
+def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pinhole: BoardCalibration) -> None:
+    views = {view.index: view for view in pinhole.views}
+    spoiled = []
+    for view in list(views.values())[:3]:
+        pixels = view.corners.pixels.copy()
+        pixels[:2] += [7.0, -4.0]
+        corners = Corners(view.corners.board_mm, pixels)
+        spoiled.append(replace(view, corners=corners, found=corners))
+    searched_again = replace_views(pinhole_search, [*spoiled, *list(views.values())[3:]])
+    done = calibrate(searched_again, CHECKERBOARD, "pinhole")
+    assert [view.index for view in done.views] == list(views)
+    assert done.stray_corners >= 6
+    for view in spoiled:
+        kept = next(each for each in done.views if each.index == view.index).corners.pixels
+        assert not any((kept == pixel).all(axis=1).any() for pixel in view.corners.pixels[:2])
+    assert done.fit.camera.central.fx == pytest.approx(pinhole.fit.camera.central.fx, rel=1e-3)
+
+
+def test_the_model_and_no_more_coefficients_than_needed_are_chosen(
+    pinhole: BoardCalibration, fisheye: BoardCalibration
+) -> None:
+    assert pinhole.fit.form == LensForm("pinhole", ("k1", "k2", "p1", "p2"))
+    assert fisheye.fit.form.model == "fisheye"
+    assert list(pinhole.held_out_px) == list(FORMS)
+    best_other = min(error for form, error in fisheye.held_out_px.items() if form.model == "pinhole")
+    assert best_other > 3 * fisheye.held_out_px[fisheye.fit.form]
+
+
+def test_the_simpler_form_wins_unless_another_is_clearly_better() -> None:
+    simple, rich, fish = FORMS[1], FORMS[4], FORMS[6]
+    assert chosen({simple: 0.100, rich: 0.099, fish: 0.0985}) == simple
+    assert chosen({simple: 0.100, rich: 0.090, fish: 0.089}) == rich
+    assert chosen({simple: np.inf, rich: np.inf, fish: 0.2}) == fish
+    with pytest.raises(CalibrationError, match="no model predicts views"):
+        chosen({simple: np.inf})
+
+
+def test_the_summary_says_where_the_boards_were(pinhole: BoardCalibration) -> None:
+    truth = dict(enumerate(Studio(PINHOLE, CHECKERBOARD).poses(18)))
+    facts = pinhole.summary()
+    assert len(facts["views"]) == len(pinhole.views) >= 12
+    for view in facts["views"]:
+        pose = truth[view["frame"]]
+        centre = pose[:3, :3] @ [15.0, 10.5, 0] + pose[:3, 3]
+        assert view["distance_mm"] == pytest.approx(centre[2], rel=0.01)
+        assert view["tilt_deg"] == pytest.approx(np.degrees(np.arccos(pose[2, 2])), abs=1)
+    assert 0.5 < facts["coverage"] < 0.9
+
+
+# ---- selection
+
+
+def test_views_that_show_the_same_count_once(pinhole_search: Search) -> None:
+    sharp = [view for view in pinhole_search.views if view.index < 100]
+    again = [replace(view, index=1000 * k + view.index) for k in range(5) for view in sharp]
+    selected = select_views(again, SIZE)
+    assert len(selected.views) == len({view.index % 1000 for view in selected.views}) <= len(sharp)
+    assert selected.alike == len(again) - len(selected.views)
+    few = select_views(sharp, SIZE, most=5)
+    assert len(few.views) == 5
+    spread = np.ptp([view.corners.pixels.mean(axis=0) for view in few.views], axis=0)
+    assert (spread > 0.25 * np.array(SIZE)).all()
+
+
+def test_a_still_board_is_refused(pinhole_search: Search) -> None:
+    one = pinhole_search.views[0]
+    still = replace_views(pinhole_search, [replace(one, index=i) for i in range(30)])
+    with pytest.raises(InputError, match=r"found in 30 of 30 frames, but 1 of these views .* at least 8 needed: move"):
+        calibrate(still, CHECKERBOARD)
+
+
+def replace_views(search: Search, views: list[View]) -> Search:
+    return replace(search, views=views, looked_at=len(views))
+
+
+# ---- what cannot serve
+
+
+def test_too_few_views_are_refused(pinhole_search: Search) -> None:
+    few = replace(replace_views(pinhole_search, pinhole_search.views[:2]), looked_at=200, without=[])
+    with pytest.raises(
+        InputError, match=r"found in 2 of 200 frames, at least 8 needed: looked for a checkerboard of 9"
+    ):
+        calibrate(few, CHECKERBOARD)
+
+
+def test_corners_without_sense_are_refused(pinhole_search: Search) -> None:
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(view, corners=Corners(view.corners.board_mm, rng.permutation(view.corners.pixels)))
+        for view in pinhole_search.views
+    ]
+    with pytest.raises((InputError, CalibrationError), match=r"^(calibrating|fitting the camera)"):
+        save_calibration(calibrate(replace(pinhole_search, views=noisy), CHECKERBOARD, "pinhole"), Path("no.yaml"))
+
+
+@pytest.fixture(scope="module")
+def one_picture() -> dict[str, np.ndarray]:
+    """A checkerboard and a ChArUco board, each held straight before the camera, grey."""
+    found = {}
+    for name, board in (("checkerboard", CHECKERBOARD), ("charuco", CHARUCO)):
+        pose = np.eye(4)
+        pose[:3, 3] = -15, -10, 45
+        found[name] = Studio(PINHOLE, board).shot(pose)[..., 0]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("shown", "board", "hint"),
+    [
+        ("checkerboard", Checkerboard(10, 7, 3.0), "a checkerboard of 9x6 inner corners is seen: give --board 9x6"),
+        ("checkerboard", CHARUCO, "a checkerboard of 9x6 inner corners is seen: leave out --charuco"),
+        ("charuco", replace(CHARUCO, columns=5, rows=7), "a ChArUco board of 7x5 squares is seen: give --board 7x5"),
+        ("charuco", replace(CHARUCO, columns=9, rows=5), "but not as they lie on this board: check --board"),
+        ("charuco", replace(CHARUCO, dictionary="DICT_6X6_250"), "give --dictionary DICT_4X4_50"),
+        ("charuco", CHECKERBOARD, "is it a ChArUco board (--charuco --dictionary DICT_4X4_50)?"),
+    ],
+)
+def test_another_board_is_named(shown: str, board: Board, hint: str, one_picture: dict[str, np.ndarray]) -> None:
+    assert board.find(one_picture[shown]) is None
+    assert hint in what_is_seen_instead(board, [one_picture[shown]])
+    assert what_is_seen_instead(board, [np.full((120, 160), 90, np.uint8)]) == ""
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Checkerboard(2, 6, 3.0), "2x6 cannot be"),
+        (lambda: Checkerboard(9, 101, 3.0), "9x101 cannot be"),
+        (lambda: Checkerboard(9, 6, 0.0), "larger than 0 mm"),
+        (lambda: Checkerboard(9, 6, float("nan")), "larger than 0 mm"),
+        (lambda: CharucoBoard(7, 5, 4.0, 4.0), "does not lie within a square"),
+        (lambda: CharucoBoard(7, 5, 4.0, 3.0, "DICT_3X3"), "unknown markers 'DICT_3X3': choose one of DICT_4X4_100,"),
+        (lambda: CharucoBoard(14, 10, 4.0, 3.0), "has 70 markers, DICT_4X4_50 only 50"),
+    ],
+)
+def test_a_board_that_cannot_be(make: object, words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        make()  # type: ignore[operator]
+
+
+def test_large_pictures_are_searched_small_and_measured_large(one_picture: dict[str, np.ndarray]) -> None:
+    grey = one_picture["checkerboard"]
+    small = CHECKERBOARD.find(grey)
+    large = CHECKERBOARD.find(cv2.resize(grey, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC))
+    assert small is not None
+    assert large is not None
+    off = np.linalg.norm(((large.pixels + 0.5) / 4 - 0.5)[:, None] - small.pixels, axis=-1).min(axis=1)
+    assert off.max() < 0.15
+
+
+# ---- what is left open
+
+
+def test_warnings(pinhole: BoardCalibration) -> None:
+    fit = pinhole.fit
+    assert warnings_about(fit, 0.8, 1.0) == []
+    flat = fit.T_camera_board.copy()
+    flat[:, :3, :3] = np.eye(3)
+    rough = tuple(100 * residual for residual in fit.residuals_px)
+    unsure = fit.deviations | {"fx": 10.0}
+    poor = replace(fit, T_camera_board=flat, residuals_px=rough, deviations=unsure)
+    said = "\n".join(warnings_about(poor, 0.3, 1.1))
+    for words in ("in 0 view(s)", "cover 30 %", "px off on the whole", "known to 3.8 % only", "by the input 1.100"):
+        assert words in said
+
+
+def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: BoardCalibration, tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("the earlier one")
+    narrow = replace(pinhole, fit=replace(pinhole.fit, camera=PinholeCamera(9000.0, 9000.0, 160, 120, *SIZE)))
+    with pytest.raises(CalibrationError, match="cannot be used, so none was written"):
+        save_calibration(narrow, file)
+    assert [each.read_text() for each in tmp_path.iterdir()] == ["the earlier one"]
+
+
+def test_the_picture(pinhole: BoardCalibration, tmp_path: Path) -> None:
+    frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    draw_calibration(pinhole, frame, tmp_path / "calibration.png")
+    assert Image.open(tmp_path / "calibration.png").size == (1600, 500)
+    with pytest.raises(InputError, match="drawing the calibration"):
+        draw_calibration(pinhole, frame, tmp_path / "none" / "calibration.png")

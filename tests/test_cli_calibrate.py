@@ -1,0 +1,123 @@
+"""`scopemap calibrate`: from pictures of a board to a file that every command reads; refusals."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_boards import CHECKERBOARD, PINHOLE, SIZE, Studio
+from drawn_inputs import save
+
+from scopemap.calibration import read_calibration
+from scopemap.cli import main
+from scopemap.datasets import open_sequence
+from scopemap.lenses import OpenCvCamera
+
+Say = Callable[..., tuple[int, str, str]]
+BOARD = ("--board", "9x6", "--square-mm", 3)
+
+
+@pytest.fixture
+def calibrate(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Say:
+    """The command `scopemap calibrate` in an empty folder: exit code, stdout, stderr."""
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["scopemap", "calibrate", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        said = capfd.readouterr()
+        return int(caught.value.code or 0), said.out, said.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten pictures of a board in the middle, tilted, each twice."""
+    folder = tmp_path_factory.mktemp("board") / "frames é [1]"
+    folder.mkdir()
+    studio = Studio(PINHOLE, CHECKERBOARD)
+    poses = [pose for i, pose in enumerate(studio.poses(40, seed=3)) if i % 4 in (1, 2) and i // 4 % 3 == 1]
+    poses += [pose for i, pose in enumerate(studio.poses(40, seed=5)) if i % 4 in (1, 2) and i // 4 % 3 == 1]
+    for i, pose in enumerate(poses[:10]):
+        for again in range(2):
+            save(folder / f"{2 * i + again:03d}.png", studio.shot(pose, seed=2 * i + again))
+    return folder
+
+
+def test_a_calibration_that_every_command_reads(calibrate: Say, frames: Path, tmp_path: Path) -> None:
+    code, out, err = calibrate(frames, *BOARD, "--model", "pinhole", "--every", 2)
+    assert code == 0
+    assert "looked at 10 of 10 frames\nthe board was found in 10 of 10 frames; fitting\n" in err
+    assert "warning: only 10 views that differ" in err
+    assert "model: pinhole with k1" in out
+    assert "calibration: calibration.yaml (use it as --camera calibration.yaml); picture: calibration.png" in out
+    assert (tmp_path / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["calibration.png", "calibration.yaml"]
+    camera = read_calibration("calibration.yaml", SIZE).camera
+    assert isinstance(camera, OpenCvCamera)
+    assert camera.central.fx == pytest.approx(265, rel=0.02)
+    sequence = open_sequence(frames, camera=tmp_path / "calibration.yaml")
+    assert sequence.calibrated
+    assert sequence.camera_source == "calibration file calibration.yaml"
+    ray = sequence.camera.unproject(np.array([60.0, 60.0]))
+    assert sequence.rectifier.source_pixel(np.array(60.0), np.array(60.0)) == pytest.approx(PINHOLE.project(ray), abs=3)
+    # What is there stays, unless the word is given.
+    code, out, err = calibrate(frames, *BOARD)
+    assert (code, out) == (1, "")
+    assert (
+        err == "scopemap: writing the calibration: calibration.yaml is there already; give --overwrite or another "
+        "--out\n"
+    )
+    code, out, err = calibrate(frames, *BOARD, "--model", "pinhole", "--frames", "::2", "--json", "--overwrite")
+    assert (code, [line for line in err.splitlines() if not line.startswith("warning: ")]) == (0, [])
+    told = json.loads(out)
+    assert (told["looked_at"], told["every"], told["found"], told["image_size"]) == (10, 1, 10, list(SIZE))
+    assert told["parameters"]["fx"] == pytest.approx(camera.central.fx)
+    assert {"frame", "name", "corners", "rms_px", "tilt_deg", "distance_mm"} == set(told["views"][0])
+
+
+def test_a_board_that_is_not_there(calibrate: Say, frames: Path, tmp_path: Path) -> None:
+    code, out, err = calibrate(frames, "--board", "10x7", "--square-mm", 3, "--frames", "0:4", "--quiet")
+    assert (code, out) == (1, "")
+    assert err == (
+        "scopemap: calibrating: the board was found in 0 of 4 frames, at least 8 needed: a checkerboard of 9x6 inner "
+        "corners is seen: give --board 9x6\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--board", "9by6", "--square-mm", 3), "cannot read the board '9by6': expected COLUMNSxROWS such as 9x6"),
+        (("--board", "9x6", "--square-mm", 0), "the squares of a board must be larger than 0 mm, got 0"),
+        ((*BOARD, "--charuco"), "a ChArUco board needs the side of its markers: give --marker-mm"),
+        ((*BOARD, "--legacy"), "are for a ChArUco board: give --charuco, too"),
+        ((*BOARD, "--charuco", "--marker-mm", 2, "--dictionary", "DICT_1"), "unknown markers 'DICT_1'"),
+        ((*BOARD, "--out", "camera.txt"), "its name has to end in .yaml or .yml"),
+        ((*BOARD, "--out", "none/c.yaml"), "the folder none is not there or not writable"),
+        ((*BOARD, "--frames", "a"), "cannot read the frames 'a'"),
+        ((*BOARD, "--dataset", "moon"), "unknown data set 'moon'"),
+    ],
+)
+def test_refusals(arguments: tuple[object, ...], words: str, calibrate: Say, frames: Path) -> None:
+    code, out, err = calibrate(frames, *arguments)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert words in err
+
+
+def test_what_cannot_be_opened(calibrate: Say, tmp_path: Path) -> None:
+    code, _, err = calibrate(tmp_path / "none.mp4", *BOARD)
+    assert (code, err) == (1, f"scopemap: reading {tmp_path / 'none.mp4'}: no such file or folder\n")
+    (tmp_path / "empty.mp4").touch()
+    code, _, err = calibrate(tmp_path / "empty.mp4", *BOARD)
+    assert code == 1
+    assert err.startswith("scopemap: reading the video")

@@ -1,0 +1,105 @@
+"""`scopemap inspect`: what it prints and writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+from drawn_clips import clip, inset, text, write
+
+from scopemap.cli import main
+
+Say = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def say(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Say:
+    """The command `scopemap inspect` in an empty folder: exit code, stdout, stderr."""
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("NO_COLOR", "1")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["scopemap", "inspect", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        said = capfd.readouterr()
+        return int(caught.value.code or 0), said.out, said.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("video") / "my [clip].mp4", clip(36, text(), inset))
+
+
+def test_it_says_what_it_found_and_draws_it(say: Say, video: Path) -> None:
+    code, out, err = say(video)
+    assert (code, err) == (0, "inspected 36 of 36 frames\n")
+    assert out.startswith(f"{video}\n")
+    for words in ("mpeg4", "overlay", "inset", "picture in picture", "advice: overlay: runs leave them out", "--set"):
+        assert words in out
+    picture = cv2.imread("my [clip]_inspection.png")
+    assert picture is not None
+    height, width = picture.shape[:2]
+    assert 1000 < width < 1600
+    assert 500 < height < 1600
+    # Overlays are boxed in yellow, insets in magenta, what a run leaves out is tinted blue.
+    blue, green, red = (picture[..., channel].astype(int) for channel in range(3))
+    for colour in ((red > 200) & (green > 200) & (blue < 60), (red > 200) & (green < 60) & (blue > 200)):
+        assert colour.sum() > 100
+    assert ((blue > 140) & (red < 120)).sum() > 500
+
+
+def test_json_is_all_that_is_printed(say: Say, video: Path, tmp_path: Path) -> None:
+    file, masks = tmp_path / "new" / "seen.PNG", tmp_path / "masks"
+    code, out, err = say(video, "--json", "--out", file, "--masks", masks)
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert list(told) == ["path", "facts", "findings", "field", "overlays", "insets", "picture"]
+    assert (told["facts"]["pictures"], told["facts"]["width"], told["facts"]["field"]) == (36, 320, "full")
+    codes = [finding["code"] for finding in told["findings"]]
+    assert codes == ["overlay", "inset", "overlay-privacy"]
+    assert told["findings"][0].keys() == {"severity", "code", "message", "advice", "stretches"}
+    assert len(told["overlays"]) == len(told["insets"]) == 1
+    assert file.is_file()
+    assert sorted(mask.name for mask in masks.iterdir()) == [f"{number:06d}.png" for number in range(36)]
+
+
+def test_nothing_is_replaced_unasked(say: Say, video: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mine.png"
+    file.write_bytes(b"mine")
+    code, out, err = say(video, "--out", file)
+    assert (code, out, err) == (1, "", f"scopemap: {file} exists; give another name with --out, or --overwrite\n")
+    assert file.read_bytes() == b"mine"
+    assert say(video, "--out", file, "--overwrite", "--quiet") == (0, "", "")
+    assert cv2.imread(str(file)) is not None
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note.txt").write_text("mine")
+    assert "is not empty" in say(video, "--masks", tmp_path / "full")[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("picture.jpg", "must end in .png"), ("folder.png", "a folder"), ("file.png/a.png", "writing")]
+)
+def test_a_picture_that_cannot_be_written(say: Say, video: Path, tmp_path: Path, name: str, why: str) -> None:
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file.png").write_text("")
+    code, out, err = say(video, "--out", tmp_path / name, "--quiet")
+    assert (code, out) == (1, "")
+    assert why in err
+    assert err.count("\n") == 1
+
+
+def test_no_video_is_one_line(say: Say, tmp_path: Path) -> None:
+    (tmp_path / "zero.mp4").write_bytes(b"")
+    for path in ("zero.mp4", "absent.mp4", "."):
+        code, out, err = say(tmp_path / path, "--quiet")
+        assert (code, out, err.count("\n")) == (1, "", 1)
+    assert not list(Path().iterdir())

@@ -1,0 +1,303 @@
+"""DICOM: which pixels, which times, whose names; and what damaged files end in."""
+
+from __future__ import annotations
+
+import io
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pydicom
+import pytest
+from drawn_dicom import PATIENT, SIZE, film, jpeg, native, packed, save, write_dicom_video, write_frames
+from drawn_inputs import number_in, picture
+from PIL import Image
+from pydicom.pixels.encoders import RLELosslessEncoder
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEG2000Lossless,
+    JPEGBaseline8Bit,
+    JPEGLosslessSV1,
+    RLELossless,
+)
+
+from scopemap.datasets import open_sequence
+from scopemap.datasets.dicom import Dicom
+from scopemap.errors import InputError
+
+YBR = {"PhotometricInterpretation": "YBR_FULL"}
+GREY = {"SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "PlanarConfiguration": None}
+
+
+def pictures(file: Path) -> np.ndarray:
+    return np.stack([frame.rgb for frame in Dicom(file).frames(slice(None))])
+
+
+def as_ybr(rgb: np.ndarray) -> np.ndarray:
+    return np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2YCrCb)[..., [0, 2, 1]] for one in rgb])
+
+
+def halved(rgb: np.ndarray) -> np.ndarray:
+    """YBR_FULL_422: Y Y B R of two neighbours."""
+    ybr = as_ybr(rgb)
+    y, b, r = (ybr[..., channel] for channel in range(3))
+    return np.stack([y[..., ::2], y[..., 1::2], b[..., ::2], r[..., ::2]], -1)
+
+
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
+def test_native_pictures_come_out_as_they_are(tmp_path: Path, syntax: str) -> None:
+    np.testing.assert_array_equal(pictures(native(tmp_path / "a.dcm", film(), syntax)), film())
+
+
+def test_planes_may_be_apart(tmp_path: Path) -> None:
+    apart = np.moveaxis(film(), -1, 1)
+    np.testing.assert_array_equal(pictures(native(tmp_path / "a.dcm", apart, PlanarConfiguration=1)), film())
+
+
+def test_colours_may_be_brightness_and_differences(tmp_path: Path) -> None:
+    whole = pictures(native(tmp_path / "a.dcm", as_ybr(film()), **YBR))
+    assert np.abs(whole.astype(int) - film()).max() <= 2
+    even = film().copy()
+    even[..., 1::2, :] = even[..., ::2, :]
+    half = pictures(native(tmp_path / "b.dcm", halved(even), PhotometricInterpretation="YBR_FULL_422"))
+    assert np.abs(half.astype(int) - even).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("values", "tags", "level"),
+    [
+        (np.full((2, 48, 64), 77, np.uint8), {}, 77),
+        (np.full((2, 48, 64), 77, np.uint8), {"PhotometricInterpretation": "MONOCHROME1"}, 178),
+        (np.full((2, 48, 64), 77 << 4, np.uint16), {"BitsAllocated": 16, "BitsStored": 12, "HighBit": 11}, 77),
+        (
+            np.full((2, 48, 64), -512, np.int16),
+            {"BitsAllocated": 16, "BitsStored": 12, "HighBit": 11, "PixelRepresentation": 1},
+            (2048 - 512) >> 4,
+        ),
+    ],
+)
+def test_grey_of_any_depth(tmp_path: Path, values: np.ndarray, tags: dict[str, Any], level: int) -> None:
+    assert (pictures(native(tmp_path / "a.dcm", values, **GREY | tags)) == level).all()
+
+
+def test_a_palette_is_looked_up(tmp_path: Path) -> None:
+    tags = GREY | {"PhotometricInterpretation": "PALETTE COLOR"}
+    for colour, level in zip(("Red", "Green", "Blue"), (10, 120, 250), strict=True):
+        tags[f"{colour}PaletteColorLookupTableDescriptor"] = [4, 0, 16]
+        tags[f"{colour}PaletteColorLookupTableData"] = np.array([0, 0, level << 8, 0], "<u2").tobytes()
+    rgb = pictures(native(tmp_path / "a.dcm", np.full((2, 48, 64), 2, np.uint8), **tags))
+    assert (rgb == (10, 120, 250)).all()
+
+
+def test_packed_pictures(tmp_path: Path) -> None:
+    close = pictures(write_frames(tmp_path / "a"))
+    assert np.abs(close.astype(int) - film()).mean() < 4
+    runs = [RLELosslessEncoder.encode(one.tobytes(), **rle_options()) for one in film()]
+    np.testing.assert_array_equal(pictures(packed(tmp_path / "b.dcm", runs, RLELossless)), film())
+    wavelets = []
+    for one in film():
+        stream = io.BytesIO()
+        Image.fromarray(one).save(stream, "JPEG2000", irreversible=False, no_jp2=True)
+        wavelets.append(stream.getvalue())
+    file = packed(tmp_path / "c.dcm", wavelets, JPEG2000Lossless, PhotometricInterpretation="YBR_RCT")
+    np.testing.assert_array_equal(pictures(file), film())
+
+
+def rle_options() -> dict[str, Any]:
+    return {
+        "rows": SIZE[1],
+        "columns": SIZE[0],
+        "samples_per_pixel": 3,
+        "bits_allocated": 8,
+        "bits_stored": 8,
+        "pixel_representation": 0,
+        "photometric_interpretation": "RGB",
+        "number_of_frames": 1,
+        "planar_configuration": 0,
+    }
+
+
+@pytest.mark.parametrize("pieces", [1, 4])
+def test_a_video_is_decoded_in_place(tmp_path: Path, pieces: int) -> None:
+    sequence = open_sequence(write_dicom_video(tmp_path / "a", pieces), frames=slice(1, None))
+    frames = list(sequence.source.frames(slice(1, None)))
+    assert [number_in(frame.rgb) for frame in frames] == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(1, 6) / 25)
+    assert list(tmp_path.rglob("*.mp4")) == []
+
+
+def test_times_are_those_that_the_file_states(tmp_path: Path) -> None:
+    def times(**tags: Any) -> list[float]:
+        return [time_s for _, time_s in Dicom(native(tmp_path / "a.dcm", film(), **tags)).stamps(slice(None)) or []]
+
+    np.testing.assert_allclose(times(FrameTimeVector=[0, 40, 20, 30], FrameTime=1), [0, 0.04, 0.06, 0.09])
+    np.testing.assert_allclose(times(FrameTime=20, CineRate=25), np.arange(4) / 50)
+    np.testing.assert_allclose(times(CineRate=25), np.arange(4) / 25)
+    np.testing.assert_allclose(times(RecommendedDisplayFrameRate=10), np.arange(4) / 10)
+    np.testing.assert_allclose(times(FrameTimeVector=[0, 40, 0, 30], FrameTime=0), np.arange(4) / 30)
+
+
+def test_pixels_need_not_be_square(tmp_path: Path) -> None:
+    assert Dicom(native(tmp_path / "a.dcm", film(), PixelAspectRatio=[10, 11])).pixel_aspect == pytest.approx(1.1)
+
+
+def write_series(folder: Path, instances: list[int | None], series: str = "1.2.3") -> Path:
+    for place, (number, rgb) in enumerate(zip(instances, film(len(instances)), strict=True)):
+        tags = {"SeriesInstanceUID": series, "InstanceNumber": number, "NumberOfFrames": None}
+        native(folder / f"{PATIENT}{place}", rgb[None], **tags)
+    return folder
+
+
+def test_a_series_is_sorted_by_its_numbers(tmp_path: Path) -> None:
+    source = open_sequence(write_series(tmp_path / "a", [12, 3, 10, 2])).source
+    assert isinstance(source, Dicom)
+    frames = list(source.frames(slice(None)))
+    assert [frame.index for frame in frames] == [2, 3, 10, 12]
+    assert [number_in(frame.rgb) for frame in frames] == [3, 1, 2, 0]
+    assert [frame.name for frame in frames] == ["2", "3", "10", "12"]
+
+
+def test_no_word_about_the_patient_comes_out(tmp_path: Path) -> None:
+    files = [
+        write_frames(tmp_path / "a"),
+        write_dicom_video(tmp_path / "b"),
+        write_series(tmp_path / "c", [1, 1, None, 4]),
+        native(tmp_path / "d.dcm", film(), BurnedInAnnotation="YES"),
+    ]
+    for path in files:
+        sequence = open_sequence(path)
+        told = [*sequence.notes, *sequence.warnings, sequence.camera_source, sequence.name]
+        told += [frame.name for frame in sequence.frames()]
+        assert told
+        assert not any(word in text for text in told for word in ("Muster", "Erika", "4711", "1.2.3"))
+    assert any("burned into the pictures" in warning for warning in Dicom(files[-1]).warnings)
+
+
+# ---- faults
+
+
+def test_a_file_that_breaks_off_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
+    for number, file in enumerate((native(tmp_path / "a.dcm", film()), write_frames(tmp_path / "b"))):
+        content = file.read_bytes()
+        file.write_bytes(content[: -int(1.5 * (SIZE[0] * SIZE[1] * 3 if number == 0 else 1000))])
+        source = Dicom(file)
+        read = [number_in(frame.rgb) for frame in source.frames(slice(None))]
+        assert 2 <= len(read) < 4
+        assert read == list(range(len(read)))
+        assert any("are there; these were used" in w or "was left out" in w for w in source.warnings)
+
+
+def test_a_picture_that_cannot_be_decoded_is_left_out_and_keeps_its_number(tmp_path: Path) -> None:
+    frames = [jpeg(rgb) for rgb in film()]
+    frames[1] = frames[1][:250] + bytes(len(frames[1]) - 250)
+    frames[1] = frames[1][: len(frames[1]) // 2]
+    source = Dicom(packed(tmp_path / "a.dcm", frames, JPEGBaseline8Bit, PhotometricInterpretation="YBR_FULL_422"))
+    assert [frame.index for frame in source.frames(slice(None))] == [0, 2, 3]
+    assert source.warnings == ["picture 1 cannot be decoded and was left out"]
+
+
+def test_a_picture_of_another_size_than_the_header_says_is_refused(tmp_path: Path) -> None:
+    frames = [jpeg(film()[0]), jpeg(picture(1, (640, 480)))]
+    file = packed(tmp_path / "a.dcm", frames, JPEGBaseline8Bit, PhotometricInterpretation="YBR_FULL_422")
+    with pytest.raises(InputError, match="picture 1 is 640x480 px, the file's header says 64x48 px"):
+        pictures(file)
+
+
+def test_claims_take_no_memory(tmp_path: Path) -> None:
+    file = native(tmp_path / "a.dcm", film(), Rows=60_000, Columns=60_000)
+    with pytest.raises(InputError, match="more than 64 million pixels"):
+        open_sequence(file)
+    many = native(tmp_path / "b.dcm", film())
+    content = many.read_bytes()
+    claimed = struct.pack("<HH2sH", 0x28, 8, b"IS", 2) + b"4 "
+    assert claimed in content
+    many.write_bytes(content.replace(claimed, struct.pack("<HH2sH", 0x28, 8, b"IS", 10) + b"2000000000"))
+    source = Dicom(many)
+    assert source.count == 4
+    assert source.warnings == ["it claims 2000000000 pictures, 4 are there; these were used"]
+    runs = packed(tmp_path / "c.dcm", [bytes(99_999)] * 2, RLELossless)
+    with pytest.raises(InputError, match="picture 0 takes 100000 bytes, more than unpacked"):
+        pictures(runs)
+
+
+def test_what_is_not_read_is_named(tmp_path: Path) -> None:
+    lossless = packed(tmp_path / "a.dcm", [jpeg(film()[0])] * 2, JPEGLosslessSV1)
+    with pytest.raises(InputError, match=r"packed as JPEG Lossless.* are not read .*convert it first"):
+        open_sequence(lossless)
+    with pytest.raises(InputError, match="deflated DICOM is not read"):
+        open_sequence(native(tmp_path / "b.dcm", film(), DeflatedExplicitVRLittleEndian))
+    with pytest.raises(InputError, match="colours stored as 'HSV' are not read"):
+        pictures(native(tmp_path / "c.dcm", film(), PhotometricInterpretation="HSV"))
+    bits = native(tmp_path / "d.dcm", film(), BitsAllocated=1)
+    with pytest.raises(InputError, match="1 bits per sample"):
+        open_sequence(bits)
+
+
+def test_a_file_without_pictures_is_one_sentence(tmp_path: Path) -> None:
+    found = pydicom.dcmread(native(tmp_path / "a.dcm", film()))
+    del found.PixelData
+    with pytest.raises(InputError, match="holds no pictures"):
+        open_sequence(save(found, tmp_path / "b.dcm"))
+    (tmp_path / "c.dcm").write_text("wrongly named")
+    with pytest.raises(InputError, match=r"c\.dcm: the DICOM file"):
+        open_sequence(tmp_path / "c.dcm")
+
+
+def test_a_file_without_its_preamble_is_read_by_its_ending(tmp_path: Path) -> None:
+    file = native(tmp_path / "a.dcm", film(), ImplicitVRLittleEndian)
+    content = file.read_bytes()
+    start = content.index(struct.pack("<HHL", 8, 0x16, 0)[:4])
+    file.write_bytes(content[start:])
+    np.testing.assert_array_equal(pictures(file), film())
+    file.write_bytes(content[132:])
+    with pytest.raises(InputError, match="lacks its first 132 bytes"):
+        open_sequence(file)
+
+
+def test_several_series_are_refused(tmp_path: Path) -> None:
+    folder = write_series(tmp_path / "a", [1, 2])
+    native(folder / "film", film())
+    with pytest.raises(InputError, match="1 videos or multi-frame images and 1 series of single frames"):
+        open_sequence(folder)
+    (folder / "film").write_bytes((folder / "film").read_bytes()[:600])
+    sequence = open_sequence(folder)
+    assert sequence.count == 2
+    assert any("1 of 3 DICOM files hold no pictures or cannot be read" in warning for warning in sequence.warnings)
+
+
+def test_instances_that_repeat_a_number_are_counted(tmp_path: Path) -> None:
+    source = Dicom(write_series(tmp_path / "a", [1, 1, 2]))
+    assert list(source.numbers) == [0, 1, 2]
+    assert any("not every file of the series has a number of its own" in warning for warning in source.warnings)
+
+
+def test_pictures_of_a_series_have_one_size(tmp_path: Path) -> None:
+    folder = write_series(tmp_path / "a", [1, 2])
+    tags = {"SeriesInstanceUID": "1.2.3", "InstanceNumber": 3, "Rows": 24, "NumberOfFrames": None}
+    native(folder / "third", film(1)[:, :24], **tags)
+    with pytest.raises(InputError, match="picture 3 is 64x24 px, those before it are 64x48 px"):
+        pictures(folder)
+
+
+def test_an_empty_video_is_one_sentence(tmp_path: Path) -> None:
+    file = write_dicom_video(tmp_path / "a")
+    content = file.read_bytes()
+    start = content.rindex(b"\xfe\xff\x00\xe0" + bytes(4)) + 8
+    file.write_bytes(content[:start])
+    with pytest.raises(InputError, match="says that it holds a video, but that is empty"):
+        open_sequence(file)
+    file.write_bytes(content[: start + 200])
+    with pytest.raises(InputError, match="reading the video"):
+        open_sequence(file)
+
+
+def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = write_frames(tmp_path / "a")
+    monkeypatch.setitem(sys.modules, "pydicom", None)
+    with pytest.raises(InputError, match=r"pip install 'scopemap\[dicom\]'"):
+        open_sequence(file)

@@ -1,0 +1,254 @@
+"""Two views or two fields in a picture, as a run reads them; and frames that are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_clips import RATE, clip, tissue, write
+from drawn_inputs import frames_of, save, write_c3vd
+from drawn_videos import HEIGHT, WIDTH, above, beside, beside_squeezed, encode, half, stereo, woven
+
+from scopemap.calibration import write_calibration
+from scopemap.camera import PinholeCamera
+from scopemap.config import InputSettings
+from scopemap.datasets import open_sequence
+from scopemap.errors import CalibrationError, InputError
+from scopemap.pictures.duplicates import difference, repeats
+from scopemap.pictures.interlacing import combing
+
+COUNT = 12
+Draw = Callable[[int], np.ndarray]
+
+
+def _video(file: Path, draw: Draw) -> Path:
+    return encode(file, [draw(number) for number in range(COUNT)])
+
+
+def _left(number: int) -> np.ndarray:
+    return stereo(number)[0]
+
+
+@pytest.mark.parametrize(
+    ("draw", "layout", "left", "aspect"),
+    [
+        (beside, "left-right", _left, 1.0),
+        (above, "top-bottom", _left, 1.0),
+        (beside_squeezed, "left-right", lambda number: half(_left(number), 1), 2.0),
+    ],
+)
+def test_a_stereo_video_gives_its_left_view(draw: Draw, layout: str, left: Draw, aspect: float, tmp_path: Path) -> None:
+    sequence = open_sequence(_video(tmp_path / "v.mp4", draw))
+    notes = [note for note in sequence.notes if note.startswith("stereo")]
+    assert len(notes) == 1
+    assert f"stereo, {layout}: the " in notes[0]
+    assert "--stereo none" in notes[0]
+    height, width = left(0).shape[:2]
+    assert (sequence.source.width, sequence.source.height) == (width, height)
+    assert sequence.source.pixel_aspect == aspect
+    # Pixels that are twice as wide see with half the focal length across.
+    assert sequence.camera.fy / sequence.camera.fx == pytest.approx(aspect)
+    frames = list(sequence.source.frames(slice(None)))
+    assert [frame.index for frame in frames] == list(range(COUNT))
+    for frame in frames:
+        assert np.abs(frame.rgb.astype(int) - left(frame.index)).mean() < 2
+
+
+def test_what_is_said_of_stereo_overrules_what_is_found(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", beside)
+    whole = open_sequence(file, settings=InputSettings(stereo="none"))
+    assert (whole.source.width, whole.source.height) == (2 * WIDTH, HEIGHT)
+    assert not any("stereo" in note for note in whole.notes)
+    mono = _video(tmp_path / "m.mp4", tissue)
+    upper = open_sequence(mono, settings=InputSettings(stereo="top-bottom"))
+    assert (upper.source.width, upper.source.height) == (WIDTH, HEIGHT // 2)
+    assert any("stereo, top-bottom: the upper half" in note and "as asked" in note for note in upper.notes)
+
+
+def test_a_folder_of_stereo_images_is_told_too(tmp_path: Path) -> None:
+    for number in range(4):
+        save(tmp_path / f"{number}.png", above(5 * number))
+    sequence = open_sequence(tmp_path)
+    assert (sequence.source.width, sequence.source.height, sequence.count) == (WIDTH, HEIGHT, 4)
+    assert sequence.source.stamps(slice(None)) == [(number, number / 30) for number in range(4)]
+    np.testing.assert_array_equal(next(sequence.source.frames(slice(None))).rgb, stereo(0)[0])
+
+
+def test_ordinary_videos_and_data_sets_are_left_alone(tmp_path: Path) -> None:
+    ordinary = open_sequence(_video(tmp_path / "v.mp4", tissue))
+    assert (ordinary.source.width, ordinary.source.height) == (WIDTH, HEIGHT)
+    assert [note for note in ordinary.notes if "stereo" in note] == ordinary.warnings == []
+    folder = write_c3vd(tmp_path / "c3vd")
+    with pytest.raises(InputError, match=r"'c3vd' knows which view is meant; leave input\.stereo=left-right"):
+        open_sequence(folder, settings=InputSettings(stereo="left-right"))
+    assert open_sequence(folder, settings=InputSettings(stereo="none")).source.name == "c3vd"
+
+
+def test_a_shape_that_looks_like_two_views_is_told(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", lambda number: np.hstack([tissue(number), tissue(number, seed=4)]))
+    sequence = open_sequence(file)
+    assert sequence.source.width == 2 * WIDTH
+    assert any("the shape of two views" in note and "--stereo left-right" in note for note in sequence.notes)
+
+
+def _calibration(file: Path, width: int, height: int) -> Path:
+    write_calibration(PinholeCamera(0.8 * width, 0.8 * width, width / 2, height / 2, width, height), file)
+    return file
+
+
+def test_a_camera_is_that_of_one_view(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", beside)
+    of_one = open_sequence(file, camera=_calibration(tmp_path / "one.yaml", WIDTH, HEIGHT))
+    assert of_one.calibrated
+    with pytest.raises(CalibrationError, match=rf"the camera must be that of one, {WIDTH}x{HEIGHT} px \(--stereo none"):
+        open_sequence(file, camera=_calibration(tmp_path / "both.yaml", 2 * WIDTH, HEIGHT))
+
+
+def test_the_calibration_beside_stereo_images_is_that_of_one_view(tmp_path: Path) -> None:
+    for number in range(4):
+        save(tmp_path / f"{number}.png", above(5 * number))
+    _calibration(tmp_path / "camera.yaml", WIDTH, HEIGHT)
+    sequence = open_sequence(tmp_path)
+    assert (sequence.calibrated, sequence.source.height) == (True, HEIGHT)
+    _calibration(tmp_path / "camera.yaml", WIDTH, 2 * HEIGHT)
+    with pytest.raises(CalibrationError, match="the camera must be that of one"):
+        open_sequence(tmp_path)
+
+
+# ---- two fields
+
+
+def test_interlaced_material_is_told_and_undone(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", lambda number: woven(2 * number))
+    told = open_sequence(file)
+    assert len(told.warnings) == 1
+    assert "interlaced" in told.warnings[0]
+    assert "--deinterlace" in told.warnings[0]
+    undone = open_sequence(file, settings=InputSettings(deinterlace=True))
+    assert undone.warnings == []
+    assert any("deinterlaced" in note for note in undone.notes)
+    for comb, frame in zip(told.source.frames(slice(None)), undone.source.frames(slice(None)), strict=True):
+        np.testing.assert_array_equal(frame.rgb[::2], comb.rgb[::2])
+        assert combing(comb.rgb) > 10 * combing(frame.rgb)
+
+
+def test_any_source_is_deinterlaced_on_request(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path)
+    plain, undone = (open_sequence(folder, settings=InputSettings(deinterlace=on)) for on in (False, True))
+    assert (undone.source.name, undone.source.camera) == ("c3vd", plain.source.camera)
+    for one, other in zip(plain.source.frames(slice(None)), undone.source.frames(slice(None)), strict=True):
+        np.testing.assert_array_equal(one.rgb[::2], other.rgb[::2])
+    truth = undone.source.truth(3)
+    assert truth is not None
+    np.testing.assert_array_equal(truth.T_world_camera, plain.source.pose(3))
+    assert undone.count == plain.count
+
+
+# ---- frames that are left out
+
+
+def _indices(file: Path, **settings: object) -> list[int]:
+    return [frame.index for frame in frames_of(open_sequence(file, settings=InputSettings(**settings)))]
+
+
+def test_pictures_that_repeat_are_skipped(tmp_path: Path) -> None:
+    """A conversion from 25 to 30 frames/s shows every fifth picture twice."""
+    converted = [tissue(6 * (number // 6) + min(number % 6, 4)) for number in range(30)]
+    file = write(tmp_path / "v.mp4", converted)
+    sequence = open_sequence(file)
+    kept = [frame.index for frame in sequence.frames()]
+    assert kept == [number for number in range(30) if number % 6 != 5]
+    assert [(s.index, s.kind, s.reason) for s in sequence.skipped] == [
+        (number, "repeated", f"repeats frame {number - 1}") for number in (5, 11, 17, 23, 29)
+    ]
+    assert sequence.count == 30
+    assert _indices(file, skip_duplicates=False) == list(range(30))
+    # Asked again, it says the same.
+    assert len(list(sequence.frames())) == 25
+    assert len(sequence.skipped) == 5
+
+
+def test_a_camera_at_rest_repeats_nothing() -> None:
+    still, rng = tissue(0).astype(float), np.random.default_rng(0)
+    noisy = [np.clip(still + rng.normal(0, 1.5, still.shape), 0, 255).astype(np.uint8) for _ in range(3)]
+    assert not repeats(noisy[0], noisy[1])
+    assert repeats(noisy[0], noisy[0])
+
+
+def test_black_borders_do_not_dilute_a_difference() -> None:
+    one, other = (tissue(number) for number in (0, 0))
+    other = np.clip(one + 1, 0, 255).astype(np.uint8)
+    assert difference(one, other) == pytest.approx(1, abs=0.01)
+    for view in (one, other):
+        view[:, 40:] = 0
+    assert difference(one, other) == pytest.approx(1, abs=0.01)
+
+
+def test_pictures_that_show_nothing_repeat_nothing() -> None:
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    assert not repeats(black, black)
+    assert not repeats(black + 90, black + 90)
+
+
+def test_what_creeps_adds_up(tmp_path: Path) -> None:
+    """Each picture differs from the one before by less than counts as new, the third from the first by more."""
+    for number in range(7):
+        rgb = tissue(0).copy()
+        rgb[::3] += np.uint8(number)
+        save(tmp_path / f"{number}.png", rgb)
+    assert _indices(tmp_path) == [0, 2, 4, 6]
+
+
+def test_a_still_is_one_frame_and_says_so(tmp_path: Path) -> None:
+    for number in range(4):
+        save(tmp_path / f"{number}.png", tissue(0))
+    with pytest.raises(InputError, match=r"3 skipped: frame 3 repeats frame 0; .*input\.skip_duplicates=false"):
+        _indices(tmp_path)
+    assert _indices(tmp_path, skip_duplicates=False) == [0, 1, 2, 3]
+
+
+def test_data_sets_with_truth_are_not_thinned_for_repeats(tmp_path: Path) -> None:
+    folder = write_c3vd(tmp_path, count=5)
+    for number in range(5):
+        save(folder / f"{number}_color.png", tissue(0, (135, 108)))
+    assert _indices(folder) == list(range(5))
+
+
+@pytest.mark.parametrize(
+    ("fps", "kept"),
+    [
+        (100.0, list(range(20))),
+        (25.0, list(range(20))),
+        (12.5, list(range(0, 20, 2))),
+        (10.0, [0, 3, 5, 8, 10, 13, 15, 18]),
+        (2.0, [0, 13]),
+    ],
+)
+def test_at_most_so_many_frames_a_second(fps: float, kept: list[int], tmp_path: Path) -> None:
+    file = write(tmp_path / "v.mp4", clip(20, size=(64, 48)))
+    assert _indices(file, fps=fps) == kept
+
+
+def test_the_rate_is_that_of_the_time_stamps(tmp_path: Path) -> None:
+    stamps = [0, 1, 2, 3, 25, 50, 51, 52, 75]
+    file = write(tmp_path / "v.mkv", clip(len(stamps), size=(64, 48)), stamps)
+    sequence = open_sequence(file, settings=InputSettings(fps=1.0))
+    frames = frames_of(sequence)
+    assert [frame.time_s * RATE for frame in frames] == pytest.approx([0, 25, 50, 75], abs=0.1)
+    assert {skipped.kind for skipped in sequence.skipped} == {"thinned"}
+    assert sequence.skipped[0].reason == "beyond 1 frames/s"
+
+
+def test_data_sets_are_thinned_by_rate_when_asked(tmp_path: Path) -> None:
+    sequence = open_sequence(write_c3vd(tmp_path), settings=InputSettings(fps=10.0))
+    assert [frame.index for frame, truth in sequence if truth is not None] == [0, 3, 6, 9]
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("name", "count"), [("colonoscopy_nflba_03", 247), ("laparoscopy_rvim", 250)])
+def test_clinical_clips_are_read_as_they_are(name: str, count: int, real_data: Path) -> None:
+    sequence = open_sequence(real_data / "endoscopy" / "video" / f"{name}.mp4")
+    assert (len(frames_of(sequence)), sequence.skipped, sequence.warnings) == (count, [], [])
+    assert not any("stereo" in note for note in sequence.notes)

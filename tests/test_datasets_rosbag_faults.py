@@ -1,0 +1,225 @@
+"""ROS recordings with something wrong: a sentence or a named repair, nothing lost, no memory taken by a claim."""
+
+from __future__ import annotations
+
+import bz2
+import sys
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+from drawn_bags import IMAGE, INFO, SIZE, START_NS, STEP_NS, Bag, small_bag, write_bag1, write_mcap, write_ros2
+from drawn_dicom import jpeg
+from drawn_inputs import number_in, picture
+
+from scopemap.datasets import open_sequence
+from scopemap.datasets.rosbag import RosBag
+from scopemap.datasets.rosbag_unpacking import LARGEST_CHUNK_BYTES, bound_unpacking, unpacked_zstd, zstandard
+from scopemap.errors import CalibrationError, InputError
+
+JPEG_START = b"\xff\xd8\xff"
+
+
+def numbers(source: RosBag) -> list[int]:
+    return [number_in(frame.rgb) for frame in source.frames(slice(None))]
+
+
+@pytest.mark.parametrize("write", [write_bag1, write_mcap])
+def test_a_file_that_breaks_off_is_one_sentence_that_says_what_may_mend_it(tmp_path: Path, write: Any) -> None:
+    file = write(tmp_path / "a")
+    content = file.read_bytes()
+    for length in (13, len(content) // 2, len(content) - 9):
+        file.write_bytes(content[:length])
+        with pytest.raises(InputError, match=r"damaged or was not closed .*; 'rosbag reindex'"):
+            open_sequence(file)
+
+
+def test_messages_before_a_damaged_one_are_used(tmp_path: Path) -> None:
+    bag = Bag()
+    size = (512, 400)  # each fills a chunk of its own
+    for number in range(4):
+        bag.image(IMAGE, number, picture(number, size), "rgb8")
+        bag.image("/other", number, np.zeros((800, 700), np.uint8), "mono8")
+    folder = bag.write_ros2(tmp_path / "a", "MCAP", "STORAGE")
+    file = folder / "a.mcap"
+    content = file.read_bytes()
+    chunk = content.rfind(b"\x28\xb5\x2f\xfd")
+    file.write_bytes(content[:chunk] + b"\0\0\0\0" + content[chunk + 4 :])
+    source = open_sequence(file, dataset=f"rosbag:{IMAGE}").source
+    read = [number_in(frame.rgb) for frame in source.frames(slice(None))]
+    assert read == list(range(len(read)))
+    assert 2 <= len(read) < 4
+    assert any(f"after {len(read)} messages the bag breaks off" in warning for warning in source.warnings)
+    assert [index for index, _ in source.stamps(slice(None)) or []] == list(range(len(read)))
+
+
+def test_a_picture_that_cannot_be_decoded_is_left_out_and_keeps_its_number(tmp_path: Path) -> None:
+    bag = Bag()
+    for number in range(4):
+        content = jpeg(picture(number, SIZE)) if number != 1 else JPEG_START + b"nothing"
+        bag.compressed(f"{IMAGE}/compressed", number, content, "jpeg")
+    bag.image("/short", 0, picture(0, SIZE), "rgb8")
+    bag.image("/short", 1, picture(1, SIZE), "rgb8", data=np.zeros(9, np.uint8))
+    bag.image("/short", 2, picture(2, SIZE), "rgb8")
+    file = bag.write_bag1(tmp_path / "a.bag")
+    source = RosBag(file, f"{IMAGE}/compressed")
+    assert [frame.index for frame in source.frames(slice(None))] == [0, 2, 3]
+    assert any("image 1 of" in warning and "was left out" in warning for warning in source.warnings)
+    short = RosBag(file, "/short")
+    assert numbers(short) == [0, 2]
+    assert any("9 bytes for 48 rows of 192 bytes" in warning for warning in short.warnings)
+
+
+def test_pictures_of_another_size_are_an_error(tmp_path: Path) -> None:
+    bag = small_bag(2)
+    bag.image(IMAGE, 2, picture(2, (SIZE[0], SIZE[1] + 2)), "rgb8")
+    with pytest.raises(InputError, match=r"image 2 of .* is 64x50 px, those before it are 64x48 px"):
+        numbers(RosBag(bag.write_bag1(tmp_path / "a.bag")))
+
+
+def test_a_bag_without_pictures_names_what_it_holds(tmp_path: Path) -> None:
+    bag = Bag()
+    bag.info()
+    for number in range(2):
+        bag.image("/depth", number, np.ones((48, 64), np.uint16), "16UC1")
+    file = bag.write_bag1(tmp_path / "a.bag")
+    with pytest.raises(InputError, match=f"holds no pictures .* {INFO}, /depth"):
+        open_sequence(file)
+
+
+@pytest.mark.parametrize("topic", ["/nowhere", "/depth"])
+def test_a_topic_that_holds_no_pictures_is_refused(tmp_path: Path, topic: str) -> None:
+    bag = small_bag(2)
+    bag.image("/depth", 0, np.ones((48, 64), np.uint16), "16UC1")
+    file = bag.write_bag1(tmp_path / "a.bag")
+    with pytest.raises(InputError, match=f"no images under the topic '{topic}'; there are {IMAGE}"):
+        open_sequence(file, dataset=f"rosbag:{topic}")
+    with pytest.raises(InputError, match="only rosbag:TOPIC"):
+        open_sequence(file, dataset="video:1")
+
+
+def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
+    bag = Bag()
+    bag.image(IMAGE, 0, picture(0, SIZE), "nv97")
+    with pytest.raises(InputError, match="encoding 'nv97' of its images is not known"):
+        open_sequence(bag.write_bag1(tmp_path / "a.bag"))
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        ({"width": 100, "height": 48}, "100x48"),
+        ({"k": np.array([1.0, 0, 31, 0, 1, 24, 0, 0, 1])}, "focal length 1, 1 px"),
+        ({"k": np.array([np.nan, 0, 31, 0, 60, 24, 0, 0, 1])}, "focal length nan"),
+        ({"k": np.array([60.0, 0, 310, 0, 60, 24, 0, 0, 1])}, "principal point 310"),
+        ({"model": "double_sphere", "d": (1.0,)}, "lens 'double_sphere' with 1 coefficients"),
+        ({"model": "rational_polynomial", "d": (0.1,) * 12}, "with 12 coefficients"),
+        ({"d": (np.nan, 0, 0, 0, 1)}, "distortion is not finite"),
+        ({"roi": (1, 1, 48, 64)}, "region of interest lies outside"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_told_and_another_may_be_given(
+    tmp_path: Path, info: dict[str, Any], message: str
+) -> None:
+    bag = small_bag(2)
+    bag.messages.pop(0)
+    bag.info(**info)
+    file = bag.write_bag1(tmp_path / "a.bag")
+    with pytest.raises(CalibrationError, match=message):
+        open_sequence(file)
+    (tmp_path / "camera.txt").write_text("60 60 31 24\n")
+    assert open_sequence(file, camera=tmp_path / "camera.txt").calibrated
+
+
+def test_a_camera_that_was_never_calibrated_is_unknown(tmp_path: Path) -> None:
+    bag = small_bag(2)
+    bag.messages.pop(0)
+    bag.info(k=np.zeros(9))
+    sequence = open_sequence(bag.write_bag1(tmp_path / "a.bag"))
+    assert not sequence.calibrated
+    assert any("not calibrated (K is zero)" in note for note in sequence.notes)
+
+
+def test_metadata_that_does_not_fit_the_files_is_told(tmp_path: Path) -> None:
+    folder = small_bag().write_ros2(tmp_path / "a", "MCAP")
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text()
+    assert "- a.mcap" in text
+    metadata.write_text(
+        text.replace("- a.mcap", "- a.mcap\n  - a_1.mcap", 1).replace("message_count: 4", "message_count: 9")
+    )
+    warnings = RosBag(folder).warnings
+    assert any("names files that are missing: a_1.mcap" in warning for warning in warnings)
+    assert any(f"counts 9 messages of {IMAGE}, its files hold 4" in warning for warning in warnings)
+    metadata.write_text("rosbag2: [")
+    assert any("cannot be read" in warning for warning in RosBag(folder).warnings)
+    metadata.write_text(text.replace("a.mcap", "../../b.mcap"))
+    with pytest.raises(InputError, match=r"none of the 1 files that its metadata\.yaml names is there"):
+        RosBag(folder)
+    metadata.unlink()
+    assert RosBag(folder).count == 4
+    (folder / "other.mcap").write_bytes((folder / "a.mcap").read_bytes())
+    with pytest.raises(InputError, match=r"several bags and no metadata\.yaml .*\(a\.mcap, other\.mcap\)"):
+        RosBag(folder)
+
+
+def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:
+    bag = small_bag(2)
+    bag.image(IMAGE, 2, picture(2, SIZE), "rgb8", stamp_ns=0)
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 2 * STEP_NS + 5) / 1e9)
+    assert any("hold no stamp" in warning for warning in source.warnings)
+
+
+def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = write_bag1(tmp_path / "a")
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(InputError, match=r"pip install 'scopemap\[ros\]'"):
+        open_sequence(file)
+
+
+BOMB = bytes(LARGEST_CHUNK_BYTES + 1)
+
+
+@pytest.mark.parametrize("kind", ["bz2", "lz4"])
+def test_chunks_unpack_up_to_a_limit(kind: str) -> None:
+    from rosbags.rosbag1.reader import decompressors
+
+    bound_unpacking()
+    packed = {"bz2": bz2.compress, "lz4": lz4.frame.compress}[kind]
+    assert decompressors[kind](packed(b"12") + packed(b"3")) == b"123"
+    with pytest.raises(ValueError, match="unpacks to more than"):
+        decompressors[kind](packed(BOMB))
+    with pytest.raises(ValueError, match="breaks off"):
+        decompressors[kind](packed(b"123456789" * 99)[:-9])
+
+
+def test_zstandard_unpacks_up_to_what_a_chunk_states(tmp_path: Path) -> None:
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+
+    bound_unpacking()
+    packed = zstandard().compress(bytes(5000))
+    assert DECOMPRESSORS["zstd"](packed, 5000) == bytes(5000)
+    with pytest.raises(ValueError, match="more than 4999 bytes"):
+        DECOMPRESSORS["zstd"](packed, 4999)
+    with pytest.raises(ValueError, match="unpacks to more than"):
+        unpacked_zstd(zstandard().compress(BOMB))
+
+
+def test_a_bag_packed_as_a_whole_unpacks_up_to_a_limit(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "a")
+    (folder / "metadata.yaml").unlink()
+    (folder / "a.db3").unlink()
+    (folder / "a.db3.zstd").write_bytes(zstandard().compress(BOMB))
+    with pytest.raises(InputError, match="would take more than"):
+        open_sequence(folder)
+
+
+def test_a_picture_that_claims_too_many_pixels_is_refused(tmp_path: Path) -> None:
+    bag = Bag()
+    for number in range(2):
+        bag.image(IMAGE, number, picture(number, SIZE), "rgb8", height=60_000, width=60_000)
+    with pytest.raises(InputError, match="more than 64 million pixels"):
+        open_sequence(bag.write_bag1(tmp_path / "a.bag"))

@@ -1,0 +1,349 @@
+"""The focal length from motion: exact on made-up points, spreads that hold, silence where nothing can be told."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from turning_clip import SIZE, focal_of, write_clip
+
+from scopemap.config import Config
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.errors import CalibrationError
+from scopemap.focal import (
+    FocalEstimate,
+    Window,
+    WindowFit,
+    adjusted,
+    focal_from_motion,
+    together,
+    windows_of,
+    with_focal_from_motion,
+)
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import so3_exp
+from scopemap.rectification import Rectifier, working_camera
+from scopemap.runner import reconstruct
+
+HALF_PX = 160.0
+SWAY_DEG, WAY = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)
+
+
+def _window(
+    fov_deg: float,
+    *,
+    seed: int = 0,
+    noise_px: float = 0.0,
+    turn_deg: tuple[float, float, float] = SWAY_DEG,
+    way: tuple[float, float, float] = WAY,
+    depths: tuple[float, float] = (0.6, 1.8),
+    bend: float = 0.0,
+) -> Window:
+    """200 points before a camera that turns and moves on, seen in 7 partners; its median depth is about 1."""
+    rng = np.random.default_rng(seed)
+    focal = focal_of(fov_deg, int(2 * HALF_PX))
+    pixel = rng.uniform(-1, 1, (200, 2)) * [0.9 * HALF_PX, 0.7 * HALF_PX]
+    point = np.concatenate([pixel / focal, np.ones((200, 1))], 1) * rng.uniform(*depths, (200, 1))
+    seen = []
+    for share in np.arange(1, 8) / 7:
+        moved = point @ so3_exp(np.radians(turn_deg) * share).T + share * np.array(way)
+        seen.append(focal * moved[:, :2] / moved[:, 2:])
+    everywhere = _bent(np.stack(seen, 1), bend)
+    everywhere += rng.normal(0, noise_px, everywhere.shape)
+    everywhere[rng.random(everywhere.shape[:2]) < 0.1] = np.nan
+    return Window(_bent(pixel, bend), everywhere, HALF_PX)
+
+
+def _bent(straight: np.ndarray, bend: float) -> np.ndarray:
+    """Pixels that x (1 + bend |x|^2 / h^2) makes straight, by fixed-point iteration."""
+    pixel = straight.copy()
+    for _ in range(50):
+        pixel = straight / (1 + bend * (pixel**2).sum(-1, keepdims=True) / HALF_PX**2)
+    return pixel
+
+
+def _error(fit: WindowFit | None, fov_deg: float) -> float:
+    assert fit is not None
+    return fit.log_focal - math.log(focal_of(fov_deg, int(2 * HALF_PX)))
+
+
+ASSUMED_PX = focal_of(70.0, int(2 * HALF_PX))
+
+
+@pytest.mark.parametrize("fov_deg", [45.0, 70.0, 90.0, 115.0])
+def test_without_noise_the_focal_length_is_exact(fov_deg: float) -> None:
+    fit = adjusted(_window(fov_deg), ASSUMED_PX)
+    assert abs(_error(fit, fov_deg)) < 2e-3
+    assert fit is not None
+    assert fit.tilt_deg == pytest.approx(math.hypot(*SWAY_DEG[:2]), rel=0.05)
+    assert fit.residual_px < 0.05
+
+
+@pytest.mark.parametrize("fov_deg", [60.0, 95.0])
+def test_a_lens_that_bends_does_not_change_the_focal_length(fov_deg: float) -> None:
+    fit = adjusted(_window(fov_deg, bend=0.25), ASSUMED_PX)
+    assert abs(_error(fit, fov_deg)) < 0.02
+    assert fit is not None
+    assert fit.bend == pytest.approx(0.25, abs=0.02)
+
+
+def test_pixels_need_not_be_square() -> None:
+    window = _window(80.0)
+    squeezed = Window(window.start * [1, 0.8], window.seen * [1, 0.8], HALF_PX, aspect=0.8)
+    assert abs(_error(adjusted(squeezed, ASSUMED_PX), 80.0)) < 2e-3
+
+
+def test_the_deviation_covers_the_error_of_noise() -> None:
+    scores = []
+    for seed in range(10):
+        fit = adjusted(_window(75.0, seed=seed, noise_px=0.3), ASSUMED_PX)
+        assert fit is not None
+        assert 1e-3 < fit.deviation < 0.1
+        assert fit.residual_px == pytest.approx(0.3, rel=0.25)
+        scores.append(_error(fit, 75.0) / fit.deviation)
+    assert 0.3 < np.sqrt(np.mean(np.square(scores))) < 1.8
+
+
+def test_outliers_do_not_carry_it_away() -> None:
+    window = _window(75.0, noise_px=0.1)
+    wrong = np.random.default_rng(1).random(window.seen.shape[:2]) < 0.1
+    seen = np.where(wrong[..., None], window.seen + 15.0, window.seen)
+    assert abs(_error(adjusted(dataclasses.replace(window, seen=seen), ASSUMED_PX), 75.0)) < 0.03
+
+
+def test_a_rotation_alone_tells_it() -> None:
+    fits = [adjusted(_window(85.0, seed=s, noise_px=0.2, way=(0, 0, 0)), ASSUMED_PX) for s in range(3)]
+    estimate = together([fit for fit in fits if fit is not None], 2 * HALF_PX)
+    assert estimate.reason == ""
+    assert abs(math.log(estimate.focal_px / focal_of(85.0, int(2 * HALF_PX)))) < 2 * estimate.share
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"turn_deg": (0, 0, 0), "way": (0.02, 0.03, -0.5)},  # along the axis
+        {"turn_deg": (0, 0, 0), "way": (0.4, 0.1, 0.0)},  # sideways
+        {"turn_deg": (0, 0, 25.0), "way": (0, 0, -0.2)},  # rolling
+        {"turn_deg": (0, 0, 0), "way": (0.2, 0.1, 0.0), "depths": (1.0, 1.0)},  # along a wall
+        {"turn_deg": (0, 0, 0), "way": (0, 0, 0)},  # at rest
+    ],
+    ids=["forward", "sideways", "roll", "wall", "rest"],
+)
+def test_motion_that_does_not_turn_the_axis_tells_nothing(motion: dict) -> None:
+    fits = [adjusted(_window(100.0, seed=seed, noise_px=0.25, **motion), ASSUMED_PX) for seed in range(3)]
+    estimate = together([fit for fit in fits if fit is not None], 2 * HALF_PX)
+    assert estimate.reason or estimate.share > 0.15
+
+
+# ---- what windows say together
+
+
+def _fit(fov_deg: float, deviation: float = 0.01, tilt_deg: float = 10.0) -> WindowFit:
+    return WindowFit(math.log(focal_of(fov_deg, 320)), deviation, 0.2, tilt_deg, 0.0)
+
+
+def test_windows_err_together_so_many_are_not_much_better_than_two() -> None:
+    two, many = (together([_fit(80.0)] * count, 320.0) for count in (2, 20))
+    assert two.fov_deg == pytest.approx(80.0)
+    assert two.windows == 2
+    assert many.share == pytest.approx(0.04, abs=0.005)
+    assert many.share < two.share < 0.05
+    assert two.sigma_px == pytest.approx(two.share * two.focal_px)
+
+
+def test_windows_that_disagree_widen_the_spread() -> None:
+    alike, torn = together([_fit(80.0)] * 4, 320.0), together([_fit(60.0), _fit(100.0)] * 2, 320.0)
+    assert torn.share > 3 * alike.share
+
+
+def test_the_less_the_axis_tilts_the_less_is_told() -> None:
+    assert together([_fit(80.0, tilt_deg=1.0)] * 5, 320.0).share == pytest.approx(0.4, rel=0.05)
+    assert "two are needed" in together([_fit(80.0, tilt_deg=0.01)] * 5, 320.0).reason
+    assert "two are needed" in together([_fit(80.0)], 320.0).reason
+
+
+@pytest.mark.parametrize("fov_deg", [15.0, 165.0])
+def test_what_is_no_endoscope_is_no_estimate(fov_deg: float) -> None:
+    assert "no endoscope" in together([_fit(fov_deg)] * 3, 320.0).reason
+
+
+def test_two_deviations_are_a_difference() -> None:
+    estimate = FocalEstimate(100.0, 0.05, 90.0, 3)
+    assert estimate.differs_from(112.0)
+    assert estimate.differs_from(89.0)
+    assert not estimate.differs_from(108.0)
+
+
+# ---- pictures
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("clips") / "turning", 100.0, 48)
+
+
+def test_pictures_of_a_turning_camera_tell_it(turning: Path) -> None:
+    sequence = open_sequence(turning)
+    estimate = focal_from_motion(sequence, Config())
+    assert estimate.reason == ""
+    assert estimate.share < 0.06
+    assert estimate.focal_px == pytest.approx(focal_of(100.0), rel=2 * estimate.share)
+    window = next(windows_of(sequence, Config()))
+    assert window.seen.shape == (len(window.start), 10, 2)
+    assert window.half_width_px == SIZE[0] / 2
+
+
+def test_a_large_working_size_is_looked_at_small(tmp_path: Path) -> None:
+    folder = write_clip(tmp_path / "clip", 80.0, 12)
+    for file in folder.iterdir():
+        cv2.imwrite(str(file), cv2.resize(cv2.imread(str(file)), None, fx=3, fy=3))
+    large, usual = open_sequence(folder, size=(600, 480)), open_sequence(folder)
+    assert next(windows_of(large, Config())).half_width_px == usual.camera.width / 2
+    at_large, at_usual = (focal_from_motion(sequence, Config()) for sequence in (large, usual))
+    assert at_large.focal_px == pytest.approx(at_usual.focal_px * 600 / usual.camera.width, rel=0.02)
+    assert at_large.fov_deg == pytest.approx(at_usual.fov_deg, rel=0.02)
+
+
+def test_a_run_takes_it_and_writes_down_its_spread(turning: Path, tmp_path: Path) -> None:
+    config = Config.load(settings={"depth.backend": "shading", "networks.flow": "none", "fusion.enabled": False})
+    result = reconstruct(open_sequence(turning), config, out=tmp_path / "out")
+    truth_px = focal_of(100.0)
+    assert result.camera.fx == pytest.approx(truth_px, rel=0.1)
+    facts = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    assert facts["camera"]["source"].startswith("estimated: from the motion of 48 frames, fx ")
+    assert "focal length" in facts["seconds"]
+    sigma_px = facts["camera"]["focal_sigma_px"]
+    assert abs(result.camera.fx - truth_px) < 2 * sigma_px < 0.2 * truth_px
+    for name in ("camera.yaml", "source_camera.yaml"):
+        storage = cv2.FileStorage(str(tmp_path / "out" / name), cv2.FILE_STORAGE_READ)
+        assert storage.getNode("focal_sigma_px").real() == pytest.approx(sigma_px)
+        again = open_sequence(turning, camera=tmp_path / "out" / name)
+        assert again.calibrated
+        assert again.camera.fx == pytest.approx(result.camera.fx)
+
+
+# ---- the setting
+
+
+def _settings(focal: str) -> Config:
+    return Config.load(settings={"input.focal": focal})
+
+
+@pytest.fixture
+def still(tmp_path: Path) -> Sequence:
+    return open_sequence(write_clip(tmp_path / "still", 100.0, 12, turn_deg=0.0, way_mm=0.0))
+
+
+@pytest.mark.parametrize("focal", ["auto", "assume"])
+def test_a_camera_at_rest_stays_as_assumed(still: Sequence, focal: str) -> None:
+    config = _settings(focal).model_copy(update={"fusion": Config().fusion.model_copy(update={"enabled": False})})
+    result = reconstruct(still, config)
+    assert result.camera == still.camera
+    assert result.provenance["camera"]["focal_sigma_px"] is None
+    told = [note for note in result.provenance["notes"] if note.startswith("focal length: assumed")]
+    assert len(told) == (focal == "auto")
+    assert ("focal length" in result.provenance["seconds"]) == (focal == "auto")
+
+
+ESTIMATES = {
+    "clear": FocalEstimate(84.0, 0.04, 100.0, 5),
+    "wide": FocalEstimate(84.0, 0.2, 100.0, 5),
+    "agrees": FocalEstimate(140.0, 0.05, 71.0, 5),
+    "bent": FocalEstimate(84.0, 0.04, 100.0, 5, bend=0.3),
+    "none": FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 stretches"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "focal", "taken", "said"),
+    [
+        ("clear", "auto", True, "fx 84 +- 3 px, horizontal field of view 100 deg"),
+        ("bent", "auto", True, "bends straight lines, too, by about 30%"),
+        ("wide", "auto", False, "does not tell it well: fx 84 +- 17 px"),
+        ("agrees", "auto", False, "the motion agrees: fx 140 +- 7 px"),
+        ("none", "auto", False, "0 stretches"),
+        ("clear", "flow", True, "fx 84 +- 3 px"),
+        ("wide", "flow", True, "fx 84 +- 17 px"),
+        ("agrees", "flow", True, "fx 140 +- 7 px"),
+    ],
+)
+def test_which_estimate_is_taken(
+    still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, said: str
+) -> None:
+    estimate = ESTIMATES[name]
+    monkeypatch.setattr("scopemap.focal.choice.focal_from_motion", lambda *_: estimate)
+    found, notes = with_focal_from_motion(still, _settings(focal))
+    assert said in " ".join([found.camera_source, *notes])
+    if taken:
+        assert found.camera.fx == pytest.approx(estimate.focal_px)
+        assert found.focal_sigma_px == pytest.approx(estimate.sigma_px)
+    else:
+        assert found is still
+
+
+def test_asking_for_what_the_motion_does_not_tell_is_an_error(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.focal.choice.focal_from_motion", lambda *_: ESTIMATES["none"])
+    with pytest.raises(CalibrationError, match=r"input\.focal = flow.*0 stretches"):
+        reconstruct(still, _settings("flow"))
+
+
+def test_a_known_camera_is_left_alone(turning: Path, tmp_path: Path) -> None:
+    (tmp_path / "known.txt").write_text("150 150 99.5 79.5")
+    sequence = open_sequence(turning, camera=tmp_path / "known.txt", frames=slice(0, 3))
+    result = reconstruct(sequence, _settings("flow"))
+    assert result.camera.fx == 150
+    assert "focal length" not in result.provenance["seconds"]
+
+
+# ---- real pictures
+
+
+class _Rectified:
+    """Frames of a calibrated sequence as pictures of a camera that nobody knows."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self._sequence, self.path = sequence, sequence.path
+        self.name, self.width, self.height = "pretended", sequence.camera.width, sequence.camera.height
+        self.count, self.pixel_aspect = sequence.count, sequence.camera.fy / sequence.camera.fx
+        self.masks, self.notes, self.warnings = None, [], []
+
+    def frames(self, selection: slice) -> Iterator[Frame]:
+        return iter(list(self._sequence.frames())[selection])
+
+
+def _pretend_unknown(sequence: Sequence, fov_deg: float = 70.0) -> Sequence:
+    source = _Rectified(sequence)
+    focal_px = focal_of(fov_deg, source.width)
+    guess = dataclasses.replace(sequence.camera, fx=focal_px, fy=focal_px * source.pixel_aspect)
+    size = (source.width, source.height)
+    return dataclasses.replace(
+        sequence,
+        source=source,
+        rectifier=Rectifier(guess, working_camera(guess, size)),
+        camera_source=f"assumed: {fov_deg:g} deg",
+        calibrated=False,
+        selection=slice(None),
+    )
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "folder",
+    ["endoscopy/c3vd/cecum_t1_a", "endoscopy/endonerf/pulling_soft_tissues", "rgbd/7scenes_kitchen_100f"],
+)
+def test_real_clips_are_right_or_silent(real_data: Path, folder: str) -> None:
+    if not (real_data / folder).is_dir():
+        pytest.skip(f"{folder} not found")
+    sequence = open_sequence(real_data / folder, frames=slice(0, 120))
+    unknown = _pretend_unknown(sequence)
+    found, notes = with_focal_from_motion(unknown, Config())
+    assert found is not unknown or any("focal length: assumed" in note for note in notes)
+    if found is not unknown:
+        assert found.focal_sigma_px is not None
+        assert abs(math.log(found.camera.fx / sequence.camera.fx)) < 2 * found.focal_sigma_px / found.camera.fx

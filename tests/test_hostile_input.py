@@ -1,0 +1,214 @@
+"""Input that means harm: archives that lead outside, files that grow while they are read. Refused, or harmless.
+
+What single parsers are held to is in test_datasets_limits, test_numbered_files and test_decoding.
+"""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import tarfile
+import tempfile
+import zipfile
+import zlib
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from drawn_datasets import WRITERS
+from drawn_inputs import picture, save, write_c3vd
+from drawn_scared import json_files, point_files
+from front_door import refused
+from test_datasets_endomapper import XML, archive_of, images_bin, write_endomapper
+from test_datasets_endoslam import write_real
+
+from scopemap.datasets import open_sequence
+from scopemap.datasets.reference import reference_trajectory
+from scopemap.datasets.survey import survey
+from scopemap.errors import InputError, ScopemapError
+
+Capture = pytest.CaptureFixture[str]
+
+
+def read_all(path: Path) -> None:
+    sequence = open_sequence(path)
+    reference_trajectory(sequence)
+    survey(sequence)
+    for _ in sequence:
+        pass
+
+
+# ---- archives whose members lead outside
+
+
+def _evil(name: str, kind: bytes = tarfile.REGTYPE, target: str = "", content: bytes = b"") -> tarfile.TarInfo:
+    member = tarfile.TarInfo(name)
+    member.type, member.linkname, member.size = kind, target, len(content)
+    return member
+
+
+def _write_evil(file: Path, content: dict[str, bytes], outside: Path) -> None:
+    """Each file once where it leads outside, and a link, a device and a pipe under its name; then as it should be."""
+    with tarfile.open(file, "w:gz") as archive:
+        for name, data in content.items():
+            for path in (f"../../../{name}", f"{outside}/{name}", f"a/../../{name}"):
+                archive.addfile(_evil(path, content=data), io.BytesIO(data))
+            for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
+                archive.addfile(_evil(name, kind, str(outside / "secret")))
+                archive.addfile(_evil(f"deeper/{name}", kind, "../../../secret"))
+            for kind in (tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE):
+                archive.addfile(_evil(name, kind))
+            archive.addfile(_evil(name, content=data), io.BytesIO(data))
+
+
+def _tree(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("name", ["scared", "scared-c"])
+def test_members_that_lead_outside_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = WRITERS[name](tmp_path / "input")
+    (tmp_path / "secret").write_bytes(b"secret")
+    numbers = [2, 3, 5, 9] if name == "scared-c" else [0, 1, 2, 3]
+    named = None if name == "scared" else (lambda n, entry: entry | {"camera-calibration": "intrinsics_colmap.yaml"})
+    _write_evil(folder / "data" / "frame_data.tar.gz", json_files(numbers, named), tmp_path)
+    _write_evil(folder / "data" / "scene_points.tar.gz", point_files(numbers, both=name == "scared"), tmp_path)
+    monkeypatch.chdir(folder)
+    before, elsewhere = _tree(tmp_path), set(Path(tempfile.gettempdir()).iterdir())
+    sequence = open_sequence(folder)
+    assert [frame.index for frame, truth in sequence if truth is not None and truth.depth_mm is not None] == numbers
+    read_all(folder)
+    assert _tree(tmp_path) == before
+    assert set(Path(tempfile.gettempdir()).iterdir()) <= elsewhere
+
+
+@pytest.mark.parametrize("lead", ["../../../", "/", "a/../../"])
+def test_models_in_a_zip_that_lead_outside_write_nothing(lead: str, tmp_path: Path) -> None:
+    folder = write_endomapper(tmp_path / "input")
+    archive_of(folder).parent.mkdir(parents=True)
+    with zipfile.ZipFile(archive_of(folder), "w") as archive:
+        archive.writestr(f"{lead}sparse/0/images.bin", images_bin([1, 2, 3]))
+    before = _tree(tmp_path)
+    read_all(folder)
+    assert _tree(tmp_path) == before
+
+
+def test_a_recording_that_names_files_outside_is_refused(tmp_path: Path) -> None:
+    folder = WRITERS["rosbag:ros2"](tmp_path / "input")
+    (file,) = folder.glob("*.db3")
+    file.rename(tmp_path / "outside.db3")
+    text = (folder / "metadata.yaml").read_text()
+    for name in ("../outside.db3", str(tmp_path / "outside.db3")):
+        (folder / "metadata.yaml").write_text(text.replace(file.name, name))
+        with pytest.raises(InputError):
+            read_all(folder)
+
+
+# ---- files that grow while they are read
+
+
+def _aliases(head: str) -> str:
+    """Nine lists, each of nine times the one before: 9^9 numbers."""
+    lines = [head, "a0: &a0 [0, 0, 0, 0, 0, 0, 0, 0, 0]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
+    return "\n".join([*lines, "K: *a8", "camera_matrix: *a8", "cam0: {intrinsics: *a8}"]) + "\n"
+
+
+ENTITIES = "<!DOCTYPE x [<!ENTITY a0 'ha'>{}]>".format(
+    "".join(f"<!ENTITY a{i} '{f'&a{i - 1};' * 9}'>" for i in range(1, 10))
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("opencv.yaml", _aliases("%YAML:1.0\n---")),
+        ("plain.yaml", _aliases("image_width: 64")),
+        ("kalibr.yaml", _aliases("%YAML 1.1\n---")),
+        ("bomb.xml", f"<?xml version='1.0'?>{ENTITIES}<opencv_storage><K>&a9;</K></opencv_storage>"),
+        ("rig.xml", f"<?xml version='1.0'?>{ENTITIES}<rig><camera><camera_model>&a9;</camera_model></camera></rig>"),
+        (
+            "outside.xml",
+            "<!DOCTYPE x [<!ENTITY e SYSTEM 'file:///etc/passwd'>]><opencv_storage><K>&e;</K></opencv_storage>",
+        ),
+        ("deep.json", "[" * 100_000),
+        ("deep.yaml", "K: " + "[" * 100_000),
+        ("deep.xml", "<a>" * 100_000),
+        ("digits.json", '{"K": [' + "9" * 500_000 + "]}"),
+        ("large.yaml", "%YAML:1.0\n---\n" + "# nothing\n" * 200_000),
+    ],
+)
+def test_a_calibration_that_grows_is_refused(name: str, text: str, capfd: Capture, tmp_path: Path) -> None:
+    for number in range(3):
+        save(tmp_path / f"{number}.png", picture(number, (64, 48)))
+    (tmp_path / name).write_text(text)
+    assert name in refused(capfd, "run", tmp_path, "--camera", tmp_path / name, "--out", tmp_path / "out", "--quiet")
+
+
+def test_a_data_sets_own_xml_that_grows_is_refused(tmp_path: Path) -> None:
+    folder = write_endomapper(tmp_path / "input")
+    (file,) = (tmp_path / "input").rglob("*_geometrical.xml")
+    file.write_text(ENTITIES + XML.replace("{params}", "&a9;").format(kind="", width="&a9;", height=1))
+    with pytest.raises(ScopemapError, match=r"_geometrical\.xml"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("member", ["xl/worksheets/sheet1.xml", "xl/sharedStrings.xml"])
+@pytest.mark.parametrize("how", ["entities", "zeros"])
+def test_a_workbook_that_grows_is_refused(member: str, how: str, tmp_path: Path) -> None:
+    folder = write_real(tmp_path / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1")
+    (file,) = folder.rglob("*.xlsx")
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    bomb = f"{ENTITIES}<sst><si><t>&a9;</t></si></sst>".encode() if how == "entities" else b" " * (64 << 20)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in (members | {member: bomb}).items():
+            archive.writestr(name, data)
+    assert file.stat().st_size < 100_000
+    with pytest.raises(InputError, match=r"poses\.xlsx"):
+        open_sequence(folder)
+
+
+def _huge_png(side: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    head = side.to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def test_pictures_of_billions_of_pixels_are_refused_and_the_limit_can_be_set(
+    capfd: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        (tmp_path / f"{number}.png").write_bytes(_huge_png(60_000))
+    said = refused(capfd, "run", tmp_path, "--out", tmp_path / "out", "--quiet")
+    assert "more than 64 million pixels" in said
+    assert "SCOPEMAP_MAX_MEGAPIXELS" in said
+    folder = write_c3vd(tmp_path / "small", 3)
+    monkeypatch.setenv("SCOPEMAP_MAX_MEGAPIXELS", "0.01")
+    assert "more than 0.01 million pixels" in refused(capfd, "run", folder, "--out", tmp_path / "out", "--quiet")
+
+
+def test_a_video_of_pictures_beyond_the_limit_takes_no_memory(tmp_path: Path) -> None:
+    """Some 400 kB that are two pictures of 200 MB each: FFmpeg would unpack one to see what it is."""
+    file = tmp_path / "clip.mov"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("png", rate=25)
+        stream.width = stream.height = 8192
+        stream.pix_fmt = "gray"
+        for _ in range(2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((8192, 8192), np.uint8), format="gray")))
+        container.mux(stream.encode())
+    code = (
+        "import resource, sys\nfrom scopemap.datasets.video import VideoFile\nfrom scopemap.errors import InputError\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "try: VideoFile(__import__('pathlib').Path(sys.argv[1]))\nexcept InputError as error: print(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+    )
+    said = subprocess.run([sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=True).stdout
+    assert "more than 64 million pixels" in said
+    assert "SCOPEMAP_MAX_MEGAPIXELS" in said
+    assert int(said.splitlines()[-1]) < 60_000, "kB of memory"

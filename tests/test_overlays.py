@@ -1,0 +1,142 @@
+"""The overlay finder of the runs: burned-in text goes, tissue stays, a camera at rest makes no overlay."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_clips import SIZE, Change, black, clip, during, inside, octagon, text
+
+from scopemap.camera import PinholeCamera
+from scopemap.config import Config, MaskSettings
+from scopemap.datasets import open_sequence
+from scopemap.frame import Frame
+from scopemap.masking import Masker
+from scopemap.overlays import OverlayFinder
+
+CAMERA = PinholeCamera(300.0, 300.0, 159.5, 119.5, *SIZE)
+EVERYWHERE = np.ones(SIZE[::-1], bool)
+
+
+def found_in(pictures: list[np.ndarray], field: np.ndarray = EVERYWHERE) -> list[np.ndarray | None]:
+    finder = OverlayFinder()
+    return [finder(picture, field) for picture in pictures]
+
+
+def strokes(change: Change) -> np.ndarray:
+    return change(0, np.zeros((*SIZE[::-1], 3), np.uint8)).max(-1) > 100
+
+
+def test_text_is_found_causally_and_little_else() -> None:
+    found = found_in(clip(40, text()))
+    assert all(one is None for one in found[:11])
+    last = found[-1]
+    assert last is not None
+    assert last[strokes(text())].mean() > 0.97
+    near = cv2.dilate(strokes(text()).astype(np.uint8), np.ones((11, 11))) > 0
+    assert not (last & ~near).any()
+
+
+def test_a_black_beginning_is_no_hindrance() -> None:
+    last = found_in(clip(50, during(0, 9, black), text()))[-1]
+    assert last is not None
+    assert last[strokes(text())].mean() > 0.97
+
+
+def test_a_panel_is_filled() -> None:
+    def panel(_: int, picture: np.ndarray) -> np.ndarray:
+        out = picture.copy()
+        cv2.rectangle(out, (40, 180), (140, 210), (10, 10, 30), -1)
+        return text("ID 77", (50, 200))(0, out)
+
+    last = found_in(clip(40, panel))[-1]
+    assert last is not None
+    assert last[182:209, 42:139].all()
+    assert last.mean() < 1.6 * 100 * 30 / EVERYWHERE.size
+
+
+def test_tissue_alone_is_no_overlay() -> None:
+    assert not any(one is not None for one in found_in(clip(60)))
+
+
+def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
+    rng = np.random.default_rng(0)
+    still = clip(1, text())[0]
+    pictures = []
+    for number in range(80):
+        noisy = np.clip(still + rng.normal(0, 2, still.shape), 0, 255).astype(np.uint8)
+        # An instrument that goes to and fro, and a lamp that flickers.
+        cv2.rectangle(noisy, (60 + 3 * (number % 40), 80), (110 + 3 * (number % 40), 160), (150, 150, 160), -1)
+        pictures.append(np.clip(noisy * (1 + 0.1 * np.sin(number)), 0, 255).astype(np.uint8))
+    assert not any(one is not None for one in found_in(pictures))
+
+
+def test_the_rim_of_the_field_is_no_overlay() -> None:
+    masker, changes = Masker(MaskSettings(highlights=False)), (inside(octagon),)
+    without = Masker(MaskSettings(highlights=False, overlays=False))
+    for number, picture in enumerate(clip(40, *changes)):
+        frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
+        np.testing.assert_array_equal(masker(frame).valid, without(frame).valid)
+
+
+def test_what_goes_is_forgotten_and_another_size_begins_anew() -> None:
+    pictures = clip(40, text()) + clip(70)[40:]
+    finder = OverlayFinder()
+    found = [finder(picture, EVERYWHERE) for picture in pictures]
+    assert found[39] is not None
+    assert found[-1] is None
+    assert finder(clip(1, size=(160, 120))[0], EVERYWHERE[::2, ::2]) is None
+    assert finder.count == 1
+
+
+@pytest.mark.parametrize("size", [(32, 32), (33, 400), (400, 33)])
+def test_odd_sizes(size: tuple[int, int]) -> None:
+    finder = OverlayFinder()
+    for picture in clip(20, size=size):
+        assert finder(picture, np.ones(size[::-1], bool)) is None
+
+
+def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
+    maskers = [Masker(MaskSettings(highlights=False, overlays=on)) for on in (True, False)]
+    for number, picture in enumerate(clip(40, text())):
+        frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
+        masked, plain = (masker(frame).valid for masker in maskers)
+    letters = strokes(text())
+    assert masked[letters].mean() < 0.03
+    # White letters are over-exposed, their edges are not.
+    assert plain[letters].mean() > 0.1
+    assert plain[~letters].mean() > 0.99
+    assert Config.load("default").mask.overlays
+    assert not Config.load("paper").mask.overlays
+
+
+def test_it_costs_little() -> None:
+    pictures, finder = clip(40, text(), size=(337, 270)), OverlayFinder()
+    seconds = []
+    for picture in pictures:
+        started = time.process_time()
+        finder(picture, np.ones((270, 337), bool))
+        seconds.append(time.process_time() - started)
+    assert np.median(seconds) < 2e-3
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("path", "largest_share"),
+    [("endoscopy/c3vd/cecum_t1_a", 0.0), ("endoscopy/c3vd/trans_t1_a", 0.0),
+     ("endoscopy/video/laparoscopy_rvim.mp4", 0.0), ("endoscopy/video/colonoscopy_nflba_03.mp4", 0.0),
+     ("rgbd/7scenes_kitchen_100f", 0.0),
+     # A status bar of the robot, looked at by eye.
+     ("endoscopy/endonerf/pulling_soft_tissues", 0.006)],
+)  # fmt: skip
+def test_real_tissue_is_no_overlay(real_data: Path, path: str, largest_share: float) -> None:
+    on, off = (Masker(MaskSettings(highlights=False, overlays=which)) for which in (True, False))
+    largest = 0.0
+    for frame in open_sequence(real_data / path).frames():
+        left_out = off(frame).valid & ~on(frame).valid
+        largest = max(largest, float(left_out.mean()))
+        assert not left_out[: int(0.9 * len(left_out))].any()
+    assert largest <= largest_share
