@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import io
 import multiprocessing
+import os
 import random
 import re
 import resource
@@ -110,15 +111,17 @@ def exchange(chance: random.Random, file: Path) -> None:
 
 
 def take_away(chance: random.Random, file: Path) -> None:
-    """Delete the file; or put a folder, or a link to nowhere or to itself, in its place."""
+    """Delete the file; or put a folder, a link to nowhere or to itself, or a pipe in its place."""
     file.unlink()
-    match chance.randrange(5):
+    match chance.randrange(6):
         case 0:
             file.mkdir()
         case 1:
             file.symlink_to("nowhere")
         case 2:
             file.symlink_to(file)
+        case 3:
+            os.mkfifo(file)
 
 
 def rename(chance: random.Random, file: Path) -> None:

@@ -50,6 +50,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
     sequence = open_sequence(path, frames=slice(0, frames))
     pipeline, seconds = Pipeline(config, Estimators.create(config, sequence)), defaultdict(list)
     parts = {
+        "overlays, in mask": (pipeline._masker, "_overlays"),
         "mask": (pipeline, "_masker"),
         "depth estimate": (pipeline.estimators.depth, "estimate"),
         "flow, perceptual distance": (pipeline, "_link"),

@@ -118,7 +118,7 @@ def write_ros2(folder: Path) -> Path:
     bag = small_bag()
     for number in range(4):
         depth = np.full((SIZE[1], SIZE[0]), 50 + number, np.uint16)
-        bag.image("/endoscope/aligned_depth_to_color/image_raw", number, depth, "16UC1")
+        bag.image("/endoscope/aligned_depth_to_left/image_raw", number, depth, "16UC1")
     return bag.write_ros2(folder)
 
 

@@ -1,4 +1,4 @@
-"""Calibration boards as a known camera sees them: rays meet the board's plane, nine to a pixel."""
+"""Calibration boards as a known camera sees them: rays meet the board's plane, several to a pixel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ PINHOLE = OpenCvCamera(PinholeCamera(265.0, 268.0, 163.0, 116.5, *SIZE), (-0.25,
 FISHEYE = FisheyeCamera(PinholeCamera(140.0, 141.0, 157.5, 122.0, *SIZE), (-0.03, -0.012, 0.004, -0.0008))
 _PX_PER_MM = 12
 _RIM_MM = 2
-_SAMPLES = 3
 
 
 def texture(board: Checkerboard | CharucoBoard) -> np.ndarray:
@@ -33,11 +32,11 @@ def texture(board: Checkerboard | CharucoBoard) -> np.ndarray:
 
 
 class Studio:
-    """Takes pictures of a board with a camera."""
+    """Takes pictures of a board with a camera; `samples` rays a side make a pixel."""
 
-    def __init__(self, camera: CameraModel, board: Checkerboard | CharucoBoard) -> None:
-        self.camera, self.board, self.print = camera, board, texture(board)
-        steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    def __init__(self, camera: CameraModel, board: Checkerboard | CharucoBoard, samples: int = 3) -> None:
+        self.camera, self.board, self.print, self.samples = camera, board, texture(board), samples
+        steps = (np.arange(samples) + 0.5) / samples - 0.5
         u = (np.arange(camera.width)[:, None] + steps).ravel()
         v = (np.arange(camera.height)[:, None] + steps).ravel()
         self.rays = camera.unproject(np.stack(np.meshgrid(u, v), -1))
@@ -53,7 +52,7 @@ class Studio:
         x, y = (np.where(outside, -1e6, a).clip(-1e6, 1e6).astype(np.float32) for a in (x, y))
         seen = cv2.remap(self.print, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90.0)
         h, w = self.camera.height, self.camera.width
-        picture = seen.reshape(h, _SAMPLES, w, _SAMPLES).mean(axis=(1, 3))
+        picture = seen.reshape(h, self.samples, w, self.samples).mean(axis=(1, 3))
         picture = cv2.GaussianBlur(picture, (0, 0), blur_px)
         picture += np.random.default_rng(seed).normal(0, noise, picture.shape)
         return np.repeat(picture.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
@@ -75,8 +74,10 @@ class Studio:
             T[:3, 3] = ray / np.linalg.norm(ray) * distance_mm * rng.uniform(0.85, 1.2) - R @ [w / 2, h / 2, 0]
             yield T
 
-    def corners_px(self, T_camera_board: np.ndarray) -> np.ndarray:
-        """Where a checkerboard's corners truly are in the picture."""
+    def corners_px(self, T_camera_board: np.ndarray, bow_mm: float = 0.0) -> np.ndarray:
+        """Where a checkerboard's corners truly are in the picture; its middle bows by `bow_mm`."""
         assert isinstance(self.board, Checkerboard)
         points = self.board.corners_mm + self.board.square_mm * np.array([1, 1, 0])
+        radius = np.linalg.norm(points - points.mean(axis=0), axis=1)
+        points[:, 2] += bow_mm * (1 - (radius / radius.max()) ** 2)
         return self.camera.project(points @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])

@@ -27,14 +27,20 @@ def _canvas(seed: int) -> np.ndarray:
     return np.clip(np.array([165.0, 85.0, 75.0]) + level[..., None] * [0.5, 0.45, 0.4], 20, 215).astype(np.uint8)
 
 
+@cache
+def _noise() -> np.ndarray:
+    return np.random.default_rng(9).normal(0, 1.5, (1100, 1400, 3)).astype(np.float32)
+
+
 def tissue(number: int, size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
     """What the camera sees in frame `number`: it goes round and about over the tissue."""
     x = round(400 + 3.2 * number + 30 * np.sin(number / 5)) % (1200 - size[0])
     y = round(300 + 60 * np.sin(number / 9) + 20 * np.cos(number / 3))
     picture = _canvas(seed)[y : y + size[1], x : x + size[0]]
     # The sensor's noise: no picture repeats another.
-    noise = np.random.default_rng(1000 * seed + number).normal(0, 1.5, picture.shape)
-    return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
+    x, y = np.random.default_rng(1000 * seed + number).integers(0, 200, 2)
+    noise = _noise()[y : y + size[1], x : x + size[0]]
+    return cv2.add(picture, noise, dtype=cv2.CV_8U)
 
 
 def clip(count: int = 60, *changes: Change, size: tuple[int, int] = SIZE) -> list[np.ndarray]:

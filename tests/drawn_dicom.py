@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from drawn_inputs import picture, write_video
@@ -72,13 +74,27 @@ def write_frames(folder: Path) -> Path:
     return packed(folder / "clip.dcm", frames, JPEGBaseline8Bit, **tags)
 
 
-def write_dicom_video(folder: Path, pieces: int = 3) -> Path:
-    """An MP4 in several fragments."""
+def h264(container: str, count: int = 30, rate_hz: int = 30) -> bytes:
+    """Return H.264 with pictures out of order, in a `container` or ("h264") bare."""
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format=container) as opened:
+        stream = opened.add_stream("libx264", rate=rate_hz, options={"bf": "2"})
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for number in range(count):
+            opened.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number, (160, 120)), format="rgb24")))
+        opened.mux(stream.encode())
+    return buffer.getvalue()
+
+
+def write_dicom_video(folder: Path, pieces: int = 3, content: bytes = b"", **tags: Any) -> Path:
+    """A video in several fragments; an MP4 of 25 pictures per second where there is no `content`."""
     folder.mkdir(parents=True, exist_ok=True)
-    file = write_video(folder / "plain.mp4", 6)
-    content = file.read_bytes()
-    file.unlink()
-    found = dataset(MPEG4HP41, NumberOfFrames=6, PhotometricInterpretation="YBR_PARTIAL_420", CineRate=25)
+    if not content:
+        file = write_video(folder / "plain.mp4", 6)
+        content = file.read_bytes()
+        file.unlink()
+    tags = {"NumberOfFrames": 6, "PhotometricInterpretation": "YBR_PARTIAL_420", "CineRate": 25} | tags
+    found = dataset(MPEG4HP41, **tags)
     found.Rows, found.Columns = 120, 160
     length = -(-len(content) // pieces) // 2 * 2 + 2
     parts = [content[at : at + length] for at in range(0, len(content), length)]

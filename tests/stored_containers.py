@@ -15,7 +15,7 @@ from drawn_scene import RATE_HZ, Content
 from pydicom.uid import MPEG4HP41, JPEGBaseline8Bit
 from stored_frames import Put, damaged_stream, movie
 
-_DEPTH = "/endoscope/aligned_depth_to_color/image_raw"
+_DEPTH = "/endoscope/aligned_depth_to_left/image_raw"
 
 
 def recording(form: str) -> Put:

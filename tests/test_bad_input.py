@@ -215,6 +215,25 @@ def test_no_permission_is_a_sentence(name: str, open_folder: Path) -> None:
             assert outcome or path.is_file(), f"{path.name} without permission ({mode:o}) went unnoticed"
 
 
+@pytest.mark.skipif(not hasattr(os, "setresuid"), reason="permissions are taken away as on Linux")
+def test_folders_that_are_not_needed_may_be_closed(open_folder: Path) -> None:
+    """A disk's `lost+found`, a hidden folder, and one beside the pictures or the data set."""
+    for write in (WRITERS["images"], WRITERS["c3vd"]):
+        entry = write(open_folder / "input")
+        _read_all(entry)
+        for name in ("lost+found", ".trash"):
+            (entry / name).mkdir(mode=0o000)
+        assert _as_nobody(lambda at=entry: " ".join(open_sequence(at).warnings)) == ""  # type: ignore[misc]
+        closed = entry / "private" if write is WRITERS["images"] else entry.parent / "private"
+        closed.mkdir(mode=0o000)
+        told = _as_nobody(lambda at=closed.parent: " ".join(open_sequence(at).warnings))  # type: ignore[misc]
+        assert told == f"left out: no permission to look into {closed}"
+        for inner in open_folder.rglob("*"):
+            if inner.is_dir():
+                inner.chmod(0o755)
+        shutil.rmtree(open_folder / "input")
+
+
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_links_in_a_circle_change_nothing(name: str, tmp_path: Path) -> None:
     entry = WRITERS[name](tmp_path / "input")

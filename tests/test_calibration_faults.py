@@ -30,7 +30,8 @@ ENTITIES = (
 OUTSIDE = '<!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/hostname">]><opencv_storage><K>&e;</K></opencv_storage>'
 BOMBS = {
     "aliases": LAUGHS,
-    "one alias": "K: &k [520, 0, 318, 0, 520, 245, 0, 0, 1]\nM: *k\n",
+    "alias of a mapping": "K: &k {data: [520, 0, 318, 0, 520, 245, 0, 0, 1]}\nM: *k\n",
+    "aliases of a long list": f"a: &a {[1] * 5000}\nb: [{', '.join(['*a'] * 5000)}]\n",
     "merge key": "a: &a {K: [1]}\nb:\n  <<: *a\n",
     "alias of itself": "K: &k [*k]\n",
     "entities": ENTITIES,

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from drawn_boards import CHECKERBOARD, PINHOLE, SIZE, Studio
 from drawn_inputs import save
+from drawn_videos import encode
 
 from scopemap.calibration import read_calibration
 from scopemap.cli import main
 from scopemap.datasets import open_sequence
+from scopemap.datasets.images import read_image
+from scopemap.errors import CalibrationError
 from scopemap.lenses import OpenCvCamera
 
 Say = Callable[..., tuple[int, str, str]]
@@ -84,6 +87,39 @@ def test_a_calibration_that_every_command_reads(calibrate: Say, frames: Path, tm
     assert {"frame", "name", "corners", "rms_px", "tilt_deg", "distance_mm"} == set(told["views"][0])
 
 
+def test_two_views_in_a_picture_are_read_as_a_run_reads_them(calibrate: Say, frames: Path, tmp_path: Path) -> None:
+    pictures = [read_image(file) for file in sorted(frames.iterdir())[::2]]
+    both = [np.hstack([left, np.roll(left[::-1], 12, axis=1)]) for left in pictures]
+    video = encode(tmp_path / "both.mp4", both)
+    code, _, err = calibrate(video, *BOARD, "--model", "pinhole", "--set", "input.stereo=left-right")
+    assert code == 0
+    assert "note: stereo, left-right: the left half of each picture is used: as asked" in err
+    camera = read_calibration("calibration.yaml", SIZE).camera
+    assert camera.central.fx == pytest.approx(265, rel=0.02)
+    assert camera.central.cx == pytest.approx(163, abs=4)
+
+
+def test_one_field_is_read_beside_a_camera_of_no_use(calibrate: Say, frames: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "woven"
+    folder.mkdir()
+    for i, file in enumerate(sorted(frames.iterdir())[::2]):
+        picture = read_image(file)
+        assert picture is not None
+        picture[1::2] = np.roll(picture, 6, axis=1)[1::2]
+        save(folder / f"{i}.png", picture)
+    (folder / "camera.yaml").write_text("%YAML:1.0\n---\nthe lens before the last")
+    code, out, _ = calibrate(folder, *BOARD, "--model", "pinhole", "--set", "input.deinterlace=true", "--json")
+    assert code == 0
+    told = json.loads(out)
+    assert told["parameters"]["fx"] == pytest.approx(265, rel=0.02)
+    assert told["rms_px"] < 0.3
+    (folder / "camera.yaml").write_text((tmp_path / "calibration.yaml").read_text().replace("320", "640"))
+    with pytest.raises(CalibrationError, match="640x240"):
+        open_sequence(folder)
+    code, _, err = calibrate(folder, "--board", "10x7", "--square-mm", 3, "--overwrite", "--frames", "0:2")
+    assert (code, "the board was found in 0 of 2 frames" in err) == (1, True)
+
+
 def test_a_board_that_is_not_there(calibrate: Say, frames: Path, tmp_path: Path) -> None:
     code, out, err = calibrate(frames, "--board", "10x7", "--square-mm", 3, "--frames", "0:4", "--quiet")
     assert (code, out) == (1, "")
@@ -106,6 +142,9 @@ def test_a_board_that_is_not_there(calibrate: Say, frames: Path, tmp_path: Path)
         ((*BOARD, "--out", "none/c.yaml"), "the folder none is not there or not writable"),
         ((*BOARD, "--frames", "a"), "cannot read the frames 'a'"),
         ((*BOARD, "--dataset", "moon"), "unknown data set 'moon'"),
+        ((*BOARD, "--frames", "::0"), "the step must be positive, got 0"),
+        ((*BOARD, "--set", "input.focal=flow"), "'input.focal' has no part in a calibration: only input.stereo and"),
+        ((*BOARD, "--set", "input.stereo=both"), "input.stereo"),
     ],
 )
 def test_refusals(arguments: tuple[object, ...], words: str, calibrate: Say, frames: Path) -> None:

@@ -69,7 +69,19 @@ def test_json_is_all_that_is_printed(say: Say, video: Path, tmp_path: Path) -> N
     assert told["findings"][0].keys() == {"severity", "code", "message", "advice", "stretches"}
     assert len(told["overlays"]) == len(told["insets"]) == 1
     assert file.is_file()
-    assert sorted(mask.name for mask in masks.iterdir()) == [f"{number:06d}.png" for number in range(36)]
+    assert [mask.name for mask in masks.iterdir()] == ["mask.png"]
+
+
+def test_a_part_of_a_video_counts_as_the_whole_does(say: Say, video: Path, tmp_path: Path) -> None:
+    code, out, err = say(video, "--json", "--frames", "12:36:2", "--out", tmp_path / "part.png")
+    assert (code, err) == (0, "")
+    facts = json.loads(out)["facts"]
+    assert facts["pictures"] == 12
+    assert facts["usual_rate_hz"] == pytest.approx(25)
+    assert facts["span_s"] == pytest.approx(22 / 25)
+    code, _, err = say(video, "--frames", "half", "--quiet")
+    assert code != 0
+    assert "cannot read the frames 'half'" in err
 
 
 def test_nothing_is_replaced_unasked(say: Say, video: Path, tmp_path: Path) -> None:
@@ -83,6 +95,7 @@ def test_nothing_is_replaced_unasked(say: Say, video: Path, tmp_path: Path) -> N
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note.txt").write_text("mine")
     assert "is not empty" in say(video, "--masks", tmp_path / "full")[2]
+    assert "holds other files" in say(video, "--masks", tmp_path / "full", "--overwrite")[2]
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_vid
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.datasets import Sequence, SourceFrame, SourceTruth, open_sequence
-from scopemap.datasets.checking import Finding, check, refusal
+from scopemap.datasets.checking import Finding, check, check_path, refusal
 from scopemap.datasets.pose_depth import PoseDepthTest
-from scopemap.datasets.survey import survey
+from scopemap.datasets.survey import FrameRecord, Survey, survey
 from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
 from scopemap.phantom import PhantomSpec, write_phantom
@@ -84,7 +84,9 @@ def test_other_sound_sets_have_no_fault(tmp_path: Path) -> None:
     assert faults(video) == {}
     assert "camera-assumed" in {finding.code for finding in video}
     write_sevenscenes(tmp_path / "rooms")
-    assert set(faults(findings(tmp_path / "rooms"))) == {"depth-constant", "depth-unit"}  # a wall at 1.5 m, as drawn
+    room = findings(tmp_path / "rooms")
+    assert set(faults(room)) == {"depth-constant"}  # a wall at 1.5 m, as drawn
+    assert any(one.code == "depth-unit" and "that of a room" in one.message for one in room)
 
 
 # ---- planted in files
@@ -352,3 +354,24 @@ def test_the_documents_name_every_code() -> None:
     codes |= {"pose-missing", "depth-missing"}
     documented = (ROOT / "docs" / "formats.md").read_text().split("## Checking a data set")[1].split("\n## ")[0]
     assert set(re.findall(r"`([a-z]+(?:-[a-z]+)*)`", documented)) >= codes
+
+
+def _moving(steps_mm: np.ndarray, noise_mm: float) -> Survey:
+    """Poses of a path along x, each off by some noise."""
+    positions_mm = np.cumsum(steps_mm)[:, None] * [1.0, 0, 0]
+    positions_mm += np.random.default_rng(0).normal(0, noise_mm, positions_mm.shape)
+    poses = np.tile(np.eye(4), (len(steps_mm), 1, 1))
+    poses[:, :3, 3] = positions_mm
+    frames = tuple(FrameRecord(i, i / 30, f"{i}", 200.0, 30.0, False, T, None) for i, T in enumerate(poses))
+    camera = PinholeCamera(500, 500, 320, 256, 640, 512)
+    return Survey("stereomis", camera, True, "", 1.0, None, frames, (), {}, "", (), (), ())
+
+
+def test_a_camera_that_moves_off_does_not_jump() -> None:
+    steps_mm = np.zeros(600)
+    steps_mm[300:500] = 0.5
+    assert check_path(_moving(steps_mm, 0.005)) == []
+    steps_mm[100] = steps_mm[400] = 8.0
+    (finding,) = check_path(_moving(steps_mm, 0.005))
+    assert finding.code == "pose-jump"
+    assert "to 2 frames (100, 400)" in finding.message

@@ -8,11 +8,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pydicom
 import pytest
-from drawn_dicom import PATIENT, SIZE, film, jpeg, native, packed, save, write_dicom_video, write_frames
+from drawn_dicom import PATIENT, SIZE, film, h264, jpeg, native, packed, save, write_dicom_video, write_frames
 from drawn_inputs import number_in, picture
 from PIL import Image
 from pydicom.pixels.encoders import RLELosslessEncoder
@@ -85,6 +86,33 @@ def test_grey_of_any_depth(tmp_path: Path, values: np.ndarray, tags: dict[str, A
     assert (pictures(native(tmp_path / "a.dcm", values, **GREY | tags)) == level).all()
 
 
+def test_grey_levels_are_those_that_the_file_wants_shown(tmp_path: Path) -> None:
+    bits = {"BitsAllocated": 16, "BitsStored": 12, "HighBit": 11}
+    values = np.full((2, 48, 64), 400, np.uint16)
+    values[:, :24] = 40
+    dark = native(tmp_path / "a.dcm", values, **GREY, **bits)
+    assert pictures(dark).max() == 25
+    assert any("the upper 8 of the 12 bits" in note for note in Dicom(dark).notes)
+    window = native(tmp_path / "b.dcm", values, **GREY, **bits, WindowCenter=[300, 1], WindowWidth=[401, 1])
+    assert sorted(set(pictures(window).ravel())) == [0, round(255 * (400 - 99.5) / 400)]
+    assert any("wants shown (WindowCenter" in note for note in Dicom(window).notes)
+    scaled = {"RescaleSlope": 2, "RescaleIntercept": -10, "WindowCenter": 400, "WindowWidth": 801}
+    assert pictures(native(tmp_path / "c.dcm", values, **GREY, **bits, **scaled)).max() == round(255 * 790.5 / 800)
+    whole = np.arange(2 * 48 * 64).astype(np.uint8).reshape(2, 48, 64)
+    file = native(tmp_path / "d.dcm", whole, **GREY, WindowCenter=128, WindowWidth=256)
+    np.testing.assert_array_equal(pictures(file)[..., 0], whole)
+
+
+def test_jpeg_frames_may_be_called_partial(tmp_path: Path) -> None:
+    frames = [jpeg(rgb) for rgb in film()]
+    tags = {"PhotometricInterpretation": "YBR_PARTIAL_420"}
+    assert (
+        np.abs(pictures(packed(tmp_path / "a.dcm", frames, JPEGBaseline8Bit, **tags)).astype(int) - film()).mean() < 4
+    )
+    with pytest.raises(InputError, match="'YBR_PARTIAL_420' are not read"):
+        pictures(native(tmp_path / "b.dcm", film(), **tags))
+
+
 def test_a_palette_is_looked_up(tmp_path: Path) -> None:
     tags = GREY | {"PhotometricInterpretation": "PALETTE COLOR"}
     for colour, level in zip(("Red", "Green", "Blue"), (10, 120, 250), strict=True):
@@ -129,6 +157,33 @@ def test_a_video_is_decoded_in_place(tmp_path: Path, pieces: int) -> None:
     assert [number_in(frame.rgb) for frame in frames] == [1, 2, 3, 4, 5]
     np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(1, 6) / 25)
     assert list(tmp_path.rglob("*.mp4")) == []
+
+
+needs_h264 = pytest.mark.skipif("libx264" not in av.codecs_available, reason="no encoder for H.264")
+
+
+@needs_h264
+@pytest.mark.parametrize("container", ["mp4", "mpegts", "h264"])
+def test_h264_is_decoded_and_its_own_times_beat_rounded_ones(tmp_path: Path, container: str) -> None:
+    file = write_dicom_video(tmp_path, content=h264(container), FrameTime=33, CineRate=30, NumberOfFrames=30)
+    source = Dicom(file)
+    frames = list(source.frames(slice(None)))
+    assert [number_in(frame.rgb) for frame in frames] == list(range(30))
+    # A bare stream holds no stamps: then the header's word counts.
+    step_s = 0.033 if container == "h264" else 1 / 30
+    np.testing.assert_allclose(np.diff([frame.time_s for frame in frames]), step_s, atol=1e-4)
+    apart = [warning for warning in source.warnings if "FrameTime" in warning and "0.99 times as long" in warning]
+    assert source.warnings == apart
+    assert bool(apart) == (container != "h264")
+
+
+@needs_h264
+def test_a_bare_stream_without_times_has_the_rate_that_its_pictures_state(tmp_path: Path) -> None:
+    source = Dicom(write_dicom_video(tmp_path, content=h264("h264", rate_hz=20), CineRate=None))
+    times_s = [frame.time_s for frame in source.frames(slice(None))]
+    np.testing.assert_allclose(np.diff(times_s), 1 / 20)
+    assert not source.stamped
+    assert "time stamps: frame number / 20 s (neither the file nor the pictures have stamps)" in source.notes
 
 
 def test_times_are_those_that_the_file_states(tmp_path: Path) -> None:
@@ -233,6 +288,13 @@ def test_what_is_not_read_is_named(tmp_path: Path) -> None:
         open_sequence(native(tmp_path / "b.dcm", film(), DeflatedExplicitVRLittleEndian))
     with pytest.raises(InputError, match="colours stored as 'HSV' are not read"):
         pictures(native(tmp_path / "c.dcm", film(), PhotometricInterpretation="HSV"))
+    tags = {"PhotometricInterpretation": "MUSTER ERIKA"}
+    odd = [packed(tmp_path / f"odd{number}.dcm", [jpeg(film()[0])] * 2, JPEGBaseline8Bit, **tags) for number in (0, 1)]
+    odd[1].write_bytes(odd[1].read_bytes().replace(b"1.2.840.10008.1.2.4.50", b"1.2.4711.1950.1950.195"))
+    for file in odd:
+        with pytest.raises(InputError, match="in an unknown way are not read") as caught:
+            pictures(file)
+        assert not any(word in str(caught.value) for word in ("MUSTER", "4711"))
     bits = native(tmp_path / "d.dcm", film(), BitsAllocated=1)
     with pytest.raises(InputError, match="1 bits per sample"):
         open_sequence(bits)

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sqlite3
+import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from drawn_bags import small_bag, write_bag1, write_mcap
 from drawn_datasets import write_pictures
-from drawn_inputs import picture, save, write_sevenscenes, write_video
+from drawn_dicom import dataset, film, native
+from drawn_dicom import save as save_dicom
+from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared_c
 from test_datasets_colmap import NAMES, stored_pose, write_model
 from test_datasets_colmap import write_scene as write_colmap
@@ -20,8 +27,8 @@ from test_datasets_tum import ROOM, write_tum
 
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.errors import InputError, ScopemapError
+from scopemap.datasets import open_sequence, open_source
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 
 MINE = PinholeCamera(60.0, 60.0, 40.0, 32.0, 80, 64)
 
@@ -124,6 +131,67 @@ def test_so_is_a_keyframe_of_scared_c_without_its_calibration(tmp_path: Path) ->
     assert open_sequence(keyframe, dataset="scared-c", camera=tmp_path / "mine.txt").camera.fx == 60.0
 
 
+def list_of_a_medium(file: Path) -> Path:
+    found = dataset()
+    found.file_meta.MediaStorageSOPClassUID = found.SOPClassUID = "1.2.840.10008.1.3.10"
+    return save_dicom(found, file)
+
+
+def a_database(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("CREATE TABLE notes (text TEXT)")
+
+
+@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("name", ["clip.bag", "a.db3", "notes.db3", "report.dcm", "a.mcap"])
+def test_a_container_that_lies_about_hides_nothing(
+    name: str, installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "a.db3":
+        small_bag().write_ros2(tmp_path / "bag" / "a")
+        (tmp_path / "bag" / "a" / "a.db3").rename(tmp_path / name)
+        shutil.rmtree(tmp_path / "bag")
+    stray = {"clip.bag": write_bag1, "a.mcap": write_mcap}.get(name)
+    if stray is not None:
+        (tmp_path / "elsewhere").mkdir()
+        shutil.copy(stray(tmp_path / "elsewhere" / "a"), tmp_path / name)
+        shutil.rmtree(tmp_path / "elsewhere")
+    elif name == "report.dcm":
+        native(tmp_path / name, film())
+    elif name == "notes.db3":
+        a_database(tmp_path / name)
+    if not installed:
+        monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+        monkeypatch.setitem(sys.modules, "pydicom", None)
+    kinds = {"images": write_pictures, "sequence": write_c3vd}
+    for inner, write in kinds.items():
+        write(tmp_path / inner)
+        assert open_sequence(tmp_path).path == tmp_path / inner
+        shutil.rmtree(tmp_path / inner)
+    if not installed or name == "notes.db3":
+        write_pictures(tmp_path / "pictures")
+        assert open_sequence(tmp_path).path == tmp_path / "pictures"
+
+
+def test_containers_beside_a_data_set_do_not_count_and_without_one_do(tmp_path: Path) -> None:
+    native(tmp_path / "ct" / "a.dcm", film())
+    write_c3vd(tmp_path / "deeper" / "sequence")
+    write_video(tmp_path / "clip.mp4", 3)
+    assert open_sequence(tmp_path).path == tmp_path / "deeper" / "sequence"
+    assert open_sequence(tmp_path, dataset="dicom").path == tmp_path / "ct"
+    shutil.rmtree(tmp_path / "deeper")
+    assert open_sequence(tmp_path).path == tmp_path / "ct"
+
+
+@pytest.mark.parametrize("name", ["DICOMDIR", "index.dcm"])
+def test_the_list_of_what_a_medium_holds_is_no_picture(name: str, tmp_path: Path) -> None:
+    list_of_a_medium(tmp_path / name)
+    folder = native(tmp_path / "DICOM" / "A" / "IM01", film()).parent
+    assert open_sequence(tmp_path).path == folder
+    list_of_a_medium(folder / name)
+    assert open_sequence(folder).warnings == []
+
+
 @pytest.mark.parametrize("own", [False, True])
 def test_the_calibration_in_the_folder_comes_before_that_beside_the_images(own: bool, tmp_path: Path) -> None:
     folder = write_oneslam(tmp_path / "colon")
@@ -131,3 +199,19 @@ def test_the_calibration_in_the_folder_comes_before_that_beside_the_images(own: 
     if own:
         write_calibration(PinholeCamera(50.0, 50.0, 40.0, 32.0, 80, 64), folder / "camera.yaml")
     assert open_sequence(folder).camera.fx == (50.0 if own else 60.0)
+
+
+@pytest.mark.parametrize("text", ["%YAML:1.0\n---\nnothing", "500 500 320 240 0 0"])
+def test_a_source_is_opened_whatever_its_camera(text: str, tmp_path: Path) -> None:
+    for i in range(3):
+        save(tmp_path / f"{i}.png", picture(i))
+    (tmp_path / "camera.yaml").write_text(text)
+    source = open_source(tmp_path)
+    assert [frame.index for frame in source.frames(slice(None))] == [0, 1, 2]
+    with pytest.raises(CalibrationError, match=r"camera\.yaml"):
+        open_sequence(tmp_path)
+    with pytest.raises(InputError, match="no such file or folder"):
+        open_source(tmp_path / "none")
+    mine = tmp_path / "mine.txt"
+    mine.write_text("60 60 67 53")
+    assert open_sequence(tmp_path, camera=mine).calibrated

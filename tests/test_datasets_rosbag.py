@@ -225,3 +225,63 @@ def test_stamps_decode_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     source = RosBag(small_bag().write_bag1(tmp_path / "a.bag"))
     monkeypatch.setattr("scopemap.datasets.rosbag.picture_of", lambda message: pytest.fail("decoded"))
     assert [index for index, _ in source.stamps(slice(None, None, 2))] == [0, 2]
+
+
+def test_compressed_depth_is_no_colour_video_and_may_be_truth(tmp_path: Path) -> None:
+    bag = Bag()
+    content = cv2.imencode(".png", np.full((SIZE[1], SIZE[0]), 123, np.uint16))[1].tobytes()
+    for number in range(4):
+        bag.compressed("/cam/depth/image_rect_raw/compressed", number, content, "16UC1; png compressed ")
+        bag.compressed("/cam/depth_registered/image/compressed", number, content, "16UC1; png compressed ")
+    for number in range(2):
+        bag.image("/cam/color/image_raw", number, picture(number, SIZE), "rgb8")
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert next(source.frames(slice(None))).name == "/cam/color/image_raw[0]"
+    truth = source.truth(1)
+    assert truth is not None
+    np.testing.assert_array_equal(truth.depth_mm, 123)
+
+
+def test_colour_is_preferred_to_grey(tmp_path: Path) -> None:
+    bag = Bag()
+    for number in range(3):
+        bag.image("/cam/infra/left/image", number, GREY, "mono8")
+    for number in range(2):
+        bag.compressed("/cam/color/image", number, cv2.imencode(".png", COLOUR)[1].tobytes(), "rgb8; png compressed")
+    assert next(RosBag(bag.write_bag1(tmp_path / "a.bag")).frames(slice(None))).name == "/cam/color/image[0]"
+
+
+@pytest.mark.parametrize(
+    ("depth", "pictures", "used"),
+    [
+        ("/cam/depth_unregistered/image", "/cam/image", False),
+        ("/cam/depth_not_registered/image", "/cam/image", False),
+        ("/cam/unaligned_depth/image", "/cam/image", False),
+        ("/cam/depth_registered/image", "/cam/image", True),
+        ("/cam/aligned_depth_to_infra1/image", "/cam/color/image", False),
+        ("/cam/aligned_depth_to_color/image", "/cam/color/image", True),
+        ("/cam/aligned_depth/image", "/cam/color/image", True),
+    ],
+)
+def test_depth_is_that_of_the_pictures_it_names(tmp_path: Path, depth: str, pictures: str, used: bool) -> None:
+    bag = Bag()
+    for number in range(2):
+        bag.image(pictures, number, picture(number, SIZE), "rgb8")
+        bag.image(depth, number, np.full((SIZE[1], SIZE[0]), 50, np.uint16), "16UC1")
+    assert (RosBag(bag.write_bag1(tmp_path / "a.bag")).truth(0) is not None) == used
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize("form", ["mono16", "bayer_rggb16", "rgb16", "mono16; png compressed"])
+def test_as_many_of_16_bits_are_used_as_the_first_image_needs(tmp_path: Path, bits: int, form: str) -> None:
+    bag, shape = Bag(), (SIZE[1], SIZE[0], 3) if form == "rgb16" else (SIZE[1], SIZE[0])
+    for number, level in enumerate((200, 100, 300)):
+        values = np.minimum(np.full(shape, level) << (bits - 8), 65535).astype(np.uint16)
+        if "png" in form:
+            bag.compressed(IMAGE, number, cv2.imencode(".png", values)[1].tobytes(), form)
+        else:
+            bag.image(IMAGE, number, values, form)
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert [int(frame.rgb[20, 20].max()) for frame in source.frames(slice(None))] == [200, 100, 255]
+    assert any(f"samples of 16 bits: {bits} of them count" in note for note in source.notes)
+    assert any("brighter than" in warning for warning in source.warnings) == (bits < 16)

@@ -117,7 +117,7 @@ def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
         ({"model": "double_sphere", "d": (1.0,)}, "lens 'double_sphere' with 1 coefficients"),
         ({"model": "rational_polynomial", "d": (0.1,) * 12}, "with 12 coefficients"),
         ({"d": (np.nan, 0, 0, 0, 1)}, "distortion is not finite"),
-        ({"roi": (1, 1, 48, 64)}, "region of interest lies outside"),
+        ({"roi": (1, 1, 48, 64)}, "its region, 64x48 px at 1,1, is no part of 64x48 px"),
     ],
 )
 def test_a_camera_that_cannot_be_is_told_and_another_may_be_given(
@@ -223,3 +223,31 @@ def test_a_picture_that_claims_too_many_pixels_is_refused(tmp_path: Path) -> Non
         bag.image(IMAGE, number, picture(number, SIZE), "rgb8", height=60_000, width=60_000)
     with pytest.raises(InputError, match="more than 64 million pixels"):
         open_sequence(bag.write_bag1(tmp_path / "a.bag"))
+
+
+def test_stamps_out_of_order_are_told(tmp_path: Path) -> None:
+    bag = Bag()
+    for number, place in enumerate((0, 1, 3, 2, 4)):
+        bag.image(IMAGE, number, picture(number, SIZE), "rgb8", stamp_ns=START_NS + place * STEP_NS)
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert numbers(source) == [0, 1, 2, 3, 4]
+    assert source.warnings == [f"the stamps of {IMAGE} do not increase: images stay as they were recorded"]
+
+
+@pytest.mark.parametrize(
+    ("profile", "encoding", "said"),
+    [
+        (b"ros1", b"ro1", r"serialised as ro1 \(profile 'ros1'\)"),
+        (b"    ", b"pb3", r"serialised as pb3 \(profile '    '\)"),
+        (b"ros2", b"pb3", "of its messages, those serialised as pb3 are not read, only cdr is"),
+    ],
+)
+def test_messages_that_are_laid_out_in_another_way_are_named(
+    tmp_path: Path, profile: bytes, encoding: bytes, said: str
+) -> None:
+    file = small_bag().write_ros2(tmp_path / "a", "MCAP") / "a.mcap"
+    content = file.read_bytes()
+    assert content[17:25] == b"\x04\0\0\0ros2"
+    file.write_bytes(content[:21] + profile + content[25:].replace(b"\x03\0\0\0cdr", b"\x03\0\0\0" + encoding))
+    with pytest.raises(InputError, match=said):
+        open_sequence(file)

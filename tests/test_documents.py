@@ -13,6 +13,7 @@ from scopemap import __version__
 from scopemap.checkpoints import REGISTRY
 from scopemap.cli import app
 from scopemap.config import PRESETS, setting_names
+from scopemap.datasets import DATASETS
 from scopemap.reconstruction import _COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,6 +58,15 @@ def test_the_readme_names_every_preset_and_all_weights() -> None:
 def test_the_columns_of_frames_csv_are_documented() -> None:
     table = _text("docs/formats.md").split("### frames.csv")[1].split("## What goes in")[0]
     assert re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) == list(_COLUMNS)
+
+
+def test_every_data_set_is_documented() -> None:
+    layouts, origins = _text("docs/datasets.md").split("## Where they come from")
+    origins, measuring = origins.split("## Running and measuring")
+    rows = [set(re.findall(r"^\| `([\w-]+)`", part, flags=re.MULTILINE)) for part in (layouts, origins)]
+    containers = {"rosbag", "dicom", "video", "images"}
+    assert rows == [set(DATASETS), set(DATASETS) - containers]
+    assert set(DATASETS) - containers <= set(re.findall(r"`([\w-]+)`", measuring))
 
 
 def test_versions_agree() -> None:

@@ -13,10 +13,13 @@ from drawn_datasets import WRITERS
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
+from scopemap.benchmark.plan import MethodPlan
 from scopemap.benchmark.scoring import default_protocol
+from scopemap.benchmark.truth import open_truth
+from scopemap.calibration import write_calibration
 from scopemap.cli.evaluate import evaluate
 from scopemap.datasets.reference import read_reference, reference_trajectory
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import CalibrationError, InputError, SettingsError
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory import write_tum
 
@@ -106,3 +109,46 @@ def test_a_folder_of_nothing_names_both_searches(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("nothing")
     with pytest.raises(InputError, match=r"no true poses in .*no trajectory was recognised.*as a data set"):
         read_reference(tmp_path)
+
+
+@pytest.fixture
+def halved(tmp_path: Path) -> Path:
+    """A data set whose pictures are half the size that the calibration beside them is for."""
+    folder = WRITERS["oneslam"](tmp_path / "input")
+    camera = open_sequence(folder).rectifier.source.central
+    write_calibration(camera.resized(2 * camera.width, 2 * camera.height), folder / "images" / "camera.yaml")
+    return folder
+
+
+def test_truth_is_read_as_the_run_read_its_input(halved: Path, tmp_path: Path) -> None:
+    settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
+    with pytest.raises(CalibrationError, match="--camera-fit scale"):
+        open_sequence(halved)
+    config = Config.load(settings=settings | {"input.camera_fit": "scale"})
+    run = tmp_path / "run"
+    reconstruct(open_sequence(halved, settings=config.input), config, out=run)
+    assert open_truth(run, halved).camera == open_sequence(halved, settings=config.input).camera
+    assert "abs_rel" in _figures(run, "--truth", halved, "--align", "origin", "--depth", "median")["depth"]
+    # Poses need no camera at all.
+    assert read_reference(halved).source.startswith("data set oneslam")
+
+
+def test_depth_of_a_run_with_another_camera_is_compared_pixel_by_pixel(tmp_path: Path) -> None:
+    folder, run = WRITERS["hamlyn"](tmp_path / "input"), tmp_path / "run"
+    settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
+    own = open_sequence(folder).rectifier.source.central
+    other = tmp_path / "other.yaml"
+    write_calibration(replace(own, fx=own.fx * 1.3, fy=own.fy * 1.3, cx=own.cx + 2), other)
+    reconstruct(open_sequence(folder, camera=other), Config.load(settings=settings), out=run)
+    truth = open_truth(run, folder)
+    assert truth.camera.fx == pytest.approx(own.fx * 1.3 * truth.camera.width / own.width)
+    assert "abs_rel" in _figures(run, "--truth", folder, "--depth", "median")["depth"]
+    (run / "source_camera.yaml").unlink()  # as older runs left it
+    with pytest.raises(InputError, match="another camera"):
+        _figures(run, "--truth", folder, "--depth", "median")
+
+
+def test_frames_are_the_same_for_all_methods_of_a_plan() -> None:
+    with pytest.raises(ValueError, match="all methods see the same frames"):
+        MethodPlan(name="thin", settings={"input.fps": 5})
+    assert MethodPlan(name="assumed", settings={"input.focal": "assume"}).settings

@@ -6,13 +6,18 @@ What single parsers are held to is in test_datasets_limits, test_numbered_files 
 from __future__ import annotations
 
 import io
+import os
+import signal
 import subprocess
 import sys
 import tarfile
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 
 import av
 import numpy as np
@@ -68,7 +73,9 @@ def _tree(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", ["scared", "scared-c"])
-def test_members_that_lead_outside_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_members_that_lead_outside_write_nothing(
+    name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = WRITERS[name](tmp_path / "input")
     (tmp_path / "secret").write_bytes(b"secret")
     numbers = [2, 3, 5, 9] if name == "scared-c" else [0, 1, 2, 3]
@@ -76,12 +83,14 @@ def test_members_that_lead_outside_write_nothing(name: str, tmp_path: Path, monk
     _write_evil(folder / "data" / "frame_data.tar.gz", json_files(numbers, named), tmp_path)
     _write_evil(folder / "data" / "scene_points.tar.gz", point_files(numbers, both=name == "scared"), tmp_path)
     monkeypatch.chdir(folder)
-    before, elsewhere = _tree(tmp_path), set(Path(tempfile.gettempdir()).iterdir())
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+    before = _tree(tmp_path)
     sequence = open_sequence(folder)
     assert [frame.index for frame, truth in sequence if truth is not None and truth.depth_mm is not None] == numbers
     read_all(folder)
     assert _tree(tmp_path) == before
-    assert set(Path(tempfile.gettempdir()).iterdir()) <= elsewhere
+    assert list(elsewhere.iterdir()) == []
 
 
 @pytest.mark.parametrize("lead", ["../../../", "/", "a/../../"])
@@ -104,6 +113,48 @@ def test_a_recording_that_names_files_outside_is_refused(tmp_path: Path) -> None
         (folder / "metadata.yaml").write_text(text.replace(file.name, name))
         with pytest.raises(InputError):
             read_all(folder)
+
+
+# ---- pipes: whoever opens one waits forever
+
+
+@pytest.fixture
+def at_once() -> Iterator[None]:
+    def too_late(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, too_late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+needs_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+
+
+@needs_pipes
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.bag", "clip.dcm", "clip"])
+def test_a_pipe_is_one_sentence(name: str, tmp_path: Path, at_once: None) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: it is a pipe or a device"):
+        open_sequence(tmp_path / name)
+
+
+@needs_pipes
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_pipes_in_the_place_of_files_end_reading_at_once(name: str, tmp_path: Path, at_once: None) -> None:
+    entry = WRITERS[name](tmp_path / "input")
+    files = {(f.parent, f.suffix): f for f in sorted((tmp_path / "input").rglob("*")) if f.is_file()}
+    for file in files.values():
+        content = file.read_bytes()
+        file.unlink()
+        os.mkfifo(file)
+        with suppress(ScopemapError):
+            read_all(entry)
+        file.unlink()
+        file.write_bytes(content)
+    read_all(entry)
 
 
 # ---- files that grow while they are read

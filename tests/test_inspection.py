@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drawn_bags import IMAGE, Bag
 from drawn_clips import (
     SIZE,
     Change,
@@ -28,6 +29,7 @@ from drawn_clips import (
     tissue,
     write,
 )
+from drawn_dicom import write_dicom_video
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,7 +37,7 @@ from scopemap.datasets import open_sequence
 from scopemap.errors import InputError
 from scopemap.inspection.finding import Finding, covered, stretches_of
 from scopemap.inspection.inspecting import Inspection, inspect
-from scopemap.inspection.masks import write_masks
+from scopemap.inspection.masks import write_mask
 from scopemap.mask_files import MaskFiles
 
 COUNT = 50
@@ -149,13 +151,13 @@ def test_a_picture_in_the_picture_is_found_and_its_masks_are_read_by_runs(inspec
     assert set(by_code(found)) == {"inset"}
     (box,) = found.insets
     assert np.array(box) * [*SIZE, *SIZE] == pytest.approx([220, 0, 320, 80], abs=3)
-    assert write_masks(found, tmp_path / "masks") == COUNT
+    assert write_mask(found, tmp_path / "masks")
     mask = MaskFiles(tmp_path / "masks", open_sequence(found.path, size=SIZE).rectifier).covered(COUNT - 1)
     assert mask is not None
     assert mask[:76, 224:].all()
     assert not mask[90:].any()
     assert not mask[:, :210].any()
-    assert write_masks(inspected("clean"), tmp_path / "none") == 0
+    assert not write_mask(inspected("clean"), tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
@@ -211,6 +213,50 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     assert set(by_code(found)) == {"frames-dropped"}
     assert "numbers in the names" in found.findings[0].message
     assert found.container is None
+
+
+def test_positions_count_unreadable_images_as_frames_does(tmp_path: Path) -> None:
+    for number, picture in enumerate(clip(40, during(25, 39, drape))):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), picture[..., ::-1])
+    for number in range(3, 9):
+        (tmp_path / f"{number:03d}.png").write_bytes(b"")
+    inspection = inspect(tmp_path)
+    found = by_code(inspection)
+    assert set(found) == {"source", "not-tissue"}
+    assert found["not-tissue"].stretches == ((25, 39),)
+    assert found["not-tissue"].advice.endswith("--frames :25")
+    assert [view.figures.position for view in inspection.samples][-1] > 30
+    told = [finding.message for finding in inspection.findings if finding.code == "source"]
+    assert (len(told), told[-1]) == (4, "and 3 more warnings of the reader")
+    part = by_code(inspect(tmp_path, frames=slice(10, None, 2)))["not-tissue"]
+    assert part.stretches == ((26, 38),)
+    assert part.advice.endswith("--frames 10:26:2")
+
+
+def test_time_stamps_of_bags_and_dicom_are_their_own(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    bag = Bag()
+    for number, picture in enumerate(clip(30)):
+        bag.image(IMAGE, number + (8 if number > 15 else 0), picture, "rgb8")
+    found = inspect(bag.write_bag1(tmp_path / "hole.bag"))
+    assert "time stamps leave 1 hole(s), about 8" in by_code(found)["frames-dropped"].message
+    assert found.container is None
+    pytest.importorskip("pydicom")
+    video = inspect(write_dicom_video(tmp_path / "video"))
+    assert video.container is not None
+    assert video.container.width == video.size[0]
+
+
+def test_the_camera_may_be_that_of_one_of_two_views(tmp_path: Path) -> None:
+    video, camera = write(tmp_path / "both.mp4", clip(12, beside)), tmp_path / "camera.yaml"
+    camera.write_text(
+        "%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+        "   cols: 3\n   dt: d\n   data: [300.,0.,159.5,0.,300.,119.5,0.,0.,1.]\n"
+    )
+    found = inspect(video, camera=camera)
+    assert found.size == SIZE
+    assert open_sequence(video, camera=camera).source.width == SIZE[0]
+    assert found.packed is not None
 
 
 def test_what_breaks_off_is_said_and_what_is_no_video_refused(tmp_path: Path) -> None:

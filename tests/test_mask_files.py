@@ -85,7 +85,7 @@ def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no folder"):
         MaskFiles(tmp_path / "nowhere", RECTIFIER)
     with pytest.raises(InputError, match="no image with a number"):
-        MaskFiles(write_masks(tmp_path / "names", {"tool.png": left_half()}), RECTIFIER)
+        MaskFiles(write_masks(tmp_path / "names", {"tool.png": left_half(), "text.png": left_half()}), RECTIFIER)
     with pytest.raises(InputError, match="two masks for frame 1"):
         MaskFiles(write_masks(tmp_path / "twice", {"a1.png": left_half(), "b1.png": left_half()}), RECTIFIER)
     damaged = write_masks(tmp_path / "damaged", {"1.png": left_half()})
@@ -95,6 +95,20 @@ def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:
     narrow = write_masks(tmp_path / "narrow", {"1.png": np.zeros((480, 320), np.uint8)})
     with pytest.raises(CalibrationError, match="aspect"):
         MaskFiles(narrow, RECTIFIER).covered(1)
+
+
+def test_the_only_image_without_a_number_is_for_all_frames(tmp_path: Path) -> None:
+    masks = MaskFiles(write_masks(tmp_path / "masks", {"mask.png": left_half()}), RECTIFIER)
+    for index in (0, 7, 123456):
+        covered = masks.covered(index)
+        assert covered[:, :160].all()
+        assert not covered[:, 160:].any()
+    assert masks.provenance()["masks"].endswith("mask.png, for all frames")
+    assert masks.warnings == []
+    assert cv2.imwrite(str(tmp_path / "masks" / "7.png"), left_half())
+    numbered = MaskFiles(tmp_path / "masks", RECTIFIER)
+    assert numbered.covered(7) is not None
+    assert numbered.covered(0) is None
 
 
 def test_the_masker_leaves_masked_pixels_out_of_that_frame_only(tmp_path: Path) -> None:

@@ -46,7 +46,8 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
     Reading first and decoding then also works for names that OpenCV cannot open on some systems.
     """
     try:
-        return decoded(file.read_bytes(), flags)
+        # Whoever opens a pipe waits forever.
+        return decoded(file.read_bytes(), flags) if file.is_file() else None
     except OSError:
         return None
     except InputError as error:

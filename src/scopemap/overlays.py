@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -9,27 +11,60 @@ import numpy as np
 _CHANNEL = 1
 # Whether the camera has moved is seen in a small copy without its local mean, in so many parts of it, levels of 255.
 _SMALL_SIDE_PX, _LOCAL_PX, _PARTS = 60, 9, (8, 6)
-_TEXTURE, _MOVED, _LEAST_PARTS, _MOVED_SHARE = 1.0, 0.4, 12, 0.7
+_TEXTURE, _ALIKE, _LEAST_PARTS, _MOVED_SHARE = 1.0, 0.94, 12, 0.7
 _LEAST_COUNT, _MEMORY, _LOOK_EVERY = 12, 40, 4
 # What is an edge, levels of 255; which share of it may change, on average and in one image: coding changes it a little.
 _EDGE, _STILL_SHARE, _NOW_SHARE = 40, 0.1, 0.25
 _RIM_PX, _CLOSING_PX, _GROW_PX, _LEAST_PX, _LARGEST_SHARE = 2, 5, 2, 6, 0.25
+# What lies so far around an edge that stays must change, levels of 255 without noise, or be of one colour, nearly all.
+_CALM_PX, _NEAR_PX, _FAR_PX, _CHANGED, _PLAIN, _AROUND_SHARE = 5, 4, 8, 1.5, 2.0, 0.7
+# An overlay is gone where so much of its edges differs: half of their pixels are of what lies beside it.
+_GONE_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found at the last look.
+
+    mask : (H, W) bool. labels : (H, W) int32, its parts, from 1. edges : (N,) places in the flat image, of the edges
+    that stay. level, limit : (N,) float32, what was learnt of them, and how far they may be from it. of : (N,) part.
+    """
+
+    mask: np.ndarray
+    labels: np.ndarray
+    edges: np.ndarray
+    level: np.ndarray
+    limit: np.ndarray
+    of: np.ndarray
+
+    def shown(self, level: np.ndarray) -> np.ndarray | None:
+        """Return which overlays are in this image, (H, W) bool: a menu may go while the camera rests."""
+        differs = np.abs(level.ravel()[self.edges] - self.level) > self.limit
+        if not differs.any():
+            return self.mask
+        edges = np.bincount(self.of)
+        gone = np.bincount(self.of, differs) > _GONE_SHARE * edges
+        if not gone.any():
+            return self.mask
+        gone[0] = True  # what is no part of the mask
+        return None if gone[edges > 0].all() else ~gone[self.labels]
 
 
 class OverlayFinder:
     """Learns from one image after the other, all of one size, which edges the camera's motion does not move.
 
     It keeps a running mean of the image and of how far each pixel is from it. Images count once the texture has changed
-    in most parts of the field since the last that counted: tissue that rests before a resting camera is no overlay.
-    Nothing is found before 12 of them; what was seen more than 40 ago fades. Overlays that one can see through, or
-    whose own content changes all the time, are not found.
+    in most parts of the field since the last that counted, and an edge that stays counts only where what lies around it
+    does not: tissue at rest is no overlay, whether all of it rests or a part. Nothing is found before 12 images; what
+    was seen more than 40 ago fades. Overlays that one can see through, or whose own content changes all the time, are
+    not found.
     """
 
     def __init__(self) -> None:
         self.count = 0
         self._last: np.ndarray = np.zeros((0, 0), np.float32)
-        self._mean, self._change = self._last, self._last
-        self._found: np.ndarray | None = None
+        self._mean, self._change, self._calm_change = self._last, self._last, self._last
+        self._found: _Found | None = None
 
     def __call__(self, rgb: np.ndarray, field: np.ndarray, beside: np.ndarray | None = None) -> np.ndarray | None:
         """Return where overlays are, (H, W) bool; None where there are none, or too little has moved so far.
@@ -41,29 +76,42 @@ class OverlayFinder:
         detail = _small_detail(level, field)
         if self._mean.shape != level.shape:
             self.count, self._found = 1, None
-            self._last, self._mean, self._change = detail, level.astype(np.float32), np.zeros(level.shape, np.float32)
+            self._last, self._mean = detail, level.astype(np.float32)
+            self._change, self._calm_change = np.zeros_like(self._mean), np.zeros_like(self._mean)
         elif _has_moved(self._last, detail):
             self._last = detail
             self._learn(level)
             if self.count >= _LEAST_COUNT and self.count % _LOOK_EVERY == 0:
                 self._found = self._overlays(level, field if beside is None else field | beside)
-        return self._found
+        return None if self._found is None else self._found.shown(level)
 
     def _learn(self, level: np.ndarray) -> None:
         self.count += 1
         weight = 1 / min(self.count, _MEMORY)
-        cv2.accumulateWeighted(cv2.absdiff(level.astype(np.float32), self._mean), self._change, weight)
-        cv2.accumulateWeighted(level, self._mean, weight)
+        now = level.astype(np.float32)
+        # The light of the whole picture going up and down is no change of what is seen.
+        steady = now * (cv2.mean(self._mean)[0] / max(cv2.mean(level)[0], 1.0))
+        calm = cv2.blur(steady - self._mean, (_CALM_PX, _CALM_PX))
+        cv2.accumulateWeighted(np.abs(calm), self._calm_change, weight)
+        cv2.accumulateWeighted(cv2.absdiff(now, self._mean), self._change, weight)
+        cv2.accumulateWeighted(now, self._mean, weight)
 
-    def _overlays(self, level: np.ndarray, field: np.ndarray) -> np.ndarray | None:
+    def _overlays(self, level: np.ndarray, field: np.ndarray) -> _Found | None:
         contrast = cv2.morphologyEx(self._mean, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
         still = (contrast >= _EDGE) & (self._change <= _STILL_SHARE * contrast)
         # What has just gone, a menu, must not be kept by the memory.
         still &= cv2.absdiff(level.astype(np.float32), self._mean) <= _NOW_SHARE * contrast
-        rim = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
-        inside = cv2.erode(field.astype(np.uint8), rim, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-        still &= inside > 0
-        return _grown(still) if np.count_nonzero(still) >= _LEAST_PX else None
+        still &= cv2.erode(field.astype(np.uint8), _square(_RIM_PX), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+        if np.count_nonzero(still) < _LEAST_PX:
+            return None
+        still &= _stands_alone(still, (self._calm_change >= _CHANGED) | (contrast <= _PLAIN))
+        mask = _grown(still)
+        if mask is None:
+            return None
+        _, labels = cv2.connectedComponents(mask.astype(np.uint8))
+        edges = np.flatnonzero(still & mask)
+        mean, limit = self._mean.ravel()[edges], _NOW_SHARE * contrast.ravel()[edges]
+        return _Found(mask, labels, edges, mean, limit, labels.ravel()[edges])
 
 
 def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
@@ -83,18 +131,43 @@ def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
 
 
 def _has_moved(before: np.ndarray, now: np.ndarray) -> bool:
-    """Whether most parts that had texture show another one; an overlay fills few parts."""
-    texture, change = _in_parts(before), _in_parts(now - before)
-    textured = texture >= _TEXTURE
-    parts = np.count_nonzero(textured)
-    if parts < _LEAST_PARTS:
+    """Whether most parts that have texture show another one, by correlation: a lamp that changes moves nothing.
+
+    An overlay fills few parts.
+    """
+    textured = _in_parts(np.abs(now)) >= _TEXTURE
+    if np.count_nonzero(_in_parts(np.abs(before)) >= _TEXTURE) < _LEAST_PARTS:
         # A black picture is not waited for to come back.
-        return bool(np.count_nonzero(_in_parts(now) >= _TEXTURE) >= _LEAST_PARTS)
-    return bool(np.count_nonzero(change[textured] >= _MOVED * texture[textured]) >= _MOVED_SHARE * parts)
+        return bool(np.count_nonzero(textured) >= _LEAST_PARTS)
+    textured &= _in_parts(np.abs(before)) >= _TEXTURE
+    parts = np.count_nonzero(textured)
+    power = np.sqrt(_in_parts(before * before) * _in_parts(now * now))
+    moved = _in_parts(before * now) < _ALIKE * power
+    return bool(parts >= _LEAST_PARTS and np.count_nonzero(moved & textured) >= _MOVED_SHARE * parts)
 
 
-def _in_parts(detail: np.ndarray) -> np.ndarray:
-    return cv2.resize(np.abs(detail), _PARTS, interpolation=cv2.INTER_AREA)
+def _in_parts(values: np.ndarray) -> np.ndarray:
+    return cv2.resize(values, _PARTS, interpolation=cv2.INTER_AREA)
+
+
+def _stands_alone(still: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return where edges that stay, (H, W) bool, stay alone: around them nearly all is `other`, (H, W) bool.
+
+    That is: moving, or of one colour. What rests among pixels that rest may be tissue before a camera at rest.
+    """
+    closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
+    near = cv2.dilate(closed, _square(_NEAR_PX))
+    count, labels = cv2.connectedComponents(near)
+    # The largest label in reach: a pixel between two groups counts for one of them.
+    around = cv2.dilate(labels.astype(np.float32), _square(_FAR_PX)).astype(np.int32)
+    around[near > 0] = 0
+    pixels = np.bincount(around.ravel(), minlength=count)
+    alone = np.bincount(around.ravel(), other.ravel(), minlength=count) >= _AROUND_SHARE * pixels
+    return alone[labels]
+
+
+def _square(radius_px: int) -> np.ndarray:
+    return np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
 
 
 def _grown(still: np.ndarray) -> np.ndarray | None:
@@ -110,5 +183,5 @@ def _grown(still: np.ndarray) -> np.ndarray | None:
         found[box] = np.maximum(found[box], closed[box])
         if cv2.contourArea(contour) <= _LARGEST_SHARE * still.size:
             cv2.drawContours(found, [contour], -1, 1, cv2.FILLED)
-    grown = cv2.dilate(found, np.ones((2 * _GROW_PX + 1, 2 * _GROW_PX + 1), np.uint8)) > 0
+    grown = cv2.dilate(found, _square(_GROW_PX)) > 0
     return grown if grown.any() else None

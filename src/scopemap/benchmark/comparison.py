@@ -14,10 +14,10 @@ from scopemap.benchmark.entry import Entry
 from scopemap.benchmark.plan import ProtocolPlan
 from scopemap.benchmark.presentation import Shown
 from scopemap.benchmark.result import FILE_NAME, RunResult
-from scopemap.benchmark.scoring import default_protocol, pose_groups, score, working_size
+from scopemap.benchmark.scoring import default_protocol, pose_groups, score
+from scopemap.benchmark.truth import open_truth
 from scopemap.benchmark.worker import RUN
 from scopemap.datasets import Sequence as Frames
-from scopemap.datasets import open_sequence
 from scopemap.datasets.reference import read_reference
 from scopemap.errors import InputError
 from scopemap.trajectory import Trajectory, Unit, read_trajectory
@@ -80,7 +80,7 @@ def _frames(place: Path, truth: Path) -> Frames | None:
     if not (place / "frames.csv").is_file() or not truth.is_dir() or (truth / "frames.csv").is_file():
         return None
     try:
-        return open_sequence(truth, size=working_size(place))
+        return open_truth(place, truth)
     except InputError:  # a folder of poses without images
         return None
 

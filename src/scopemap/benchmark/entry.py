@@ -77,7 +77,10 @@ class Entry(BaseModel):
         plan = self.sequence
         camera = None if plan.camera is None else _below(self.data, plan.camera)
         frames = None if plan.frames is None else slice(*plan.frames)
-        return open_sequence(self.source, dataset=plan.dataset, camera=camera, size=plan.size, frames=frames)
+        settings = Config.load(settings=self.settings | plan.settings).input
+        return open_sequence(
+            self.source, dataset=plan.dataset, camera=camera, size=plan.size, frames=frames, settings=settings
+        )
 
     def shared_settings(self) -> dict[str, Any]:
         """Return the settings that all methods are given on this sequence."""

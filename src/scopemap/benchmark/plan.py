@@ -160,6 +160,9 @@ class MethodPlan(_Part):
         if (self.use == "import") != bool(self.files):
             raise ValueError(f"method '{self.name}': `files` and use = \"import\" belong together")
         Config.load(self.preset, settings=self.settings)
+        apart = [name for name in self.settings if name.startswith("input.") and name != "input.focal"]
+        if apart:
+            raise ValueError(f"method '{self.name}': all methods see the same frames; give {apart[0]} to the sequence")
         return self
 
 

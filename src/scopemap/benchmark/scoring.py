@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +12,7 @@ import trimesh
 
 from scopemap.benchmark.flow_store import FlowStore
 from scopemap.benchmark.plan import ProtocolPlan
+from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import MaskSettings
 from scopemap.datasets import Sequence, open_sequence
 from scopemap.datasets.reference import reference_trajectory
@@ -34,7 +34,6 @@ from scopemap.trajectory import Trajectory, read_trajectory
 Figures = dict[str, dict[str, Any]]
 _RAFT_ITERATIONS = 12
 _MOST_VIEWS = 40
-_SAME_CAMERA_PX = 0.01
 
 
 def score(
@@ -153,10 +152,8 @@ def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consis
     depth = DepthReader(run)
     if not depth.present:
         raise InputError(f"{run} holds no depth maps (depth/depth.json); only a run's folder does")
-    camera = _camera_of(run)
-    sequence = open_sequence(truth, size=(int(camera["width"]), int(camera["height"])))
-    parts = ("fx", "fy", "cx", "cy")
-    if any(abs(camera[name] - getattr(sequence.camera, name)) > _SAME_CAMERA_PX for name in parts):
+    sequence = open_truth(run, truth)
+    if not is_camera_of(run, sequence):
         raise InputError(f"the run {run} was made with another camera than {truth} gives: their depths do not compare")
     protocol = default_protocol(sequence)
     figures: Figures = {}
@@ -173,23 +170,6 @@ def default_protocol(sequence: Sequence) -> ProtocolPlan:
     """Return the protocol with the range of true depth that is usual for the data set."""
     name = next((known for known in DEPTH_RANGES_MM if sequence.source.name.startswith(known)), "")
     return ProtocolPlan(depth_range_mm=DEPTH_RANGES_MM.get(name, ProtocolPlan().depth_range_mm))
-
-
-def working_size(run: Path) -> tuple[int, int] | None:
-    """Return the working size (width, height) of a run, which its depth maps have; None where nothing tells."""
-    try:
-        camera = _camera_of(run)
-    except InputError:
-        return None
-    return int(camera["width"]), int(camera["height"])
-
-
-def _camera_of(run: Path) -> dict[str, float]:
-    try:
-        camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
-        return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot tell the camera of the run {run} from its provenance.json: {error}") from None
 
 
 def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:

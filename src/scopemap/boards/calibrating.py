@@ -29,7 +29,7 @@ class BoardCalibration:
     Attributes
     ----------
     fit : the camera, and the boards as it sees them. views : those that it was fitted to, in the input's order.
-    held_out_px : error of every form tried, in views that it was not fitted to, px.
+    held_out_px : error of every form tried, in those of `views` that it was not fitted to, px.
     left_out : views that do not fit. blurred : views that are blurred.
     alike : number of views that were not used because another one shows the same.
     coverage : share of the picture within boards.
@@ -108,9 +108,12 @@ def calibrate(
     forms = [form for form in FORMS if model in ("auto", form.model)]
     form = _flexible(selected.views, size, forms)
     views, out = agreeing(selected.views, size, form)
+    views.sort(key=lambda view: view.index)
     errors = _held_out(views, size, forms)
-    form = chosen(errors)
-    views, more = agreeing(views, size, form)
+    agreed, more = agreeing(views, size, chosen(errors))
+    if _corners(agreed) < _corners(views) and len(agreed) >= FEWEST_VIEWS:
+        errors = _held_out(agreed, size, forms)  # what is reported is of the views and corners that are used
+    views, form = agreed, chosen(errors)
     out += more
     if len(views) < FEWEST_VIEWS:
         worst = out[0]
@@ -118,9 +121,7 @@ def calibrate(
             f"{seen}, but only {len(views)} of {len(selected.views)} views agree",
             f"frame {worst.view.index}: {worst.reason}; is the plate flat and the zoom untouched?",
         )
-    views.sort(key=lambda view: view.index)
-    fit = fit_camera(views, size, form)
-    fit = fit if fit.deviations else with_bootstrap(fit, views)
+    fit = with_bootstrap(fit_camera(views, size, form), views)
     covered = coverage(views, size)
     warnings = warnings_about(fit, covered, pixel_aspect)
     return BoardCalibration(fit, views, errors, out, selected.blurred, selected.alike, covered, warnings)
@@ -169,6 +170,10 @@ def _flexible(views: list[View], size: tuple[int, int], forms: list[LensForm]) -
             f"calibrating: no camera explains the {len(views)} views; is the plate flat, the board the one named?"
         )
     return min(fits, key=lambda fit: float(np.median(fit.view_rms_px))).form
+
+
+def _corners(views: list[View]) -> int:
+    return sum(len(view.corners.pixels) for view in views)
 
 
 def _held_out(views: list[View], size: tuple[int, int], forms: list[LensForm]) -> dict[LensForm, float]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from scopemap.boards.targets import DICTIONARIES, Board, CharucoBoard, Checkerboard
+from scopemap.boards.targets import DICTIONARIES, Board, CharucoBoard, Checkerboard, nearest_px
 
 _ANY_SIZE = (4, 3)
+# Texture of any kind often passes for a grid of that size, sometimes for a larger one. It does not lie as a plane does:
+# it is off by 0.16 squares and more, larger grids by 0.4; strong distortion moves a whole board by up to 0.3.
+_SMALL_OFF, _LARGE_OFF, _SEEN_TWICE = 0.1, 0.3, 2
 _LONGEST_SIDE_PX = 1200
 _PICTURES = 6
 _TELLING_MARKERS = 4
@@ -68,8 +72,10 @@ def _markers_in(grey: np.ndarray, dictionary: str) -> int:
 def _other_checkerboard(board: Board, pictures: list[np.ndarray]) -> str:
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     tries = (cv2.findChessboardCornersSBWithMeta(grey, _ANY_SIZE, flags) for grey in pictures)
+    grids = [np.asarray(pixels, dtype=np.float64).reshape(*meta.shape[:2], 2) for found, pixels, meta in tries if found]
+    counts = Counter(tuple(sorted(grid.shape[:2])) for grid in grids if _is_plane(grid))
     # Of a board that is hard to see a part is found: the largest is nearest to the truth.
-    sizes = [tuple(sorted(meta.shape[:2])) for found, _, meta in tries if found]
+    sizes = [size for size, count in counts.items() if size != tuple(sorted(_ANY_SIZE)) or count >= _SEEN_TWICE]
     rows, columns = max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
     if not rows:
         return ""
@@ -77,3 +83,15 @@ def _other_checkerboard(board: Board, pictures: list[np.ndarray]) -> str:
     if not isinstance(board, Checkerboard):
         return f"{seen}: leave out --charuco"
     return "" if sorted((board.columns, board.rows)) == [rows, columns] else f"{seen}: give --board {columns}x{rows}"
+
+
+def _is_plane(grid: np.ndarray) -> bool:
+    """Whether corners (rows, columns, 2) lie about as those of a plane do."""
+    rows, columns = grid.shape[:2]
+    pixels, even = grid.reshape(-1, 2), np.mgrid[:columns, :rows].T.reshape(-1, 2).astype(np.float64)
+    H, _ = cv2.findHomography(even, pixels)
+    if H is None:
+        return False
+    off = cv2.perspectiveTransform(even[None], H)[0] - pixels
+    limit = _LARGE_OFF if grid.size > 2 * _ANY_SIZE[0] * _ANY_SIZE[1] else _SMALL_OFF
+    return bool(np.sqrt(np.mean(np.sum(off**2, axis=1))) < limit * nearest_px(pixels))

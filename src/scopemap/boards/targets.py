@@ -15,6 +15,9 @@ _FEWEST, _MOST = 3, 100  # a side, inner corners or squares
 _FEWEST_CORNERS = 8
 # A board is first looked for in a picture of this size: where there is none, a large one takes seconds to say so.
 _SEARCH_SIDE_PX = 800
+# Corners are placed by what lies within so much around them, and no farther than a share of a square: farther off, the
+# lens bends the edges.
+_REACH_PX, _REACH_SHARE, _REACH_SQUARES = 8, 1 / 160, 0.4
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
@@ -169,7 +172,8 @@ def _check(columns: int, rows: int, square_mm: float) -> None:
 
 def _refined(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Return `pixels` (N, 2) moved onto the corners nearby, to a fraction of a pixel."""
-    reach = max(2, int(0.4 * nearest_px(pixels)))
+    straight = max(_REACH_PX, round(_REACH_SHARE * max(grey.shape)))
+    reach = max(2, min(straight, int(_REACH_SQUARES * nearest_px(pixels))))
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
     return cv2.cornerSubPix(grey, start, (reach, reach), (-1, -1), _REFINED).reshape(-1, 2).astype(np.float64)
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from scopemap.boards.targets import Board, Corners, nearest_px
-from scopemap.datasets import Sequence
+from scopemap.datasets import Source
 from scopemap.errors import InputError
 
 _FRAMES_LOOKED_AT = 300
@@ -44,29 +44,42 @@ class Search:
     Attributes
     ----------
     size : width and height of the frames, px.
-    looked_at : frames in which the board was looked for, every `every`-th one.
+    selection : the frames in which the board was looked for, every `every`-th of those asked for.
+    looked_at : how many these were.
     views : where it was found.
     without : some of the frames in which it was not found, grey: to say why.
     """
 
     size: tuple[int, int]
-    every: int
+    selection: slice = field(default_factory=lambda: slice(None))
+    every: int = 1
     looked_at: int = 0
     views: list[View] = field(default_factory=list)
     without: list[np.ndarray] = field(default_factory=list)
 
 
-def find_views(sequence: Sequence, board: Board, every: int | None = None, listener: Listener | None = None) -> Search:
-    """Look for `board` in every `every`-th selected frame, as it is in the file; None: about 300 frames in all.
+def find_views(
+    source: Source,
+    board: Board,
+    selection: slice | None = None,
+    every: int | None = None,
+    listener: Listener | None = None,
+) -> Search:
+    """Look for `board` in every `every`-th selected frame, as `source` has it; None: about 300 frames in all.
 
-    `listener` is told the frames looked at, and of how many. Raises `InputError` where the input cannot be read.
+    `selection` counts positions in the source, None: all. `listener` is told the frames looked at, and of how many.
+    Raises `InputError` where the source cannot be read.
     """
-    count = sequence.count
+    selection = selection or slice(None)
+    if selection.step is not None and selection.step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
+    count = None if source.count is None else len(range(*selection.indices(source.count)))
     every = every or max(1, (count or 0) // _FRAMES_LOOKED_AT)
     total = None if count is None else -(-count // every)
-    search = Search((sequence.source.width, sequence.source.height), every)
+    looked_at = slice(selection.start, selection.stop, every * (selection.step or 1))
+    search = Search((source.width, source.height), looked_at, every)
     missed = 0
-    for frame in sequence.source.frames(_every(sequence, every)):
+    for frame in source.frames(looked_at):
         search.looked_at += 1
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = board.find(grey)
@@ -81,17 +94,12 @@ def find_views(sequence: Sequence, board: Board, every: int | None = None, liste
     return search
 
 
-def picture_of(view: View, sequence: Sequence, every: int) -> np.ndarray:
-    """Return the frame (h, w, 3) uint8 of a view found among every `every`-th frame, read anew."""
-    for frame in sequence.source.frames(_every(sequence, every)):
+def picture_of(view: View, source: Source, search: Search) -> np.ndarray:
+    """Return the frame (h, w, 3) uint8 of a view that `search` found in `source`, read anew."""
+    for frame in source.frames(search.selection):
         if frame.index == view.index:
             return frame.rgb
-    raise InputError(f"reading {sequence.path} again: frame {view.index} is gone")
-
-
-def _every(sequence: Sequence, every: int) -> slice:
-    selection = sequence.selection
-    return slice(selection.start, selection.stop, every * (selection.step or 1))
+    raise InputError(f"reading {source.path} again: frame {view.index} is gone")
 
 
 def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:

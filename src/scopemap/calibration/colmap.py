@@ -133,10 +133,13 @@ def _with_lens(model: str, central: PinholeCamera, lens: list[float]) -> CameraM
 
 def _text_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        content = file.read_bytes()
+        if b"\0" in content:
+            raise ValueError("it is binary, not text")
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"cannot read the cameras of a COLMAP model from {file}: {error}") from None
-    for number, line in enumerate(lines, start=1):
+    # Bytes that are no UTF-8, as in comments of any tool, become question marks.
+    for number, line in enumerate(content.decode("utf-8-sig", errors="replace").splitlines(), start=1):
         fields = line.split()
         if not fields or line.startswith("#"):
             continue

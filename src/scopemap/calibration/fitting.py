@@ -33,7 +33,7 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
         raise CalibrationError(
             f"{_sizes(calibration, image_size)}; where the images were resized from that size, say so (--camera-fit "
             "scale), where they were cut out of it, say where (--camera-fit crop:X,Y), else give another calibration "
-            "(--camera)"
+            f"(--camera){_turned_note(camera, image_size)}"
         )
     check_plausible(camera, calibration.name)
     return calibration
@@ -88,11 +88,11 @@ def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
             "scale): add image_width and image_height"
         )
     if (camera.width, camera.height) == image_size:
-        return calibration
+        return replace(calibration, source=f"{calibration.source}, of the images' size: nothing to scale")
     if not _same_aspect(camera, image_size):
         raise CalibrationError(
             f"{_sizes(calibration, image_size)}: another aspect, which scaling (--camera-fit scale) does not explain; "
-            "where the images were cut out, say where (--camera-fit crop:X,Y)"
+            f"where the images were cut out, say where (--camera-fit crop:X,Y){_turned_note(camera, image_size)}"
         )
     scaled = camera.resized(*image_size)
     return replace(calibration, camera=scaled, source=calibration.source + rescaled_note(camera, scaled))
@@ -120,6 +120,11 @@ def _cut(calibration: Calibration, image_size: Size, corner: tuple[int, int]) ->
 def _same_aspect(camera: CameraModel, image_size: Size) -> bool:
     width, height = image_size
     return abs(camera.width * height / (camera.height * width) - 1) <= _ASPECT_TOLERANCE
+
+
+def _turned_note(camera: CameraModel, image_size: Size) -> str:
+    turned = _same_aspect(camera, image_size[::-1]) and not _same_aspect(camera, image_size)
+    return "; its height and width may be swapped" if turned else ""
 
 
 def _sizes(calibration: Calibration, image_size: Size) -> str:

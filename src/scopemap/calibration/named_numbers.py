@@ -7,49 +7,68 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
-from scopemap.calibration.opencv import size_of
-from scopemap.calibration.stated import Calibration, Size, pinhole_of, with_lens
-from scopemap.calibration.trees import Tree, as_number, number, words
+from scopemap.calibration.distortion import model_in
+from scopemap.calibration.fields import Fields
+from scopemap.calibration.opencv import INNER, depth_scale_mm, lens_of
+from scopemap.calibration.sizes import size_of
+from scopemap.calibration.stated import Calibration, Size, pinhole_of
+from scopemap.calibration.trees import Repeated, Tree, as_number
 
-_PREFIXES = ("", "Camera.", "Camera1.")
-_FOCAL = ("fx", "fy")
-_CENTRE = ("cx", "cy")
-_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
-_TANGENTIAL = ("p1", "p2")
-_MODEL_NAMES = ("Camera.type", "camera_model", "distortion_model", "model", "type")
+_PREFIXES = ("Camera.", "Camera1.")
+_OF_NERFSTUDIO = "fl_x"
+_INTRINSICS = {
+    "fx": ("fx", _OF_NERFSTUDIO, "focal_x", "focal_length_x"),
+    "fy": ("fy", "fl_y", "focal_y", "focal_length_y"),
+    "cx": ("cx", "ppx"),
+    "cy": ("cy", "ppy"),
+}
 # Nothing, and what begins something else in YAML.
 _NO_VALUES = ("", *"[{*&!|>")
-_KANNALA_BRANDT = re.compile("kannala|fisheye|equi|kb4")
+_CORNER_TO_CENTRE_PX = 0.5
 
 
 def has_names(tree: Tree) -> bool:
     """Whether a tree names a focal length in one of these ways."""
-    return isinstance(tree.get("intrinsics"), dict) or any(f"{prefix}fx" in tree for prefix in _PREFIXES)
+    return any(next(level.nodes(_INTRINSICS["fx"]), None) is not None for level, _ in _places(tree))
 
 
 def of_names(tree: Tree, image_size: Size) -> Calibration:
     """Return the camera of a tree that names its intrinsics; `ValueError` where one is missing or no number."""
-    inner = tree.get("intrinsics")
-    own = inner if isinstance(inner, dict) else tree
-    prefix = next((prefix for prefix in _PREFIXES if f"{prefix}fx" in own), "")
-    found = {name: number(own, (prefix + name,)) for name in (*_FOCAL, *_CENTRE, *_RADIAL, *_TANGENTIAL)}
-    intrinsics = [value for name in (*_FOCAL, *_CENTRE) if (value := found[name]) is not None]
+    own, prefix = next(place for place in _places(tree) if next(place[0].nodes(_INTRINSICS["fx"]), None) is not None)
+    found = {name: own.number(spellings) for name, spellings in _INTRINSICS.items()}
+    intrinsics = [value for value in found.values() if value is not None]
     if len(intrinsics) < 4:
-        missing = ", ".join(prefix + name for name in (*_FOCAL, *_CENTRE) if found[name] is None)
-        raise ValueError(f"it has no {missing}")
-    pinhole, origin = pinhole_of(intrinsics, size_of(own) or size_of(tree), image_size)
-    model = words(tree, _MODEL_NAMES) or words(own, _MODEL_NAMES)
-    camera = with_lens(pinhole, "" if model == "rectified" else model, _coefficients(found, model))
-    return Calibration(camera, None, "", origin)
+        raise ValueError(f"it has no {', '.join(prefix + name for name, value in found.items() if value is None)}")
+    note = ""
+    if own.number((_OF_NERFSTUDIO,)) is not None and max(intrinsics[2:]) > 1:
+        intrinsics[2:] = [value - _CORNER_TO_CENTRE_PX for value in intrinsics[2:]]
+        note = ", its pixels counted from the corner, as in nerfstudio"
+    whole = Fields(tree)
+    levels = [own, whole] if prefix or next(whole.nodes(_INTRINSICS["fx"]), None) is None else [whole]
+    size, size_note = size_of(levels, intrinsics, image_size)
+    pinhole, origin = pinhole_of(intrinsics, size, image_size)
+    camera, lens_note = lens_of(pinhole, levels, model_in(levels))
+    return Calibration(camera, depth_scale_mm(levels), note + size_note + lens_note, origin)
 
 
-def pairs_in(text: str) -> dict[str, str] | None:
+def _places(tree: Tree) -> list[tuple[Fields, str]]:
+    """Return where a tree may have its intrinsics, and with which prefix: within it, at its top, as ORB-SLAM does."""
+    top = Fields(tree)
+    prefixed = [
+        ({name.removeprefix(prefix): node for name, node in tree.items() if name.startswith(prefix)}, prefix)
+        for prefix in _PREFIXES
+    ]
+    return [(level, "") for level in (*top.inner(INNER), top)] + [(Fields(part), prefix) for part, prefix in prefixed]
+
+
+def pairs_in(text: str) -> dict[str, Any] | None:
     """Return names and values of `name: value` or `name=value`, on lines of their own or separated by , or ;.
 
     None where there is anything else but comments.
     """
-    pairs: dict[str, str] = {}
+    pairs: dict[str, Any] = {}
     lines = (line.partition("#")[0] for line in text.splitlines() if line.strip())
     for part in (part.strip() for line in lines for part in re.split("[,;]", line)):
         name, separator, value = part.partition("=" if "=" in part else ":")
@@ -57,24 +76,8 @@ def pairs_in(text: str) -> dict[str, str] | None:
         if part and (not separator or not name.strip() or value[:1] in _NO_VALUES):
             return None
         if part:
-            if name.strip() in pairs:
-                raise ValueError(f"{name.strip()[:40]!r} stands in it twice: leave one out")
-            pairs[name.strip()] = value
+            pairs[name.strip()] = Repeated() if name.strip() in pairs else value
     return pairs or None
-
-
-def _coefficients(found: dict[str, float | None], model: str) -> list[float]:
-    """Return the coefficients in OpenCV's order of the model; `ValueError` where their names do not tell the model."""
-    radial = [found[name] or 0.0 for name in _RADIAL]
-    tangential = [found[name] or 0.0 for name in _TANGENTIAL]
-    if _KANNALA_BRANDT.search(model):
-        if any(tangential) or any(radial[4:]):
-            raise ValueError("a Kannala-Brandt lens has k1 k2 k3 k4 alone, found others, too")
-        return radial[:4]
-    if not model and radial[3] and not any(found[name] is not None for name in _TANGENTIAL):
-        raise ValueError("it has k4 but no p1, and names no model: OpenCV's or a fisheye's? add `model: fisheye`")
-    terms = [*radial[:2], *tangential, *radial[2:]]
-    return terms if any(terms[5:]) else terms[:5] if terms[4] else terms[:4]
 
 
 def numbers_of_pairs(text: str) -> dict[str, float]:

@@ -10,82 +10,74 @@ from dataclasses import replace
 
 import numpy as np
 
-from scopemap.calibration.stated import (
-    LARGEST_SIDE_PX,
-    MOST_TERMS,
-    Calibration,
-    Size,
-    intrinsics_of,
-    pinhole_of,
-    with_lens,
-)
-from scopemap.calibration.trees import Tree, number, numbers, words
+from scopemap.calibration.distortion import coefficients_in, model_in
+from scopemap.calibration.fields import Fields
+from scopemap.calibration.lens_models import with_lens
+from scopemap.calibration.sizes import size_of
+from scopemap.calibration.stated import LARGEST_SIDE_PX, MOST_TERMS, Calibration, Size, intrinsics_of, pinhole_of
+from scopemap.calibration.trees import Tree
 from scopemap.camera import CameraModel, PinholeCamera
 from scopemap.lenses import OmnidirectionalCamera
 
 _MATRIX_NAMES = (
-    "camera_matrix", "K", "K1", "M1", "M", "Camera_Matrix", "cameraMatrix", "cam_K", "intrinsic_matrix", "KL", "mtx",
-    "k",
-)  # fmt: skip
-_DISTORTION_NAMES = (
-    "distortion_coefficients", "D", "D1", "K_dist", "Distortion_Coefficients", "distCoeffs", "dist", "DL", "d",
-)  # fmt: skip
-_WIDTH_NAMES = ("image_width", "image_Width", "width", "w", "cols", "Camera.width")
-_HEIGHT_NAMES = ("image_height", "image_Height", "height", "h", "rows", "Camera.height")
-_SIZE_NAMES = ("image_size", "image_Size", "imageSize", "img_size", "resolution")
-_MODEL_NAMES = ("camera_model", "distortion_model", "model", "model_type", "Camera.type")
+    *("camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1"),
+    *("intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics"),
+)
+INNER = ("intrinsics", "projection_parameters", "camera_intrinsics", "intrinsic")
+"""Names under which some files put what others have at their top."""
 _OMNIDIRECTIONAL = ("omnidirectional", "scaramuzza")
+
+
+def has_matrix(tree: Tree) -> bool:
+    """Whether nine numbers stand under a usual name of the camera matrix."""
+    return _matrix(Fields(tree)) is not None
 
 
 def of_matrices(tree: Tree, image_size: Size) -> Calibration:
     """Return the camera of a tree with a camera matrix; `ValueError` where there is none or it cannot be."""
-    matrix = numbers(tree, _MATRIX_NAMES)
-    if matrix is None or len(matrix) != 9:
-        raise ValueError("it has no 3x3 camera matrix under any usual name (camera_matrix, K)")
+    fields = Fields(tree)
+    matrix = _matrix(fields)
+    if matrix is None:
+        raise ValueError("it has no 3x3 camera matrix under any usual name (camera_matrix, K), and no fx fy cx cy")
     if not any(matrix):
         raise ValueError("its camera matrix is all zero, which ROS writes for a camera that was not calibrated")
-    intrinsics = intrinsics_of(np.reshape(matrix, (3, 3)))
-    pinhole, origin = pinhole_of(intrinsics, size_of(tree), image_size)
-    coefficients = numbers(tree, _DISTORTION_NAMES) or []
-    model = words(tree, _MODEL_NAMES)
-    if number(tree, ("fisheye_model", "fisheye")):
-        model += " fisheye"
-    note = ""
+    intrinsics, matrix_note = intrinsics_of(np.reshape(matrix, (3, 3)))
+    levels = [fields, *fields.inner(INNER)]
+    size, size_note = size_of(levels, intrinsics, image_size)
+    pinhole, origin = pinhole_of(intrinsics, size, image_size)
+    model = model_in(levels)
     if any(word in model for word in _OMNIDIRECTIONAL):
-        camera: CameraModel = _omnidirectional(tree, pinhole)
+        camera: CameraModel = _omnidirectional(fields, pinhole)
+        lens_note = ""
     else:
-        camera = with_lens(pinhole, model, coefficients)
-        if not model and len(coefficients) == 4 and any(coefficients):
-            note = ", its four coefficients taken as k1 k2 p1 p2 (no model is named)"
-    calibration = Calibration(camera, _depth_scale_mm(tree), note, origin)
-    return _read_out(tree, calibration)
+        camera, lens_note = lens_of(pinhole, levels, model)
+    calibration = Calibration(camera, depth_scale_mm(levels), matrix_note + size_note + lens_note, origin)
+    return _read_out(fields, calibration)
 
 
-def size_of(tree: Tree) -> Size | None:
-    """Return the size (width, height), px, that a tree states, None where it states none; `ValueError` for half a size.
-
-    Zeros, which ROS writes for what it does not know, are no size.
-    """
-    pair = numbers(tree, _SIZE_NAMES)
-    width, height = pair if pair and len(pair) == 2 else (number(tree, _WIDTH_NAMES), number(tree, _HEIGHT_NAMES))
-    if not width and not height:
-        return None
-    if not width or not height:
-        raise ValueError("it states one of width and height, but not both")
-    if not (1 <= width <= LARGEST_SIDE_PX and 1 <= height <= LARGEST_SIDE_PX) or width % 1 or height % 1:
-        raise ValueError(f"its size is {width:g}x{height:g} px, which no image has")
-    return int(width), int(height)
+def lens_of(pinhole: PinholeCamera, levels: list[Fields], model: str) -> tuple[CameraModel, str]:
+    """Return the camera with the lens in the levels of a tree, and a note on what was assumed of it."""
+    coefficients, is_list = coefficients_in(levels, model)
+    camera, note = with_lens(pinhole, model, coefficients)
+    if is_list and not model and len(coefficients) == 4 and any(coefficients):
+        note = ", its four coefficients taken as k1 k2 p1 p2 (no model is named)"
+    return camera, note
 
 
-def _depth_scale_mm(tree: Tree) -> float | None:
-    scale_mm = number(tree, ("depth_scale",))
+def depth_scale_mm(levels: list[Fields]) -> float | None:
+    """Return mm per unit of the depth files, None where it is not said; `ValueError` where it is not positive."""
+    scale_mm = next((scale for level in levels if (scale := level.number(("depth_scale",))) is not None), None)
     if scale_mm is not None and scale_mm <= 0:
         raise ValueError(f"depth_scale, mm per unit of the depth files, must be positive, found {scale_mm:g}")
     return scale_mm
 
 
-def _omnidirectional(tree: Tree, pinhole: PinholeCamera) -> OmnidirectionalCamera:
-    polynomial, stretch = numbers(tree, ("polynomial",)), numbers(tree, ("stretch",)) or [1.0, 0.0, 0.0]
+def _matrix(fields: Fields) -> list[float] | None:
+    return fields.numbers(_MATRIX_NAMES, 9)
+
+
+def _omnidirectional(fields: Fields, pinhole: PinholeCamera) -> OmnidirectionalCamera:
+    polynomial, stretch = fields.numbers(("polynomial",)), fields.numbers(("stretch",)) or [1.0, 0.0, 0.0]
     if polynomial is None or len(polynomial) > MOST_TERMS:
         raise ValueError(f"it is omnidirectional but has no 'polynomial' of up to {MOST_TERMS} numbers")
     if len(stretch) != 3:
@@ -111,11 +103,10 @@ def read_out(camera: CameraModel, region: tuple[int, int, int, int], binning: tu
     return camera.cropped(x, y, columns * across, rows * down).resized(columns, rows)
 
 
-def _read_out(tree: Tree, calibration: Calibration) -> Calibration:
-    roi = tree.get("roi")
-    roi = roi if isinstance(roi, dict) else {}
+def _read_out(fields: Fields, calibration: Calibration) -> Calibration:
+    roi = next(fields.inner(("roi",)), Fields({}))
     region = (_whole(roi, "x_offset"), _whole(roi, "y_offset"), _whole(roi, "width"), _whole(roi, "height"))
-    camera = read_out(calibration.camera, region, (_whole(tree, "binning_x"), _whole(tree, "binning_y")))
+    camera = read_out(calibration.camera, region, (_whole(fields, "binning_x"), _whole(fields, "binning_y")))
     if camera is calibration.camera:
         return calibration
     if calibration.size_origin != "stated":
@@ -124,8 +115,8 @@ def _read_out(tree: Tree, calibration: Calibration) -> Calibration:
     return replace(calibration, camera=camera, source=f"{calibration.source}, its region and binning of {sensor} taken")
 
 
-def _whole(tree: Tree, name: str) -> int:
-    value = number(tree, (name,)) or 0.0
+def _whole(fields: Fields, name: str) -> int:
+    value = fields.number((name,)) or 0.0
     if value % 1 or not 0 <= value <= LARGEST_SIDE_PX:
         raise ValueError(f"{name} must be a whole number of pixels, found {value:g}")
     return int(value)

@@ -8,7 +8,8 @@ import numpy as np
 
 from scopemap.calibration import ocamcalib
 from scopemap.calibration.contents import calibration_text
-from scopemap.calibration.stated import Calibration, Size, intrinsics_of, pinhole_of, with_lens
+from scopemap.calibration.lens_models import with_lens
+from scopemap.calibration.stated import Calibration, Size, intrinsics_of, pinhole_of
 from scopemap.camera import PinholeCamera
 from scopemap.errors import CalibrationError
 
@@ -38,16 +39,16 @@ def of_rows(rows: list[list[float]], image_size: Size) -> Calibration:
     if not np.isfinite(values).all():
         raise ValueError("it holds NaN or infinity")
     if _is_matrix(rows, values):
-        intrinsics, coefficients = intrinsics_of(_matrix(values)), []
+        (intrinsics, note), coefficients = intrinsics_of(_matrix(values)), []
     elif len(values) in _LINE_COUNTS:
-        intrinsics, coefficients = (values[0], values[1], values[2], values[3]), values[4:]
+        note, intrinsics, coefficients = "", (values[0], values[1], values[2], values[3]), values[4:]
     else:
         raise ValueError(
             f"it holds {len(values)} numbers: expected fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or a camera matrix "
             "of 3x3, 3x4 or 4x4"
         )
     pinhole, origin = pinhole_of(intrinsics, None, image_size)
-    return Calibration(with_lens(pinhole, "", coefficients), None, "", origin)
+    return Calibration(with_lens(pinhole, "", coefficients)[0], None, note, origin)
 
 
 def read_intrinsics(file: Path, size: Size) -> PinholeCamera:
@@ -66,7 +67,7 @@ def read_intrinsics(file: Path, size: Size) -> PinholeCamera:
         )
     K = _matrix(numbers)
     try:
-        fx, fy, cx, cy = intrinsics_of(K)
+        (fx, fy, cx, cy), _ = intrinsics_of(K)
     except ValueError as error:
         raise CalibrationError(f"the intrinsics {file}: {error}") from None
     width, height = size
@@ -83,8 +84,9 @@ def _is_matrix(rows: list[list[float]], values: list[float]) -> bool:
     if len(values) not in _MATRIX_SHAPES:
         return False
     height, width = _MATRIX_SHAPES[len(values)]
-    last = [values[width], *values[2 * width : 2 * width + 3]]
-    return height == 4 or [len(row) for row in rows] == [width] * height or last == [0, 0, 0, 1]
+    K = np.reshape(values, (height, width))[:, :3]
+    is_one = any([M[1, 0], *M[2]] == [0, 0, 0, 1] for M in (K, K.T) if M.shape == (3, 3))
+    return height == 4 or [len(row) for row in rows] == [width] * height or is_one
 
 
 def _matrix(values: list[float] | np.ndarray) -> np.ndarray:

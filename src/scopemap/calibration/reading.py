@@ -9,7 +9,7 @@ from scopemap.calibration import colmap, kalibr, named_numbers, plain_numbers
 from scopemap.calibration.calibu import of_calibu
 from scopemap.calibration.contents import calibration_bytes, calibration_text
 from scopemap.calibration.fitting import fitted
-from scopemap.calibration.opencv import of_matrices
+from scopemap.calibration.opencv import has_matrix, of_matrices
 from scopemap.calibration.stated import Calibration, Size
 from scopemap.calibration.stereo_ini import is_stereo_ini, of_stereo_ini
 from scopemap.calibration.trees import read_tree
@@ -73,7 +73,7 @@ def _of_tree(text: str, image_size: Size) -> Calibration:
         return of_matrices(inner, image_size)
     cameras = kalibr.cameras_in(tree)
     if cameras:
-        return kalibr.of_chain(cameras, image_size)
-    if named_numbers.has_names(tree):
+        return kalibr.of_chain(tree, cameras, image_size)
+    if not has_matrix(tree) and named_numbers.has_names(tree):
         return named_numbers.of_names(tree, image_size)
     return of_matrices(tree, image_size)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from scopemap.camera import CameraModel, PinholeCamera
-from scopemap.lenses import FisheyeCamera, FovCamera, OpenCvCamera
 
 Size: TypeAlias = tuple[int, int]
 SizeOrigin: TypeAlias = Literal["stated", "images", "relative"]
@@ -19,13 +17,8 @@ SizeOrigin: TypeAlias = Literal["stated", "images", "relative"]
 LARGEST_SIDE_PX = 100_000
 MOST_TERMS = 20
 _LONGEST_RELATIVE_FOCAL = 10.0
-_MOST_SKEW = 1e-3
-_FISHEYE = re.compile(r"fisheye|\bequi(distant)?\b|kannala|kb4")
-_FOV = re.compile(r"\bfov\b")
-# Every other word for what a lens is refused by name where it has coefficients.
-_RADIAL_TANGENTIAL = re.compile(
-    r"opencv|pinhole|perspective|plumb_?bob|radtan|radial-tangential|brown(-?conrady)?|rational(_polynomial)?"
-)
+# A skew is passed over up to the first share of the focal length, with a note up to the second.
+_SLIGHT_SKEW, _MOST_SKEW = 1e-3, 1e-2
 
 
 @dataclass(frozen=True)
@@ -68,44 +61,27 @@ def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Siz
     return PinholeCamera(fx, fy, cx, cy, width, height), "stated" if stated else "images"
 
 
-def intrinsics_of(K: np.ndarray) -> tuple[float, float, float, float]:
-    """Return fx fy cx cy of a camera matrix (3, 3); `ValueError` where it is none, or is skewed.
+def intrinsics_of(K: np.ndarray) -> tuple[tuple[float, float, float, float], str]:
+    """Return fx fy cx cy of a camera matrix (3, 3), and a note on what was done; `ValueError` where it is none.
 
-    A skew of up to a thousandth of the focal length, as calibrations leave it, is passed over.
+    The transposed matrix, as MATLAB and Open3D write it, is turned. A skew of up to a hundredth of the focal length is
+    passed over.
     """
-    (fx, skew, cx), (zero, fy, cy) = K[:2].tolist()
-    if not np.allclose([zero, *K[2]], [0, 0, 0, 1]):
+    note = ""
+    if _is_camera_matrix(K.T) and not _is_camera_matrix(K):
+        K, note = K.T, ", its matrix transposed"
+    if not _is_camera_matrix(K):
         raise ValueError(f"its matrix is no camera matrix [fx 0 cx; 0 fy cy; 0 0 1], found {_rows(K)}")
+    (fx, skew, cx), (_, fy, cy) = K[:2].tolist()
     if abs(skew) > _MOST_SKEW * abs(fx):
         raise ValueError(f"its camera matrix has a skew of {skew:g}, which no camera here has")
-    return fx, fy, cx, cy
+    if abs(skew) > _SLIGHT_SKEW * abs(fx):
+        note += f", its skew of {skew:g} px left out"
+    return (fx, fy, cx, cy), note
 
 
-def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float]) -> CameraModel:
-    """Return the camera with the lens that `model` names, in anyone's words, "" where nothing is said: OpenCV's.
-
-    Raises `ValueError` for a model that has no counterpart here, and for coefficients that are not its.
-    """
-    if len(coefficients) > MOST_TERMS:
-        raise ValueError(f"it has {len(coefficients)} distortion coefficients, more than any lens")
-    words, lens = model.lower().strip(), tuple(float(k) for k in coefficients)
-    if _FISHEYE.search(words):
-        return FisheyeCamera(pinhole, lens)
-    if _FOV.search(words):
-        if len(lens) != 1:
-            raise ValueError(f"a lens of the model fov has one coefficient, found {len(lens)}")
-        return FovCamera(pinhole, lens[0]) if lens[0] else pinhole
-    if not any(lens):
-        return pinhole
-    unknown = [word for word in words.split() if not _RADIAL_TANGENTIAL.fullmatch(word)]
-    if unknown:
-        raise ValueError(
-            f"the lens model {' '.join(unknown)[:40]!r} has no counterpart here: calibrate as pinhole with "
-            "radial-tangential or equidistant (fisheye) coefficients"
-        )
-    if len(lens) in (12, 14) and any(lens[8:]):
-        raise ValueError("the thin-prism and tilt coefficients s1 ... have no counterpart here: calibrate without them")
-    return OpenCvCamera(pinhole, lens[:8] if len(lens) in (12, 14) else lens)
+def _is_camera_matrix(K: np.ndarray) -> bool:
+    return np.allclose([K[1, 0], *K[2]], [0, 0, 0, 1])
 
 
 def _rows(K: np.ndarray) -> str:

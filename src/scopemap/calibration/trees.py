@@ -1,7 +1,8 @@
 """Trees of names, lists and words: what YAML, JSON and OpenCV's XML have in common, read within limits.
 
 A tree is a dict by name, a list, or a leaf (text or number). OpenCV's own parser is not used: nested deeply, a file of
-300 kB makes it take all memory there is. Anchors may stand, aliases may not, so that nothing grows.
+300 kB makes it take all memory there is. Aliases may stand for flat lists of numbers
+alone, so that nothing grows.
 """
 
 from __future__ import annotations
@@ -34,44 +35,21 @@ def read_tree(text: str) -> Any:
     if start in ("{", "["):
         try:
             return json.loads(text, object_pairs_hook=_mapping, parse_int=float)
-        except json.JSONDecodeError:
-            pass  # OpenCV wrote numbers such as 318. into its JSON, which YAML allows
+        except json.JSONDecodeError as error:  # OpenCV wrote numbers such as 318. into its JSON, which YAML allows
+            return _yaml(text, f"it is no JSON: {error}")
         except RecursionError:
             raise ValueError("it is nested deeper than any calibration") from None
     return _yaml(text)
 
 
-def number(tree: Tree, names: Iterable[str]) -> float | None:
-    """Return the first of `names` that is there, None where none is; `ValueError` where it is no finite number."""
-    return next((as_number(tree[name], name) for name in names if name in tree), None)
-
-
-def numbers(tree: Tree, names: Iterable[str]) -> list[float] | None:
-    """Return the first of `names` that holds several numbers: a list, rows of them, OpenCV's or ROS' matrix.
-
-    None where none does. Raises `ValueError` for what is in it that is no finite number, and for a wrong count.
-    """
-    for name in names:
-        node = tree.get(name)
-        counts = [node.get(side) for side in ("rows", "cols")] if isinstance(node, dict) else [None]
-        node = node.get("data") if isinstance(node, dict) else node
-        node = node.split() if isinstance(node, str) else node
-        if isinstance(node, list) and (len(node) > 1 or not isinstance(tree[name], str)):
-            cells = [cell for row in node for cell in (row if isinstance(row, list) else [row])]
-            found = [as_number(cell, name) for cell in cells]
-            if None not in counts and math.prod(as_number(count, name) for count in counts) != len(found):
-                raise ValueError(f"{name} holds {len(found)} numbers, but should be {counts[0]}x{counts[1]}")
-            return found
-    return None
-
-
-def words(tree: Tree, names: Iterable[str]) -> str:
-    """Return the texts that stand under `names`, in lower case."""
-    return " ".join(tree[name].strip().strip("\"'").lower() for name in names if isinstance(tree.get(name), str))
+class Repeated:
+    """What stands in place of a name's content where the name comes again: an error for whoever asks for it."""
 
 
 def as_number(node: Any, name: str) -> float:
     """Return a leaf as a number; `ValueError` where it is none, NaN or infinity."""
+    if isinstance(node, Repeated):
+        raise ValueError(f"{name[:_LONGEST_QUOTE]!r} stands in it twice: leave one out")
     try:
         value = math.nan if isinstance(node, bool) else float(node)
     except (TypeError, ValueError, OverflowError):
@@ -81,30 +59,51 @@ def as_number(node: Any, name: str) -> float:
     return value
 
 
-def _yaml(text: str) -> Any:
+def _yaml(text: str, fault: str = "") -> Any:
+    """Return the tree in YAML; `fault` is the error where it is none, "": the parser's own."""
     # OpenCV's first line, %YAML:1.0, is no YAML, and later versions than a parser's own make it stop.
     text = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     open_nodes: list[list[Any]] = [[]]
+    open_anchors: list[str | None] = []
+    anchored: dict[str | None, Any] = {}
+    repeated = 0
     try:
         for count, event in enumerate(yaml.parse(text, Loader=_YAML_LOADER)):
-            if count > _MOST_NODES or len(open_nodes) > _DEEPEST:
+            if count + repeated > _MOST_NODES or len(open_nodes) > _DEEPEST:
                 raise ValueError("it is larger or nested deeper than any calibration")
             if isinstance(event, yaml.AliasEvent):
-                raise ValueError(f"it holds the alias *{event.anchor}, which no calibration needs: write it out")
-            if isinstance(event, yaml.ScalarEvent):
+                node = anchored.get(event.anchor, ())
+                if not _is_flat(node):
+                    raise ValueError(f"it holds the alias *{event.anchor} of no list of numbers: write it out")
+                repeated += len(node)
+                open_nodes[-1].append(node)
+            elif isinstance(event, yaml.ScalarEvent):
                 open_nodes[-1].append(event.value)
             elif isinstance(event, yaml.SequenceStartEvent | yaml.MappingStartEvent):
                 open_nodes.append([])
+                open_anchors.append(event.anchor)
             elif isinstance(event, yaml.SequenceEndEvent):
                 open_nodes[-2].append(open_nodes.pop())
+                anchored[open_anchors.pop()] = open_nodes[-1][-1]
             elif isinstance(event, yaml.MappingEndEvent):
                 flat = open_nodes.pop()
+                anchored.pop(open_anchors.pop(), None)
                 open_nodes[-1].append(_mapping(zip(flat[::2], flat[1::2], strict=True)))
             elif isinstance(event, yaml.DocumentEndEvent):
                 break  # a recorded topic repeats itself
     except yaml.YAMLError as error:
-        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise ValueError(fault or f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
     return open_nodes[0][0] if open_nodes[0] else None
+
+
+def _is_flat(node: Any) -> bool:
+    """Whether a node is a list of numbers alone, which an alias may repeat: it grows by its own length only."""
+    if not isinstance(node, list):
+        return False
+    try:
+        return all(isinstance(cell, str) and math.isfinite(float(cell)) for cell in node)
+    except ValueError:
+        return False
 
 
 def _mapping(pairs: Iterable[tuple[Any, Any]]) -> Tree:
@@ -112,9 +111,7 @@ def _mapping(pairs: Iterable[tuple[Any, Any]]) -> Tree:
     for name, node in pairs:
         if not isinstance(name, str):
             continue
-        if name in tree:
-            raise ValueError(f"{name[:_LONGEST_QUOTE]!r} stands in it twice: leave one out")
-        tree[name] = node
+        tree[name] = Repeated() if name in tree else node
     return tree
 
 

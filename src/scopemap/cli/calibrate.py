@@ -16,14 +16,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from scopemap.cli.figures import without_nan
-from scopemap.cli.options import AsJson, Quiet, parse_slice
+from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_slice
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from scopemap.boards import Board, BoardCalibration
+    from scopemap.config import InputSettings
 
 _ENDINGS = (".yaml", ".yml")
+# All else about the input is for runs: the camera is not known yet, and frames are chosen by --frames and --every.
+_SETTINGS = ("input.stereo", "input.deinterlace")
 
 
 class ModelChoice(StrEnum):
@@ -62,6 +65,12 @@ def calibrate(
         str | None,
         typer.Option(help="Name of a reader (see `scopemap datasets list`); told from what lies there if left out."),
     ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help=f"How pictures are read: {_SETTINGS[0]}=..., {_SETTINGS[1]}=true."
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier calibration.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -69,22 +78,24 @@ def calibrate(
     """Calibrate the camera with a board held before it; the file serves every command as --camera."""
     picture = _prepared(out, overwrite)
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
-    selection = parse_slice(frames) if frames else None
+    selection, reading = parse_slice(frames) if frames else None, _reading(settings or [])
     # Imported here, so that --help does not wait for it.
     from scopemap import boards
     from scopemap.boards.picture import draw_calibration
-    from scopemap.datasets import open_sequence
+    from scopemap.datasets import open_source
 
     silent = quiet or as_json
-    sequence = open_sequence(source, dataset=dataset, frames=selection)
+    pictures = open_source(source, dataset=dataset, settings=reading)
     with count_progress("looking for the board", "looked at", silent=silent) as listener:
-        search = boards.find_views(sequence, target, every, listener)
+        search = boards.find_views(pictures, target, selection, every, listener)
     if not silent:
         typer.echo(f"the board was found in {len(search.views)} of {search.looked_at} frames; fitting", err=True)
-    done = boards.calibrate(search, target, model.value, sequence.source.pixel_aspect)
+    done = boards.calibrate(search, target, model.value, pictures.pixel_aspect)
     boards.save_calibration(done, out)
-    draw_calibration(done, boards.picture_of(done.example, sequence, search.every), picture)
-    for warning in [] if quiet else [*sequence.warnings, *done.warnings]:
+    draw_calibration(done, boards.picture_of(done.example, pictures, search), picture)
+    for note in [] if silent else pictures.notes:
+        typer.echo(f"note: {note}", err=True)
+    for warning in [] if quiet else [*pictures.warnings, *done.warnings]:
         typer.echo(f"warning: {warning}", err=True)
     if as_json:
         looked = {"looked_at": search.looked_at, "every": search.every, "found": len(search.views)}
@@ -106,6 +117,16 @@ def _prepared(out: Path, overwrite: bool) -> Path:
     if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
         raise InputError(f"writing the calibration: the folder {out.parent} is not there or not writable")
     return picture
+
+
+def _reading(pairs: list[str]) -> InputSettings:
+    from scopemap.config import Config
+
+    chosen = parse_settings(pairs)
+    other = [key for key in chosen if key not in _SETTINGS]
+    if other:
+        raise SettingsError(f"the setting '{other[0]}' has no part in a calibration: only {' and '.join(_SETTINGS)} do")
+    return Config.load(settings=chosen).input
 
 
 def _board(

@@ -11,7 +11,7 @@ import typer
 
 from scopemap.cli.figures import OutputForm, show
 from scopemap.cli.options import AsJson
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import CalibrationError, InputError, SettingsError
 
 if TYPE_CHECKING:
     from scopemap.datasets import Sequence
@@ -141,10 +141,13 @@ def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp
             raise InputError("--icp needs a run's mesh.ply and a folder with a true surface")
         return {}
     from scopemap.benchmark.scoring import surface_figures_of
+    from scopemap.benchmark.truth import open_truth
     from scopemap.datasets import open_sequence
 
     try:
         place: Sequence | Path = open_sequence(truth)
+    except CalibrationError:  # the run's user knew better
+        place = open_truth(trajectory, truth)
     except InputError:  # poses and a surface, but no frames that would tell what was seen of it
         place = truth
     found = surface_figures_of(trajectory, place, matched.similarity, icp=icp)

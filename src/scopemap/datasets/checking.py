@@ -31,10 +31,12 @@ _FOCAL_WIDTHS = (0.2, 5.0)
 _MIDDLE = (0.25, 0.75)
 _ASPECT_TOLERANCE = 0.1
 _JUMP, _JUMP_DEG = 10.0, 30.0
+_SMALLEST_JUMP_MM, _AROUND = 0.5, 5
 _LARGEST_STEP_MM, _LARGEST_EXTENT_MM = 50.0, 10_000.0
 _SMALLEST_STEP_MM, _SMALLEST_EXTENT_MM = 0.005, 1.0
 _STILL_MM, _STILL_RAD = 1e-6, 1e-6
 _DEPTH_MM = (1.0, 1000.0)
+_ROOMS, _ROOM_MM = ("7-scenes", "tum"), 10_000.0
 _MOST_UNKNOWN = 0.95
 _COARSE = 256
 _COUNTED_IN = 4 * _COARSE
@@ -187,7 +189,7 @@ def check_path(survey: Survey) -> list[Finding]:
         return [Finding("warning", "pose-still", "the camera does not move: all poses are the same")]
     moving_mm = steps_mm[steps_mm > 0]
     median_mm = float(np.median(moving_mm)) if moving_mm.size else 0.0
-    far = numbers[1:][steps_mm > _JUMP * median_mm].tolist()
+    far = numbers[1:][_jumps(steps_mm, median_mm)].tolist()
     turned = numbers[1:][turns_rad > np.radians(_JUMP_DEG)].tolist()
     return [
         *_path_unit(median_mm, extent),
@@ -210,7 +212,7 @@ def check_depth(survey: Survey) -> list[Finding]:
         *_about(flat, "depth-constant", "depth is the same everywhere: {}"),
         *_about([i for i, d in full if _is_coarse(d)], "depth-coarse",
                 f"depth has fewer than {_COARSE} different values, as of 8 bit or whole units: {{}}"),
-        *_depth_unit([depth.median_mm for _, depth in full]),
+        *_depth_unit([depth.median_mm for _, depth in full], survey.dataset in _ROOMS),
         *_about(_of_another_depth(full), "depth-jump",
                 f"the median depth is {_OTHER_DEPTH_TIMES:g} times that of the others, or a {_OTHER_DEPTH_TIMES:g}th: "
                 "{}, of another unit?"),
@@ -290,6 +292,18 @@ def _better(agreement: Agreement) -> list[Finding]:
     return [Finding("error", OTHERS[best].code, f"the poses look like {OTHERS[best].looks_like}: {fits}")]
 
 
+def _jumps(steps_mm: np.ndarray, usual_mm: float) -> np.ndarray:
+    """Return where a step (n,) is far longer than is usual, and than those around it.
+
+    A camera at rest trembles by micrometres: when it moves off, all its steps are far longer than is usual.
+    """
+    far = steps_mm > max(_JUMP * usual_mm, _SMALLEST_JUMP_MM)
+    for at in np.flatnonzero(far):
+        around_mm = steps_mm[max(at - _AROUND, 0) : at + _AROUND + 1]
+        far[at] = steps_mm[at] > _JUMP * np.median(around_mm)
+    return far
+
+
 def _path_unit(median_mm: float, extent: float) -> list[Finding]:
     size = f"steps of {median_mm:.2g} mm, {extent:.2g} mm from end to end"
     if median_mm > _LARGEST_STEP_MM or extent > _LARGEST_EXTENT_MM:
@@ -299,10 +313,12 @@ def _path_unit(median_mm: float, extent: float) -> list[Finding]:
     return []
 
 
-def _depth_unit(medians_mm: list[float]) -> list[Finding]:
+def _depth_unit(medians_mm: list[float], is_room: bool) -> list[Finding]:
     median_mm = float(np.median(medians_mm)) if medians_mm else _DEPTH_MM[0]
     if _DEPTH_MM[0] <= median_mm <= _DEPTH_MM[1]:
         return []
+    if is_room and _DEPTH_MM[1] < median_mm <= _ROOM_MM:
+        return [Finding("info", "depth-unit", f"a median depth of {median_mm:.4g} mm is that of a room: no endoscopy")]
     unit = "metres" if median_mm < _DEPTH_MM[0] else "micrometres, or no endoscopy"
     return [Finding("warning", "depth-unit", f"a median depth of {median_mm:.4g} mm looks like {unit}")]
 

@@ -22,10 +22,13 @@ import numpy as np
 from scopemap.decoding import check_pixels
 from scopemap.errors import InputError, ScopemapError
 
-_PREAMBLE, _MAGIC, _META_GROUP = 128, b"DICM", b"\x02\x00"
+_PREAMBLE, _MAGIC, _META_GROUP, _META_BYTES = 128, b"DICM", b"\x02\x00", 512
+# The SOP class of a list of what a medium holds, as an element of the file's own header.
+_INDEX = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
 _IMPLICIT, _EXPLICIT, _DEFLATED = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99"
 _RLE = "1.2.840.10008.1.2.5"
-_JPEG = {f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 90, 91)}
+_BASELINE = {f"1.2.840.10008.1.2.4.{number}" for number in (50, 51)}
+_JPEG = _BASELINE | {f"1.2.840.10008.1.2.4.{number}" for number in (90, 91)}
 _MPEG = {f"1.2.840.10008.1.2.4.{number}" for number in range(100, 109)} | {
     f"1.2.840.10008.1.2.4.{number}.1" for number in range(100, 107)
 }
@@ -38,6 +41,7 @@ _SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e5
 _TAGS = (
     *("Rows", "Columns", "NumberOfFrames", "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration"),
     *("BitsAllocated", "BitsStored", "PixelRepresentation", "PixelAspectRatio", "BurnedInAnnotation"),
+    *("WindowCenter", "WindowWidth", "VOILUTFunction", "RescaleSlope", "RescaleIntercept"),
     *("FrameTime", "FrameTimeVector", "CineRate", "RecommendedDisplayFrameRate", "InstanceNumber", "SeriesInstanceUID"),
     *(
         f"{colour}PaletteColorLookupTable{part}"
@@ -78,6 +82,11 @@ class Header:
         return self.syntax in _MPEG
 
     @property
+    def is_jpeg(self) -> bool:
+        """Whether each picture is a JPEG, with a header of its own."""
+        return self.syntax in _BASELINE
+
+    @property
     def is_several(self) -> bool:
         """Whether the file holds more than one picture."""
         return self.is_video or self.frames + self.missing > 1
@@ -105,6 +114,23 @@ class Header:
             stated = [float(side) for side in _several(self.fields.get("PixelAspectRatio"))]
         # PS3.3, C.7.6.3.1.7: the vertical side comes first.
         return stated[1] / stated[0] if len(stated) == 2 and 0.1 < stated[1] / (stated[0] or np.nan) < 10 else None
+
+    @property
+    def window(self) -> tuple[float, float] | None:
+        """Lowest and highest stored level that are shown, of grey pictures; None where the file does not say.
+
+        PS3.3, C.11.1.1.2 (rescaling) and C.11.2.1.2.1 (linear window), solved for the stored level.
+        """
+        if not str(self.fields.get("PhotometricInterpretation", "")).startswith("MONOCHROME"):
+            return None
+        if str(self.fields.get("VOILUTFunction") or "LINEAR") != "LINEAR":
+            return None
+        with telling(self.path):
+            ends = (_several(self.fields.get(f"Window{name}")) for name in ("Center", "Width"))
+            centre, width = (float(values[0]) if values else np.nan for values in ends)
+            slope, intercept = (float(self.fields.get(f"Rescale{x}") or d) for x, d in (("Slope", 1), ("Intercept", 0)))
+        low, high = ((centre - 0.5 + side * (width - 1) / 2 - intercept) / (slope or np.nan) for side in (-1, 1))
+        return (low, high) if low < high and np.isfinite((low, high)).all() else None
 
     def clock(self) -> tuple[np.ndarray | None, float | None, str]:
         """Return times (frames,), s from the first, or None; pictures per second, or None; and which tag says so."""
@@ -138,19 +164,28 @@ def telling(path: Path) -> Iterator[None]:
 
 def is_dicom(file: Path) -> bool:
     """Whether a file is DICOM by its magic word, or without that by its ending."""
+    start = _start_of(file)
+    return start is not None and (start[_PREAMBLE:][:4] == _MAGIC or file.suffix.lower() == ".dcm")
+
+
+def is_index(file: Path) -> bool:
+    """Whether a file is the list of what a medium holds (PS3.3, F; PS3.10, 8.6), by its name or its SOP class."""
+    return file.name.upper() == "DICOMDIR" or _INDEX in (_start_of(file) or b"")
+
+
+def is_installed() -> bool:
+    """Whether the package `pydicom` is there."""
     try:
-        with file.open("rb") as stream:
-            return stream.read(_PREAMBLE + 4)[_PREAMBLE:] == _MAGIC or file.suffix.lower() == ".dcm"
-    except OSError:
+        import pydicom  # noqa: F401
+    except ImportError:
         return False
+    return True
 
 
 def require_pydicom(path: Path) -> None:
     """Raise `InputError` where the package `pydicom` is not installed."""
-    try:
-        import pydicom  # noqa: F401
-    except ImportError:
-        raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'") from None
+    if not is_installed():
+        raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'")
 
 
 def read_header(file: Path) -> Header:
@@ -170,8 +205,11 @@ def read_header(file: Path) -> Header:
         if min(rows, columns) < 1 or length is None:
             raise InputError(f"reading {file}: the DICOM file holds no pictures")
         if syntax not in {_IMPLICIT, _EXPLICIT, _RLE} | _JPEG | _MPEG:
+            # An unknown UID is its own name; it may hold anything.
+            known = syntax in pydicom.uid.UID_dictionary
+            way = f"as {pydicom.uid.UID(syntax).name[:60]}" if known else "in an unknown way"
             raise InputError(
-                f"reading {file}: pictures packed as {pydicom.uid.UID(syntax).name[:60]} are not read (native, RLE, "
+                f"reading {file}: pictures packed {way} are not read (native, RLE, "
                 "JPEG, JPEG 2000 and MPEG are); convert it first, for example with dcmconv or dcmdjpeg"
             )
         check_pixels(float(rows) * columns)
@@ -215,6 +253,17 @@ def fragments(header: Header) -> list[tuple[int, int]]:
             stream.seek(item + 4)
             found.append((item + 8, struct.unpack("<L", stream.read(4))[0]))
         return found
+
+
+def _start_of(file: Path) -> bytes | None:
+    """Return the first bytes; None of a file without permission, and of pipes: who opens one waits forever."""
+    try:
+        if not file.is_file():
+            return None
+        with file.open("rb") as stream:
+            return stream.read(_META_BYTES)
+    except OSError:
+        return None
 
 
 def _stated_syntax(file: Path, stream: BinaryIO) -> str:

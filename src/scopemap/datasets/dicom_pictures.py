@@ -14,20 +14,29 @@ from scopemap.errors import InputError
 _MONOCHROME = ("MONOCHROME1", "MONOCHROME2")
 _PALETTE = "PALETTE COLOR"
 _COLOUR = ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT")
+# Of JPEG frames the file's word for their colours is no more than that: their own headers say how they are stored.
+_PARTIAL = "YBR_PARTIAL_420"
+_NOT_READ = ("HSV", "ARGB", "CMYK", "YBR_PARTIAL_422", _PARTIAL, "XYB")
 # PackBits takes one byte in 128 more than it packs at worst (PS3.5, G.3.1), and there is a header.
 _RLE_OVERHEAD = 1.05
 _RLE_HEADER_BYTES = 1024
 
 
-def pictures(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | None]]:
+def pictures(
+    header: Header, wanted: range, window: tuple[float, float] | None = None
+) -> Iterator[tuple[int, np.ndarray | None]]:
     """Yield number, from 0, and picture (rows, columns, 3) uint8, of those `wanted`; None where it cannot be decoded.
 
-    One decoded picture is held at a time. Raises `InputError` for colours that are not read, and where a picture's own
+    window : lowest and highest level that are shown, of grey pictures; None: all that the stored bits can hold. One
+    decoded picture is held at a time. Raises `InputError` for colours that are not read, and where a picture's own
     header claims another size than the file's.
     """
     colours = str(header.fields.get("PhotometricInterpretation", ""))
+    if colours == _PARTIAL and header.is_jpeg:
+        colours = "YBR_FULL_422"
     if colours not in (*_MONOCHROME, _PALETTE, *_COLOUR):
-        raise InputError(f"reading {header.path}: colours stored as '{colours[:20]}' are not read")
+        way = f"as '{colours}'" if colours in _NOT_READ else "in an unknown way"
+        raise InputError(f"reading {header.path}: colours stored {way} are not read")
     for number, frame in enumerate(packed_frames(header)):
         if number >= min(wanted.stop, header.frames):
             return
@@ -38,15 +47,15 @@ def pictures(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | 
             continue
         try:
             with telling(header.path):
-                values, stored = _decoded(header, frame)
-                yielded = _eight_bit(header, values, colours, stored)
+                values, stored = _decoded(header, frame, colours)
+                yielded = _eight_bit(header, values, colours, stored, window)
         except InputError:
             yield number, None
         else:
             yield number, yielded
 
 
-def _decoded(header: Header, frame: bytes) -> tuple[np.ndarray, int]:
+def _decoded(header: Header, frame: bytes, colours: str) -> tuple[np.ndarray, int]:
     """Return the samples of one picture as stored or, of colours, as RGB; and how many bits of them count."""
     from pydicom.encaps import encapsulate
     from pydicom.pixels import get_decoder
@@ -62,7 +71,7 @@ def _decoded(header: Header, frame: bytes) -> tuple[np.ndarray, int]:
         "bits_allocated": allocated,
         "bits_stored": int(fields.get("BitsStored") or allocated),
         "pixel_representation": int(fields.get("PixelRepresentation") or 0),
-        "photometric_interpretation": str(fields.PhotometricInterpretation),
+        "photometric_interpretation": colours,
         "pixel_keyword": "PixelData",
     }
     if samples > 1:
@@ -98,7 +107,9 @@ def _is_sized(header: Header, frame: bytes, number: int) -> bool:
     return True
 
 
-def _eight_bit(header: Header, values: np.ndarray, colours: str, stored: int) -> np.ndarray:
+def _eight_bit(
+    header: Header, values: np.ndarray, colours: str, stored: int, window: tuple[float, float] | None
+) -> np.ndarray:
     if colours == _PALETTE:
         from pydicom.pixels import apply_color_lut
 
@@ -106,6 +117,9 @@ def _eight_bit(header: Header, values: np.ndarray, colours: str, stored: int) ->
         stored = 8 * values.dtype.itemsize
     if values.ndim == 2:
         values = np.repeat(values[..., None], 3, axis=2)
+    if window is not None:
+        low, high = window
+        values, stored = np.rint(255 * np.clip((values.astype(np.float32) - low) / (high - low), 0, 1)), 8
     if values.dtype.kind == "i":
         values = values.astype(np.int32) + (1 << (stored - 1))
     if stored > 8:

@@ -52,6 +52,7 @@ class EndoMapperSimFolder(ImageFolder):
         self._poses, self._times_s, fault = read_trajectory_csv(path / _TRAJECTORY)
         self.warnings += [fault] if fault else []
         if self._times_s:
+            self.stamped = True
             self.notes[0] = f"time stamps: those of {_TRAJECTORY}"
         self.notes += [
             f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "

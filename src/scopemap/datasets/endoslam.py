@@ -57,6 +57,7 @@ class EndoSlamFolder(ImageFolder):
         self.quality = "exact" if self._track is None else self._track.quality
         self._rate_hz, rate_source = _rate_hz(path, "UnityCam" if rendered else "HighCam" if file else "")
         stated = self._track is not None and self._track.times_s is not None
+        self.stamped = stated
         times = "those of the poses" if stated else f"image number / {self._rate_hz:g} s ({rate_source})"
         self.notes = [f"time stamps: {times}"]
         self._check_track(file)

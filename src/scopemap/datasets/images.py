@@ -67,8 +67,8 @@ def read_depth16(file: Path) -> np.ndarray | None:
 class ImageFolder(KnowsNothing):
     """A folder of images; the layouts of data sets build on it.
 
-    The calibration is `camera.yaml` in the folder, else beside the images, where it is there. Time stamps are frame
-    number / 30 s. Raises `InputError` where no image can be read.
+    The calibration is `camera.yaml` in the folder, else beside the images, where it is there; one that cannot be
+    read is its `camera_fault`. Time stamps are frame number / 30 s. Raises `InputError` where no image can be read.
     """
 
     name = "images"
@@ -85,7 +85,8 @@ class ImageFolder(KnowsNothing):
         own = (folder / _OWN_CALIBRATION for folder in (path, self.files[0].parent))
         calibration_file = next((file for file in own if file.is_file()), None)
         if calibration_file is not None:
-            self._take(stated_calibration(calibration_file, (self.width, self.height)))
+            with self._making_camera():
+                self._take(stated_calibration(calibration_file, (self.width, self.height)))
 
     @staticmethod
     def recognises(path: Path) -> bool:

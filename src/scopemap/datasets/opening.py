@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
@@ -20,7 +22,7 @@ from scopemap.datasets.frame_choice import FrameChoice
 from scopemap.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
 from scopemap.datasets.images import ImageFolder
 from scopemap.datasets.oneslam import OneSlamFolder
-from scopemap.datasets.permissions import check_readable
+from scopemap.datasets.permissions import hindrances, is_apart, may_enter
 from scopemap.datasets.prepared import UNKNOWN_MAKE, of_one_view, prepared
 from scopemap.datasets.rosbag import RosBag
 from scopemap.datasets.scared import ScaredKeyframe
@@ -66,6 +68,10 @@ DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
 """The readers by name, in the order in which they are asked whether they recognise an input."""
 
 _OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
+# Those that need nothing of what lies deeper in a folder.
+_WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
+_IMAGES = "images"
+_MOST_NAMED = 3
 _USUAL_FOV_DEG = 70.0
 _SMALLEST_SIDE_PX = 32
 _DEEPEST_NESTING = 3
@@ -94,14 +100,10 @@ def open_sequence(
     selection, settings = frames or slice(None), settings or InputSettings()
     if selection.step is not None and selection.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
-    try:
-        reader = _open_source(Path(path), dataset)
+    with _saying_what_cannot_be_read(path):
+        reader = _reader(Path(path), dataset)
         source = prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
-    except PermissionError as error:
-        raise InputError(f"reading {error.filename or path}: no permission to look into it") from None
-    except OSError as error:  # names that no file system allows, a share that is gone
-        raise InputError(f"reading {error.filename or path}: {error.strerror or error}") from None
     if size is None:
         size, size_source = working_size(source.width, source.height), "chosen"
     else:
@@ -129,25 +131,54 @@ def open_sequence(
     return sequence
 
 
-def _open_source(path: Path, dataset: str | None) -> Reader:
+def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
+    """Return the frames of an input as they are in the file, one view and one field of each as `settings` say.
+
+    What is known of their camera is not looked at, right or wrong. Raises `InputError`.
+    """
+    with _saying_what_cannot_be_read(path):
+        return prepared(_reader(Path(path), dataset), settings or InputSettings())
+
+
+@contextmanager
+def _saying_what_cannot_be_read(path: Path | str) -> Iterator[None]:
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(f"reading {error.filename or path}: no permission to look into it") from None
+    except OSError as error:  # names that no file system allows, a share that is gone
+        raise InputError(f"reading {error.filename or path}: {error.strerror or error}") from None
+
+
+def _reader(path: Path, dataset: str | None) -> Reader:
     dataset, _, part = (dataset or "").partition(":")
     if dataset and dataset not in DATASETS:
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
+    within: list[str] = []
+    beside: list[str] = []
     if path.is_dir():
+        beside = hindrances(path)
         path = _innermost(path, dataset or None)
-        check_readable(path)
+        within = hindrances(path)
+    elif not path.is_file():
+        raise InputError(
+            f"reading {path}: it is a pipe or a device; store what comes out of it as a file, and give that"
+        )
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
-    if kind == RosBag.name:
-        return RosBag(path, part or None)
-    if part:
+    if part and kind != RosBag.name:
         raise InputError(
             f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon, got '{part}'"
         )
-    return DATASETS[kind](path)
+    if within and DATASETS[kind] not in _WITHOUT_LAYOUT:
+        raise InputError(f"reading {path}: {within[0]}")
+    reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
+    for hindered in list(dict.fromkeys([*within, *beside]))[:_MOST_NAMED]:
+        reader.warnings.append(f"left out: {hindered}")
+    return reader
 
 
 def _innermost(path: Path, dataset: str | None) -> Path:
@@ -156,9 +187,23 @@ def _innermost(path: Path, dataset: str | None) -> Path:
     Raises `InputError` where a folder holds several sequences of a data set.
     """
     if dataset is None:
-        return _stepped_into(path, list(DATASETS.values()))
+        return _of_any_kind(path)
     found = _stepped_into(path, [DATASETS[dataset]])
     return found if DATASETS[dataset].recognises(found) else path
+
+
+def _of_any_kind(path: Path) -> Path:
+    """Return the folder in `path` that is read; a container that lies about does not hide a data set or `images`."""
+    containers = [kind for kind in _KINDS if kind in (RosBag, Dicom)]
+    others = [kind for kind in _KINDS if kind not in containers]
+    found = _stepped_into(path, others)
+    pictures = ImageFolder.recognises(found)
+    layouts = [kind for kind in others if kind not in _WITHOUT_LAYOUT]
+    if (pictures and (found == path or found.name == _IMAGES)) or any(kind.recognises(found) for kind in layouts):
+        return found
+    # Without its package a container cannot be read, the pictures beside it can.
+    able = [kind for kind in containers if not pictures or kind.is_installed()]
+    return _stepped_into(path, [*able, *others])
 
 
 def _stepped_into(path: Path, kinds: list[type[Reader]]) -> Path:
@@ -167,7 +212,7 @@ def _stepped_into(path: Path, kinds: list[type[Reader]]) -> Path:
         if any(kind.recognises(path) for kind in kinds):
             return path
         inner = _folders_in(path)
-        images = [folder for folder in inner if folder.name == "images"]
+        images = [folder for folder in inner if folder.name == _IMAGES]
         if len(images or inner) != 1:
             return _only_sequence_below(path, kinds) or path
         path = (images or inner)[0]
@@ -179,6 +224,7 @@ def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
     kinds = [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
     level = _folders_in(path)
     for _ in range(_SEARCH_DEPTH):
+        level = [folder for folder in level if may_enter(folder)]
         found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
         if len(found) > 1:
             names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
@@ -191,7 +237,7 @@ def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
 
 def _folders_in(path: Path) -> list[Path]:
     folders = (folder for folder in path.iterdir() if folder.is_dir())
-    return sorted(folder for folder in folders if not folder.name.startswith(".") and folder.name != _LEAVINGS)
+    return sorted(folder for folder in folders if not is_apart(folder.name) and folder.name != _LEAVINGS)
 
 
 def _calibration_of(
@@ -213,11 +259,12 @@ def _calibration_of(
             f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit}): give the one "
             "that was made before they were cut (--camera)"
         )
+    unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
     if source.camera is not None:
-        return Calibration(source.camera, source.depth_scale_mm, source.camera_source), True
+        return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True
     known, fov_deg = ("assumed", _USUAL_FOV_DEG) if fov_deg is None else ("stated", fov_deg)
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
     focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
-    assumed = f"{known}: horizontal field of view {fov_deg:g} deg (--fov)"
+    assumed = f"{known}: horizontal field of view {fov_deg:g} deg (--fov){unfitted}"
     return Calibration(assumed_camera(source, float(focal_px)), None, assumed), False

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
+from typing import BinaryIO
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from scopemap.config import InputSettings
 from scopemap.datasets.images import ImageFolder
 from scopemap.datasets.sequence import KnowsNothing, Source, SourceFrame, SourceTruth
 from scopemap.datasets.video import VideoFile
-from scopemap.errors import InputError
+from scopemap.errors import CalibrationError, InputError
 from scopemap.pictures.interlacing import deinterlaced, is_interlaced
 from scopemap.pictures.stereo_packing import Packing, packing, squeezed_views, suspected
 
@@ -66,7 +67,7 @@ class PreparedSource(KnowsNothing):
         self.two_views = packed is not None
         self.name, self.path = source.name, source.path
         self.notes, self.warnings = source.notes, source.warnings
-        self.count = source.count
+        self.count, self.stamped = source.count, source.stamped
         self.width, self.height, self.pixel_aspect = source.width, source.height, source.pixel_aspect
         self.depth_scale_mm, self.depth_sensor, self.masks = source.depth_scale_mm, source.depth_sensor, source.masks
         if settings.deinterlace:
@@ -83,7 +84,12 @@ class PreparedSource(KnowsNothing):
             self.camera_fault = source.camera_fault
         elif source.calibration is not None and source.calibration.file is not None:
             # Without a size of its own, the file beside the images is for one view; any other camera is of both.
-            self._take(stated_calibration(source.calibration.file, (self.width, self.height)))
+            try:
+                self._take(stated_calibration(source.calibration.file, (self.width, self.height)))
+            except CalibrationError as fault:
+                self.camera_fault = fault
+        elif isinstance(source, ImageFolder):
+            self.camera_fault = source.camera_fault  # of that file
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, each with what is used of its picture."""
@@ -94,6 +100,10 @@ class PreparedSource(KnowsNothing):
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return number and time stamp of the selected frames, None where only reading on would tell."""
         return self._source.stamps(selection)
+
+    def media(self) -> str | BinaryIO | None:
+        """Return what FFmpeg opens, None where there is no video."""
+        return self._source.media()
 
     def pose(self, index: int) -> np.ndarray | None:
         """Return the true pose of a frame, or None."""

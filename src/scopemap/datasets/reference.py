@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.datasets.opening import DATASETS, open_sequence
-from scopemap.datasets.sequence import Sequence
+from scopemap.datasets.opening import DATASETS, open_source
+from scopemap.datasets.sequence import Sequence, Source
 from scopemap.errors import InputError, ScopemapError
 from scopemap.trajectories.opening import KINDS, holds_trajectory, open_trajectory
 from scopemap.trajectory import Trajectory, Unit
@@ -27,15 +27,16 @@ def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -
     if not path.is_dir() or (is_trajectory and asked_for) or kind not in ("auto", *DATASETS):
         return open_trajectory(path, unit, kind)
     try:
-        sequence = open_sequence(path, dataset=None if kind == "auto" else kind)
-        reference = reference_trajectory(sequence)
+        # Poses need no camera: one that does not fit takes nothing from them.
+        source = open_source(path, dataset=None if kind == "auto" else kind)
+        reference = _true_poses(source, slice(None))
     except ScopemapError as fault:
         if is_trajectory:
             return open_trajectory(path, unit, kind)
         raise InputError(f"no true poses in {path}: no trajectory was recognised, and as a data set: {fault}") from None
     if reference is None:
         return open_trajectory(path, unit, kind) if is_trajectory else None
-    return replace(reference, source=f"data set {sequence.source.name}, camera-to-world, mm")
+    return replace(reference, source=f"data set {source.name}, camera-to-world, mm")
 
 
 def reference_trajectory(sequence: Sequence) -> Trajectory | None:
@@ -44,8 +45,11 @@ def reference_trajectory(sequence: Sequence) -> Trajectory | None:
     `indices` and `times_s` are those of the frames; a frame without a true pose is left out. What the data set holds is
     what is returned: frames that later turn out unreadable are among it. Raises `InputError` for unreadable poses.
     """
-    source = sequence.source
-    stamped = [(*stamp, source.pose(stamp[0])) for stamp in source.stamps(sequence.selection) or []]
+    return _true_poses(sequence.source, sequence.selection)
+
+
+def _true_poses(source: Source, selection: slice) -> Trajectory | None:
+    stamped = [(*stamp, source.pose(stamp[0])) for stamp in source.stamps(selection) or []]
     known = [(index, time_s, pose) for index, time_s, pose in stamped if pose is not None]
     if not known:
         return None

@@ -20,15 +20,26 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.datasets.rosbag_camera import camera_of
-from scopemap.datasets.rosbag_files import CAMERA_INFO, COMPRESSED, IMAGE, Message, Recording, Topic, is_recording
-from scopemap.datasets.rosbag_pictures import depth_of, encoding_of, is_depth, picture_of
+from scopemap.datasets.rosbag_camera import calibration_of
+from scopemap.datasets.rosbag_files import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    Message,
+    Recording,
+    Topic,
+    is_installed,
+    is_recording,
+)
+from scopemap.datasets.rosbag_pictures import bare, bits_of, depth_of, eight_bit, encoding_of, is_depth, picture_of
 from scopemap.datasets.sequence import KnowsNothing, SourceFrame, SourceTruth
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
-_ALIGNED = re.compile(r"aligned|registered")
+_ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)")
+_ALIGNED_TO = re.compile(r"aligned_depth_to_([a-z0-9]+)")
+_MONO = ("mono8", "mono16", "8UC1")
 _LEFT, _RIGHT = (re.compile(rf"(?<![a-z]){side}(?![a-z])") for side in ("left", "right"))
 _LARGEST_GAP_S = 0.02
 _NS_PER_S = 1e9
@@ -37,14 +48,15 @@ _NS_PER_S = 1e9
 class RosBag(KnowsNothing):
     """The images of one topic of a recording.
 
-    path : the bag. topic : the topic of the images; None: one with a `camera_info`, of the left camera and with the
-    most messages, in this order. A frame's index is its number among the topic's messages, its time the stamp in its
-    header, or when it was recorded where the first message has no stamp.
+    path : the bag. topic : the topic of the images; None: one with a `camera_info`, in colour, of the left camera and
+    with the most messages, in this order. A frame's index is its number among the topic's messages, its time the stamp
+    in its header, or when it was recorded where the first message has no stamp.
 
     Raises `InputError` for what cannot be read, holds no images, or needs the package `rosbags`.
     """
 
     name = "rosbag"
+    stamped = True
     quality: TruthQuality = "registered"
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
@@ -55,6 +67,8 @@ class RosBag(KnowsNothing):
         self._lock = threading.Lock()
         self._held = ExitStack()
         self._depth_readers: list[Any] = []
+        self._grey: set[str] = set()
+        self._bits = 0
         with self._recording.opened() as readers:
             pictures, depths = self._image_topics(readers)
             self._topic = self._chosen(pictures, topic)
@@ -70,6 +84,8 @@ class RosBag(KnowsNothing):
             "poses in a bag (odometry, tf) are not used: whose they are is not said",
         ]
 
+    is_installed = staticmethod(is_installed)
+
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether `path` is a ROS bag or MCAP file, or a folder of such files and no images."""
@@ -77,6 +93,7 @@ class RosBag(KnowsNothing):
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; an unreadable one is left out with a warning, another size is an `InputError`."""
+        last_s = -np.inf
         with self._recording.opened() as readers:
             for number, message in islice(
                 enumerate(self._messages(readers, [self._topic.name])), *self._bounds(selection)
@@ -92,7 +109,11 @@ class RosBag(KnowsNothing):
                         f"reading {self.path}: image {number} of {self._topic.name} is {width}x{height} px, those "
                         f"before it are {self.width}x{self.height} px; a sequence needs frames of one size"
                     )
-                yield SourceFrame(number, self._time_s(message), rgb, f"{self._topic.name}[{number}]")
+                time_s = self._time_s(message)
+                if time_s <= last_s:
+                    self._warn(f"the stamps of {self._topic.name} do not increase: images stay as they were recorded")
+                last_s = time_s
+                yield SourceFrame(number, time_s, rgb, f"{self._topic.name}[{number}]")
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
         """Return number and time of the selected frames, of images that turn out unreadable, too; decodes none."""
@@ -159,7 +180,16 @@ class RosBag(KnowsNothing):
             self._warn(f"after {read} messages the bag breaks off, those were used: {error}")
 
     def _picture(self, message: Message) -> np.ndarray:
-        return picture_of(self._recording.unpacked(message))
+        """Return the picture (h, w, 3) uint8; the first of 16 bits decides for all of them how many of these count."""
+        rgb = picture_of(self._recording.unpacked(message))
+        if rgb.dtype == np.uint8:
+            return rgb
+        if not self._bits:
+            self._bits = bits_of(rgb)
+            self.notes.append(f"samples of 16 bits: {self._bits} of them count, by the brightest of the first image")
+        if bits_of(rgb) > self._bits:
+            self._warn(f"images of {self._topic.name} are brighter than the {self._bits} bits of the first: cut off")
+        return eight_bit(rgb, self._bits)
 
     def _size(self, readers: list[Any]) -> tuple[int, int]:
         """Return height and width of the first image that can be decoded."""
@@ -187,6 +217,8 @@ class RosBag(KnowsNothing):
                 self._warn(f"{topic.name} cannot be read: {error}")
                 continue
             if encoding is not None:
+                if bare(encoding) in _MONO:
+                    self._grey.add(topic.name)
                 (depths if is_depth(encoding) else pictures).append(topic)
         return pictures, depths
 
@@ -199,9 +231,12 @@ class RosBag(KnowsNothing):
             raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names or 'none'}")
         if not pictures:
             topics = ", ".join(self._recording.topics) or "none"
+            foreign = ", ".join(self._recording.foreign)
+            fault = f"; of its messages, those serialised as {foreign} are not read, only cdr is" if foreign else ""
+            fault += "".join(f"; {warning}" for warning in self.warnings[:1])
             raise InputError(
                 f"reading {self.path}: it holds no pictures (looked for sensor_msgs/Image and CompressedImage; topics "
-                f"of these kinds and camera_info are {topics}){''.join('; ' + fault for fault in self.warnings[:1])}"
+                f"of these kinds and camera_info are {topics}){fault}"
             )
         chosen = max(pictures, key=self._preference)
         others = [topic.name for topic in pictures if topic is not chosen]
@@ -211,9 +246,10 @@ class RosBag(KnowsNothing):
             )
         return chosen
 
-    def _preference(self, topic: Topic) -> tuple[bool, bool, bool, int, bool]:
+    def _preference(self, topic: Topic) -> tuple[bool, bool, bool, bool, int, bool]:
         left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
-        return self._own_info(topic) is not None, left, not right, topic.total, topic.kind == IMAGE
+        colour = topic.name not in self._grey
+        return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == IMAGE
 
     def _own_info(self, topic: Topic) -> str | None:
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
@@ -236,18 +272,18 @@ class RosBag(KnowsNothing):
         try:
             for message in islice(self._recording.messages(readers, [name]), 1):
                 info = self._recording.unpacked(message)
-                self.camera = camera_of(info, (self.width, self.height), rectified, f"{self.path.name}, {name}")
+                self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
             return
-        if self.camera is None:
+        if self.calibration is None:
             self.notes.append(f"{name} says that the camera is not calibrated (K is zero)")
         else:
-            self.camera_source = f"{name} of the bag" + (", P of rectified images" if rectified else "")
+            self.camera, self.camera_source = self.calibration.camera, self.calibration.source
 
     def _aligned(self, depths: list[Topic]) -> Topic | None:
         """Return the depth that is aligned to the pictures, by its topic's name."""
-        aligned = [topic for topic in depths if _ALIGNED.search(topic.name)]
+        aligned = [topic for topic in depths if _ALIGNED.search(topic.name) and self._is_meant(topic)]
         # Of several cameras' depth, that of the same camera has the most of its name in common.
         near = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
         chosen = max(aligned, key=lambda topic: (near[topic.name], topic.total), default=None)
@@ -257,6 +293,11 @@ class RosBag(KnowsNothing):
         if others:
             self.notes.append(f"depth that no name says to be aligned is not used: {', '.join(others)}")
         return chosen
+
+    def _is_meant(self, depth: Topic) -> bool:
+        """Whether depth that names the pictures it is aligned to names these."""
+        named = _ALIGNED_TO.search(depth.name)
+        return named is None or named[1] in self._topic.name
 
     def _bounds(self, selection: slice) -> tuple[int | None, int | None, int | None]:
         """Return bounds that count from the start; the bag's own count serves only those from the end."""

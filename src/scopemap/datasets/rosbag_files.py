@@ -6,6 +6,7 @@ are those of the ROS distributions. What unpacks is bounded, since a few bytes c
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator
@@ -15,12 +16,14 @@ from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
 from scopemap.datasets.images import image_files, numeric_order
+from scopemap.datasets.rosbag_mcap import MAGIC, check_profile
 from scopemap.datasets.rosbag_unpacking import bound_unpacking, unpacked_zstd, zstandard
 from scopemap.errors import InputError, ScopemapError
 
 IMAGE, COMPRESSED, CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-_ROS1, _MCAP, _SQLITE, _ZSTD = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
-_METADATA = "metadata.yaml"
+_ROS1, _SQLITE, _ZSTD = b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+_METADATA, _CDR, _LONGEST_WORD = "metadata.yaml", "cdr", 40
+_TABLES, _SCHEMA_BYTES = {b"topics", b"messages"}, 1 << 16
 _MOST_METADATA_BYTES = 16 << 20
 _MOST_TIMES_LARGER = 256
 _PIECE_BYTES = 1 << 20
@@ -61,9 +64,21 @@ class Topic(NamedTuple):
 
 def is_recording(path: Path) -> bool:
     """Whether `path` is a bag by its first bytes, or a folder with a bag's files and no images."""
-    if path.is_dir():
-        return bool(_storages_in(path)) and not image_files(path)
-    return _kind_of(path) is not None
+    if not path.is_dir():
+        return _kind_of(path) is not None
+    files = _storages_in(path)
+    # Many a program keeps a database; metadata say that what is damaged was a bag.
+    told = bool(files) and (path / _METADATA).is_file()
+    return (told or any(_holds_messages(file) for file in files)) and not image_files(path)
+
+
+def is_installed() -> bool:
+    """Whether the package `rosbags` is there."""
+    try:
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 class Recording:
@@ -72,18 +87,15 @@ class Recording:
     Attributes
     ----------
     topics : the topics of the types that are read here, by name.
+    foreign : how messages are serialised that are therefore not read.
     warnings : what was found wrong with the bag as a whole.
 
     Raises `InputError` where the package `rosbags` is not installed, and for what cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            import rosbags.rosbag2  # noqa: F401
-        except ImportError:
-            raise InputError(
-                f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'"
-            ) from None
+        if not is_installed():
+            raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'")
         bound_unpacking()
         self.path = path
         self.warnings: list[str] = []
@@ -93,6 +105,7 @@ class Recording:
         self._bytes = sum(file.stat().st_size for file in self._files_read)
         with self.opened() as readers:
             self.topics = _topics(readers)
+            self.foreign = sorted({_serialised(c) for reader in readers for c in reader.connections} - {_CDR})
         for name, count in stated.items():
             if name in self.topics and self.topics[name].total < count:
                 found = self.topics[name].total
@@ -202,14 +215,29 @@ class Recording:
 
 def _kind_of(file: Path) -> str | None:
     """Return what holds the messages in a file: bag, mcap or db3; None for other files and those without permission."""
-    try:
-        with file.open("rb") as stream:
-            start = stream.read(len(_SQLITE))
-    except OSError:
-        return None
+    start = _start_of(file, len(_SQLITE))
     # SQLite has other uses.
-    kinds = {"bag": _ROS1, "mcap": _MCAP} | ({"db3": _SQLITE} if file.suffix == ".db3" else {})
+    kinds = {"bag": _ROS1, "mcap": MAGIC} | ({"db3": _SQLITE} if file.suffix == ".db3" else {})
     return next((kind for kind, magic in kinds.items() if start.startswith(magic)), None)
+
+
+def _start_of(file: Path, length: int) -> bytes:
+    """Return the first bytes of a file; none of one without permission, and of pipes: who opens one waits forever."""
+    try:
+        if not file.is_file():
+            return b""
+        with file.open("rb") as stream:
+            return stream.read(length)
+    except OSError:
+        return b""
+
+
+def _holds_messages(file: Path) -> bool:
+    """Whether a file with a bag's ending holds one: of a database, whether it has the tables of a bag."""
+    if _is_packed(file):
+        return _start_of(file, len(_ZSTD)) == _ZSTD
+    kind = _kind_of(file)
+    return kind is not None and (kind != "db3" or _TABLES.issubset(re.findall(rb"\w+", _start_of(file, _SCHEMA_BYTES))))
 
 
 def _is_packed(file: Path) -> bool:
@@ -244,6 +272,7 @@ def _reader(file: Path) -> Any:
         case "bag":
             return rosbags.rosbag1.Reader(file)
         case "mcap":
+            check_profile(file)
             return rosbags.rosbag2.Reader.STORAGE_PLUGINS[".mcap"](file)
         case "db3":
             # `rosbags` makes the name into an address, where these characters mean other things.
@@ -252,8 +281,12 @@ def _reader(file: Path) -> Any:
 
 
 def _is_read(connection: Any) -> bool:
-    known = connection.msgtype in (IMAGE, COMPRESSED, CAMERA_INFO)
-    return known and getattr(connection.ext, "serialization_format", "cdr") == "cdr"
+    return connection.msgtype in (IMAGE, COMPRESSED, CAMERA_INFO) and _serialised(connection) == _CDR
+
+
+def _serialised(connection: Any) -> str:
+    """Return how messages are laid out; those of ROS 1, which has one way only, count as read."""
+    return str(getattr(connection.ext, "serialization_format", _CDR))[:_LONGEST_WORD]
 
 
 def _topics(readers: list[Any]) -> dict[str, Topic]:

@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.datasets.images import decoded_image
 from scopemap.decoding import check_pixels, decoded
 from scopemap.errors import InputError
 
@@ -44,6 +43,7 @@ _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_DEPTH = "compressedDepth"
 _DEPTH_HEADER = struct.Struct("<iff")
 _MM_PER_METRE = 1000.0
+_BITS = (8, 10, 12, 14, 16)
 
 
 def encoding_of(message: Any) -> str:
@@ -52,12 +52,30 @@ def encoding_of(message: Any) -> str:
 
 
 def is_depth(encoding: str) -> bool:
-    """Whether an encoding or format is one of depth."""
-    return encoding in ("16UC1", "32FC1") or _COMPRESSED_DEPTH in encoding
+    """Whether an encoding or format, as "16UC1; png compressed", is one of depth."""
+    return bare(encoding) in ("16UC1", "32FC1") or _COMPRESSED_DEPTH in encoding
+
+
+def bare(encoding: str) -> str:
+    """Return an encoding without what a format says of its compression."""
+    return encoding.split(";")[0].strip()
+
+
+def bits_of(wide: np.ndarray) -> int:
+    """Return how many bits of a picture of uint16 count, by its brightest sample: 8, 10, 12, 14 or 16.
+
+    Cameras of 10 or 12 bits put them into the lower part of 16.
+    """
+    return next(bits for bits in _BITS if int(wide.max()) < 1 << bits)
+
+
+def eight_bit(wide: np.ndarray, bits: int) -> np.ndarray:
+    """Return a picture of uint16, of which `bits` count, as uint8; what is brighter than they hold is cut off."""
+    return np.minimum(wide >> (bits - 8), 255).astype(np.uint8)
 
 
 def picture_of(message: Any) -> np.ndarray:
-    """Return an image message as (h, w, 3) uint8 RGB; 16 bits lose their lower half.
+    """Return an image message as (h, w, 3) RGB, uint8 or, where its samples have 16 bits, uint16.
 
     Raises `InputError` for an encoding that is not known and for data that do not make the image.
     """
@@ -74,8 +92,7 @@ def picture_of(message: Any) -> np.ndarray:
     else:
         known = ", ".join([*_PLAIN, *_YUV, "bayer_*"])
         raise InputError(f"the encoding '{encoding}' of its images is not known (known are {known})")
-    eight_bit = (values >> 8).astype(np.uint8) if values.dtype.itemsize == 2 else values
-    return np.ascontiguousarray(eight_bit)
+    return np.ascontiguousarray(values)
 
 
 def depth_of(message: Any) -> np.ndarray:
@@ -124,24 +141,35 @@ def _compressed(message: Any) -> np.ndarray:
     # What comes after the semicolon is what was compressed.
     match = _BAYER.search(message.format.split(";")[-1])
     if match:
-        values = decoded(content, cv2.IMREAD_GRAYSCALE)
-        rgb = None if values is None else _mosaic(values, match[1])
+        values = decoded(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     else:
-        rgb = decoded_image(content)
-    if rgb is None:
+        values = decoded(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if values is None or values.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its compressed image ('{message.format[:40]}') cannot be decoded")
-    return rgb
+    return _mosaic(values, match[1]) if match else _converted(values, cv2.COLOR_BGR2RGB)
 
 
 def _compressed_depth(message: Any) -> np.ndarray:
-    """As ROS's `compressed_depth_image_transport` writes it: a header of 12 bytes, then a PNG of 16 bit."""
+    """As ROS's `compressed_depth_image_transport` writes it: a header of 12 bytes, then a PNG of 16 bit.
+
+    `compressed_image_transport` leaves out the header.
+    """
     content = message.data.tobytes()
+    if _COMPRESSED_DEPTH not in message.format and bare(message.format) == "16UC1":
+        values = decoded(content)
+        if values is None or values.ndim != 2 or values.dtype != np.uint16:
+            raise _no_depth(message)
+        return values.astype(np.float32)
     values = decoded(content[_DEPTH_HEADER.size :]) if len(content) > _DEPTH_HEADER.size else None
     if _COMPRESSED_DEPTH not in message.format or values is None or values.ndim != 2 or values.dtype != np.uint16:
-        raise InputError(f"its compressed depth ('{message.format[:40]}') cannot be decoded: PNG of 16 bit is read")
+        raise _no_depth(message)
     if not message.format.startswith("32FC1"):
         return values.astype(np.float32)
     _, a, b = _DEPTH_HEADER.unpack(content[: _DEPTH_HEADER.size])
     # Inverse depth in equal steps.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.where(values > 0, _MM_PER_METRE * a / (values.astype(np.float32) - b), np.nan)
+
+
+def _no_depth(message: Any) -> InputError:
+    return InputError(f"its compressed depth ('{message.format[:40]}') cannot be decoded: PNG of 16 bit is read")

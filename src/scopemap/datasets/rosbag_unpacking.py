@@ -25,7 +25,10 @@ def unpacked_zstd(packed: bytes) -> bytes:
 
 
 def bound_unpacking() -> None:
-    """Have `rosbags` unpack chunks up to the limit only: its own functions go on until memory ends."""
+    """Have `rosbags` unpack chunks up to the limit only: its own functions go on until memory ends.
+
+    This acts on the whole process: whoever else reads bags through `rosbags` in it is held to the limit, too.
+    """
     import bz2
 
     import lz4.frame

@@ -147,7 +147,8 @@ class ScaredKeyframe(KnowsNothing):
             _check_centred(self.camera, self.path)
 
     def _found_notes(self, stacked: bool) -> list[str]:
-        times = "those of frame_data" if self._data.times_s else f"frame number / {self._rate_hz:g} s"
+        self.stamped = bool(self._data.times_s)
+        times = "those of frame_data" if self.stamped else f"frame number / {self._rate_hz:g} s"
         notes = [
             f"time stamps: {times}",
             "the view used: " + ("left, the upper half" if stacked else "the whole image"),

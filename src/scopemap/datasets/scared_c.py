@@ -46,6 +46,7 @@ class ScaredCKeyframe(KnowsNothing):
         self.warnings = list(self._data.faults)
         self._numbers = self._included()
         self.count: int | None = len(self._numbers)
+        self.stamped = bool(self._data.times_s)
         times = "those of frame_data" if self._data.times_s else f"frame number / {FOLDER_RATE_HZ:g} s"
         self.notes = [f"time stamps: {times}", "truth: COLMAP's poses, scaled to the scan of the keyframe"]
         self.height, self.width = self._size()

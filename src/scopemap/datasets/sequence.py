@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class Source(Protocol):
     camera_source : how the camera is known, one phrase, or "".
     camera_fault : why the data set's own camera cannot be used, None where it can.
     pixel_aspect : width of a pixel over its height.
+    stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
     masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
@@ -84,6 +85,7 @@ class Source(Protocol):
     camera_source: str
     camera_fault: ScopemapError | None
     pixel_aspect: float
+    stamped: bool
     depth_scale_mm: float | None
     depth_sensor: DepthSensor | None
     masks: Path | None
@@ -96,6 +98,9 @@ class Source(Protocol):
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
 
+    def media(self) -> str | BinaryIO | None:
+        """Return what FFmpeg opens, a name or a file, where the frames are those of one video; None elsewhere."""
+
     def pose(self, index: int) -> np.ndarray | None:
         """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
 
@@ -107,6 +112,7 @@ class KnowsNothing:
     """What a source says beside its frames until it has something to say: see `Source`."""
 
     pixel_aspect = 1.0
+    stamped = False
     calibration: Calibration | None = None
     camera: CameraModel | None = None
     camera_source = ""
@@ -114,6 +120,10 @@ class KnowsNothing:
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
+
+    def media(self) -> str | BinaryIO | None:
+        """Nothing: no video."""
+        return None
 
     def _take(self, calibration: Calibration) -> None:
         """Use the calibration beside the frames, which comes before a data set's own; opening fits it."""

@@ -53,6 +53,7 @@ class TumRgbdFolder(ImageFolder):
     """
 
     name = "tum"
+    stamped = True
 
     def __init__(self, path: Path) -> None:
         listed = _read_list(path / _IMAGES)

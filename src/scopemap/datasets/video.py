@@ -42,6 +42,7 @@ class VideoFile(KnowsNothing):
     """
 
     name = "video"
+    stamped = True
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -62,6 +63,7 @@ class VideoFile(KnowsNothing):
             if 0 < rate_hz <= _HIGHEST_RATE_HZ:
                 self.rate_hz = rate_hz
             else:
+                self.stamped = False
                 self.notes.append(f"time stamps: frame number / {DEFAULT_RATE_HZ:g} s (the video holds none)")
             aspect = float(stream.sample_aspect_ratio or 1.0)
             self.pixel_aspect = 1 / aspect if sideways else aspect
@@ -104,6 +106,10 @@ class VideoFile(KnowsNothing):
         """Only decoding tells how many frames there are, and when."""
         return None
 
+    def media(self) -> str | BinaryIO:
+        """Return what FFmpeg opens: the file's name, or its bytes where these are part of another file."""
+        return str(self.path)
+
     def pose(self, index: int) -> np.ndarray | None:
         """A video knows no pose."""
         return None
@@ -115,7 +121,7 @@ class VideoFile(KnowsNothing):
     def _opened(self) -> InputContainer:
         # FFmpeg takes the memory for a picture of whatever size a header claims, to look at it already.
         limit = {"max_pixels": str(int(min(most_pixels(), _MOST_CODED_PIXELS)))}
-        container = av.open(self._media(), "r", metadata_errors="replace", options=limit)
+        container = av.open(self.media(), "r", metadata_errors="replace", options=limit)
         for stream in container.streams.video:
             if stream.codec_context is not None:
                 stream.codec_context.options = limit
@@ -125,10 +131,6 @@ class VideoFile(KnowsNothing):
         with self._opened() as container:
             sized = container.streams.video[0].width > 0
         return "holds no readable frame" + ("" if sized else f", or pictures of {limit_in_words()}")
-
-    def _media(self) -> str | BinaryIO:
-        """What FFmpeg opens: the file's name, or its bytes where these are part of another file."""
-        return str(self.path)
 
     def _decoded(self) -> Iterator[tuple[int, float, VideoFrame]]:
         """Yield number, time stamp, s, and picture of every frame."""

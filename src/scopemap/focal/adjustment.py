@@ -37,6 +37,8 @@ _LEAST_SIGMA_PX = 0.03
 _MEDIAN_TO_SIGMA_2D = 1 / 1.1774
 _LEAST_Z, _LEAST_SLOPE = 1e-2, 0.1
 _UNBENDING_STEPS = 6
+# In half widths: a trial step may put a point beside the camera, where Newton's method would run away.
+_FARTHEST = 10.0
 _NEARNESS_RANGE = (1e-3, 50.0)
 _LARGEST_STEP = 0.3  # of a rotation, rad, and of ln f
 _FIRST_ITERATIONS, _ITERATIONS = 25, 30
@@ -167,10 +169,10 @@ def _square(pixel: np.ndarray, half_width_px: float) -> np.ndarray:
 
 def _bent(straight: np.ndarray, bend: float, half_width_px: float) -> np.ndarray:
     """Return where (..., 2) the lens sees what a straight one sees at `straight`; Newton's method on the radius."""
-    radius = wanted = np.sqrt(_square(straight, half_width_px))
+    radius = wanted = np.minimum(np.sqrt(_square(straight, half_width_px)), _FARTHEST)
     for _ in range(_UNBENDING_STEPS):
         slope = np.maximum(1 + 3 * bend * radius**2, _LEAST_SLOPE)
-        radius = radius - (radius * (1 + bend * radius**2) - wanted) / slope
+        radius = np.clip(radius - (radius * (1 + bend * radius**2) - wanted) / slope, 0, _FARTHEST)
     return np.where(wanted > 0, radius / np.maximum(wanted, 1e-12), 1.0) * straight
 
 

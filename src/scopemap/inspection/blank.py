@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, frames_of, stretches_of
+from scopemap.inspection.clip import Clip, frames_of
+from scopemap.inspection.finding import Finding, stretches_of
 
 _BLACK_LEVEL = 16.0
 
@@ -15,6 +15,6 @@ def check_blank(clip: Clip) -> list[Finding]:
     for flags, code, what in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
         stretches = stretches_of(flags)
         if stretches:
-            message = f"{what}: {frames_of(stretches)}"
-            found.append(Finding("warning", code, message, clip.selecting(stretches), stretches))
+            message = f"{what}: {frames_of(clip, stretches)}"
+            found.append(Finding("warning", code, message, clip.selecting(stretches), clip.positions(stretches)))
     return found

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, covered, frames_of, stretches_of
+from scopemap.inspection.clip import Clip, frames_of
+from scopemap.inspection.finding import Finding, covered, stretches_of
 
 _SHARE = 0.35
 _LEAST_S, _LEAST_FRAMES, _GAP = 0.15, 3, 2
@@ -24,7 +24,7 @@ def check_blurred(clip: Clip) -> list[Finding]:
         return []
     share = np.median(detail[covered(stretches, len(clip))]) / np.median(detail[shown])
     message = (
-        f"blurred, or without texture: {frames_of(stretches)} show {share:.0%} of the usual detail (a smear on the "
-        "lens, defocus, or tissue very near)"
+        f"blurred, or without texture: {frames_of(clip, stretches)} show {share:.0%} of the usual detail (a smear on "
+        "the lens, defocus, or tissue very near)"
     )
-    return [Finding("warning", "blurred", message, clip.selecting(stretches), stretches)]
+    return [Finding("warning", "blurred", message, clip.selecting(stretches), clip.positions(stretches))]

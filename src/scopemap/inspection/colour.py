@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, frames_of, stretches_of
+from scopemap.inspection.clip import Clip, frames_of
+from scopemap.inspection.finding import Finding, stretches_of
 
 _LEAST_REDNESS = 1.1
 _LEAST_S, _LEAST_FRAMES, _GAP = 0.3, 4, 3
@@ -21,9 +21,10 @@ def check_colour(clip: Clip) -> list[Finding]:
     advice = "look at them; narrow-band light is fine to run on"
     if np.mean(flags) > _MOSTLY:
         message = "hardly any picture has the colour of tissue in white light: is it narrow-band light, or no tissue?"
-        return [Finding("warning", "not-tissue", message, advice, stretches)]
+        return [Finding("warning", "not-tissue", message, advice, clip.positions(stretches))]
     message = (
-        f"not the colour of tissue in white light (outside the patient, or narrow-band light): {frames_of(stretches)}"
+        "not the colour of tissue in white light (outside the patient, or narrow-band light): "
+        f"{frames_of(clip, stretches)}"
     )
     advice += f", else {clip.selecting(stretches)}" if clip.selecting(stretches) else ""
-    return [Finding("warning", "not-tissue", message, advice, stretches)]
+    return [Finding("warning", "not-tissue", message, advice, clip.positions(stretches))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import BinaryIO
 
 import av
 
@@ -39,10 +39,10 @@ class Container:
     length_s: float | None
 
 
-def read_container(file: Path) -> Container | None:
+def read_container(media: str | BinaryIO) -> Container | None:
     """Return what the header and first picture of a video say, None for what is no video that can be opened."""
     try:
-        with av.open(str(file), metadata_errors="replace") as container:
+        with av.open(media, "r", metadata_errors="replace") as container:
             stream = next(iter(container.streams.video), None)
             if stream is None or stream.codec_context is None:
                 return None

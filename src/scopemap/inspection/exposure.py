@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, frames_of, stretches_of
+from scopemap.inspection.clip import Clip, frames_of
+from scopemap.inspection.finding import Finding, stretches_of
 
 _MOST_CLIPPED, _MOST_DARK, _MOST_HIGHLIGHTS = 0.1, 0.5, 0.1
 _LEAST_S, _LEAST_FRAMES, _GAP = 0.15, 3, 2
@@ -24,8 +24,10 @@ def check_exposure(clip: Clip) -> list[Finding]:
         stretches = stretches_of(shown & (clip[name] > most), clip.frames_in(_LEAST_S, _LEAST_FRAMES), _GAP)
         if stretches:
             worst = float(np.max(clip[name][shown]))
-            message = f"more than {most:.0%} of the field is {words} in {frames_of(stretches)}, {worst:.0%} at worst"
-            found.append(Finding("info", name, message, "", stretches))
+            message = (
+                f"more than {most:.0%} of the field is {words} in {frames_of(clip, stretches)}, {worst:.0%} at worst"
+            )
+            found.append(Finding("info", name, message, "", clip.positions(stretches)))
     return found
 
 

@@ -52,9 +52,3 @@ def worded(stretches: Sequence[Stretch]) -> str:
     """Return the stretches in words, those after the fourth counted."""
     named = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in stretches[:_NAMED])
     return named + (f" and {len(stretches) - _NAMED} more" if len(stretches) > _NAMED else "")
-
-
-def frames_of(stretches: Sequence[Stretch]) -> str:
-    """Return how many frames, and which, in words."""
-    count = sum(last - first + 1 for first, last in stretches)
-    return f"{count} frame{'s' * (count != 1)} ({worded(stretches)})"

@@ -69,9 +69,7 @@ class InsetWatcher:
             for x0, y0, x1, y1 in boxes
         )
         message = f"picture in picture: {places} shows something else"
-        advice = (
-            "leave it out: --masks FOLDER of this command writes masks, --set mask.files=FOLDER of a run reads them"
-        )
+        advice = "leave it out: --masks FOLDER of this command writes a mask, --set mask.files=FOLDER of a run reads it"
         return [Finding("warning", "inset", message, advice)]
 
     def _is_inset(self, box: Box, upright: np.ndarray, level: np.ndarray) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from scopemap.config import InputSettings
-from scopemap.datasets import Sequence, open_sequence
+from scopemap.datasets import Sequence, Source, open_sequence, open_source
+from scopemap.datasets.prepared import UNKNOWN_MAKE
+from scopemap.datasets.rosbag import RosBag
 from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
@@ -34,6 +37,7 @@ from scopemap.pictures.stereo_packing import Packing, packing
 _KEPT = 8
 # What stereo packing is told from: pictures from all parts of a video, else every tenth of the beginning.
 _PEEKED, _PEEK_EVERY = 9, 10
+_NAMED = 3
 _ORDER = ("error", "warning", "info")
 
 
@@ -93,27 +97,28 @@ def inspect(
     *,
     dataset: str | None = None,
     camera: Path | None = None,
+    frames: slice | None = None,
     listener: Callable[[int, int | None], None] | None = None,
 ) -> Inspection:
     """Read a video, a folder of images or a data set's folder once and return what was found.
 
-    `dataset` and `camera` as in `open_sequence`; `listener(pictures read, in all or None)` is called after each. Raises
-    `InputError` and `CalibrationError` where it cannot be opened, or holds fewer than two pictures. Where reading stops
-    later, that is part of what was found.
+    `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called
+    after each. Raises `InputError` and `CalibrationError` where it cannot be opened, or holds fewer than two pictures.
+    Where reading stops later, that is part of what was found.
     """
     plain = InputSettings(stereo="none", skip_duplicates=False)
-    sequence = open_sequence(path, dataset=dataset, camera=camera, settings=plain)
-    packed = _packed(sequence)
-    if packed is not None:
-        settings = plain.model_copy(update={"stereo": packed.layout})
-        sequence = open_sequence(path, dataset=dataset, camera=camera, settings=settings)
-    container = read_container(sequence.path) if sequence.path.is_file() else None
-    return _Pass(sequence, container, packed).inspection(listener)
+    # Whether there are two views comes first: the camera may be that of one.
+    packed = _packed(open_source(path, dataset=dataset, settings=plain))
+    settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
+    sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
+    media = sequence.source.media()
+    return _Pass(sequence, None if media is None else read_container(media), packed).inspection(listener)
 
 
-def _packed(sequence: Sequence) -> Packing | None:
-    source = sequence.source
+def _packed(source: Source) -> Packing | None:
     pictures: list[np.ndarray] = []
+    if source.name not in (*UNKNOWN_MAKE, RosBag.name):
+        return None  # the readers of data sets know what a picture holds
     # Where reading stops, the pass over all of it says why.
     with suppress(ScopemapError):
         if isinstance(source, VideoFile):
@@ -121,6 +126,27 @@ def _packed(sequence: Sequence) -> Packing | None:
         else:
             pictures.extend(frame.rgb for frame in source.frames(slice(0, _PEEKED * _PEEK_EVERY, _PEEK_EVERY)))
     return packing(pictures, source.pixel_aspect)
+
+
+def _positions(sequence: Sequence) -> Callable[[int, int], int]:
+    """Return what tells the position in the input of the n-th picture that is read, with this index.
+
+    Images that turn out unreadable have one, too; damaged pictures of a video are not counted by `--frames`.
+    """
+    known = sequence.source.stamps(slice(None))
+    start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
+    if known is None:
+        return lambda number, _: start + step * number
+    positions = {index: position for position, (index, _) in enumerate(known)}
+    return lambda number, index: positions.get(index, start + step * number)
+
+
+def _of_source(warnings: list[str]) -> list[Finding]:
+    """Return a finding for each of the reader's warnings, those after the third counted."""
+    found = [Finding("warning", "source", warning) for warning in warnings[:_NAMED]]
+    if len(warnings) > _NAMED:
+        found.append(Finding("warning", "source", f"and {len(warnings) - _NAMED} more warnings of the reader"))
+    return found
 
 
 class _Sampled:
@@ -161,7 +187,7 @@ class _Pass:
         if len(figures) < 2:
             found = stopped or f"{len(figures)} picture(s) could be read, two are needed"
             raise InputError(f"inspecting {sequence.path}: {found}")
-        clip = Clip(tuple(figures), not any(note.startswith("time stamps:") for note in sequence.source.notes))
+        clip = Clip(tuple(figures), sequence.source.stamped, sequence.selection)
         findings = sorted(self._findings(clip, stopped), key=lambda finding: _ORDER.index(finding.severity))
         samples = tuple(self._sampled.kept)
         height, width = samples[0].small.shape[:2]
@@ -179,11 +205,11 @@ class _Pass:
         )
 
     def _views(self) -> Iterator[View]:
-        viewer, sequence = Viewer(), self._sequence
-        for item in sequence.source.frames(sequence.selection):
+        viewer, sequence, position_of = Viewer(), self._sequence, _positions(self._sequence)
+        for number, item in enumerate(sequence.source.frames(sequence.selection)):
             rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
             frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
-            view = viewer(item.rgb, frame)
+            view = viewer(position_of(number, item.index), item.rgb, frame)
             for watcher in (self._field, self._overlays, self._insets, self._sampled):
                 watcher.add(view)
             yield view
@@ -192,7 +218,7 @@ class _Pass:
         pictures = [view.rgb for view in self._sampled.kept if not view.figures.blank]
         return [
             *([Finding("error", "reading-stopped", stopped)] if stopped else []),
-            *(Finding("warning", "source", warning) for warning in self._sequence.warnings),
+            *_of_source(self._sequence.warnings),
             *(check_container(self._container) if self._container is not None else []),
             *check_timing(clip, self._container.length_s if self._container is not None else None),
             *stereo_findings(self._packed),

@@ -1,4 +1,4 @@
-"""Masks of what a run does not find by itself, in the form in which it reads them: one image per frame, by number."""
+"""A mask of what a run does not find by itself, in the form in which it reads it: one image for all frames."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 
 from scopemap.inspection.inspecting import Inspection
 
+MASK_NAME = "mask.png"
 
-def write_masks(inspection: Inspection, folder: Path) -> int:
-    """Write a PNG for every frame, white where an overlay or a picture in the picture lies; return how many.
 
-    Nothing is written where there are neither. Raises `OSError` where the folder cannot be written.
+def write_mask(inspection: Inspection, folder: Path) -> bool:
+    """Write a PNG, white where an overlay or a picture in the picture lies; False, and nothing, where neither does.
+
+    Raises `OSError` where the folder cannot be written.
     """
     boxes = [*inspection.insets, *(overlay.box for overlay in inspection.overlays if overlay.in_field)]
     if not boxes:
-        return 0
+        return False
     width, height = inspection.size
     mask = np.zeros((height, width), np.uint8)
     for left, top, right, bottom in boxes:
@@ -25,6 +27,5 @@ def write_masks(inspection: Inspection, folder: Path) -> int:
         mask[rows, int(np.floor(left * width)) : int(np.ceil(right * width))] = 255
     content = cv2.imencode(".png", mask)[1].tobytes()
     folder.mkdir(parents=True, exist_ok=True)
-    for figures in inspection.clip.figures:
-        (folder / f"{figures.index:06d}.png").write_bytes(content)
-    return len(inspection.clip)
+    (folder / MASK_NAME).write_bytes(content)
+    return True

@@ -53,13 +53,14 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
         _draw_found(figure.add_subplot(grid[0, column]), view, inspection)
         _draw_masked(figure.add_subplot(grid[1, column]), view)
     first: Axes | None = None
+    positions = inspection.clip["position"]
     for row, (name, label) in enumerate(_LINES, start=2):
         axes = figure.add_subplot(grid[row, :], sharex=first)
         first = first or axes
         values = inspection.clip[name] * (100 if name == "motion" else 1)
-        axes.plot(values, color="#404040", linewidth=1.0)
+        axes.plot(positions, values, color="#404040", linewidth=1.0)
         again = np.flatnonzero(repeated(inspection.clip))
-        axes.plot(again, values[again], ".", color=_BANDS["duplicates"], markersize=4)
+        axes.plot(positions[again], values[again], ".", color=_BANDS["duplicates"], markersize=4)
         axes.set_ylabel(label, fontsize=8)
         axes.set_ylim(bottom=0)
         _finish(axes, inspection, views)
@@ -122,7 +123,8 @@ def _draw_bands(axes: Axes, bands: list[tuple[str, tuple[tuple[int, int], ...]]]
 def _finish(axes: Axes, inspection: Inspection, views: list[View]) -> None:
     for view in views:
         axes.axvline(view.figures.position, color="#9ecae1", linewidth=0.8, zorder=0)
-    axes.set_xlim(-0.5, len(inspection.clip) - 0.5)
+    figures = inspection.clip.figures
+    axes.set_xlim(figures[0].position - 0.5, figures[-1].position + 0.5)
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.3)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, covered, frames_of, stretches_of
+from scopemap.inspection.clip import Clip, frames_of
+from scopemap.inspection.finding import Finding, covered, stretches_of
 from scopemap.pictures.duplicates import LEAST_DIFFERENCE
 
 _FREEZE_S, _FREEZE_FRAMES = 0.3, 4
@@ -24,11 +24,11 @@ def check_repeats(clip: Clip) -> list[Finding]:
     left_out = "runs leave them out (--set input.skip_duplicates=false keeps them)"
     found = []
     if frozen:
-        message = f"the picture is frozen for {frames_of(frozen)}"
-        found.append(Finding("warning", "frozen", message, left_out, frozen))
+        message = f"the picture is frozen for {frames_of(clip, frozen)}"
+        found.append(Finding("warning", "frozen", message, left_out, clip.positions(frozen)))
     if single:
-        message = f"the same picture as before: {frames_of(single)}{_rhythm(single)}"
-        found.append(Finding("info", "duplicates", message, left_out, single))
+        message = f"the same picture as before: {frames_of(clip, single)}{_rhythm(single) if clip.step == 1 else ''}"
+        found.append(Finding("info", "duplicates", message, left_out, clip.positions(single)))
     return found
 
 

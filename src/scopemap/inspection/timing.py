@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.inspection.clip import Clip
-from scopemap.inspection.finding import Finding, Stretch, worded
+from scopemap.inspection.finding import Finding, worded
 
 _UNEVEN, _UNEVEN_SHARE = 0.2, 0.05
 _HOLE = 1.5
@@ -18,11 +18,10 @@ def check_timing(clip: Clip, claimed_s: float | None) -> list[Finding]:
 
     claimed_s : the length that the file's header states, s, or None.
     """
-    times_s = clip["time_s"]
-    steps_s = np.diff(times_s)
+    steps_s = clip.steps_s
     if steps_s.size < 2:
         return []
-    back = tuple((int(i) + 1, int(i) + 1) for i in np.flatnonzero(steps_s <= 0))
+    back = clip.positions(tuple((int(i) + 1, int(i) + 1) for i in np.flatnonzero(steps_s <= 0)))
     if back:
         message = f"{len(back)} time stamps are not later than the one before (frames {worded(back)})"
         return [
@@ -40,7 +39,7 @@ def check_timing(clip: Clip, claimed_s: float | None) -> list[Finding]:
         found.append(
             Finding("info", "rate-variable", message, "runs use the time stamps; --fps thins out by them, too")
         )
-    if clip.stamped and clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION:
+    if clip.stamped and clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
         message = f"{clip.rate_hz:.3g} pictures per second, between which hardly anything moves"
         found.append(Finding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work"))
     return found
@@ -50,15 +49,15 @@ def _holes(clip: Clip, steps_s: np.ndarray, usual_s: float) -> list[Finding]:
     before = np.flatnonzero(steps_s > _HOLE * usual_s)
     if not before.size or before.size > _UNEVEN_SHARE * len(clip):
         return []
-    lost = int(np.round(steps_s[before] / usual_s - 1).sum())
-    places: tuple[Stretch, ...] = tuple((int(i), int(i) + 1) for i in before)
+    lost = int(np.round((steps_s[before] / usual_s - 1) * np.diff(clip["position"])[before]).sum())
+    places = clip.positions(tuple((int(i), int(i) + 1) for i in before))
     what = "time stamps leave" if clip.stamped else "numbers in the names leave"
     message = f"{what} {before.size} hole(s), about {lost} picture(s) were dropped (between frames {worded(places)})"
     return [Finding("warning", "frames-dropped", message, "", places)]
 
 
 def _length(clip: Clip, claimed_s: float | None) -> list[Finding]:
-    if claimed_s is None or not clip.stamped or not clip.rate_hz:
+    if claimed_s is None or not clip.is_whole or not clip.stamped or not clip.rate_hz:
         return []
     times_s = clip["time_s"]
     read_s = float(times_s[-1] - times_s[0]) + 1 / clip.rate_hz

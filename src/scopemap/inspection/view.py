@@ -32,7 +32,7 @@ class Figures:
 
     Attributes
     ----------
-    position : in the input, from 0. index, time_s : as the reader has them.
+    position : in the input, from 0, as `--frames` counts. index, time_s : as the reader has them.
     blank : whether it shows nothing, or next to nothing that is not black. brightness : mean level in the field, of
     255.
     detail : as the tracker measures how clear a picture is. change : mean difference from the last picture that was no
@@ -93,40 +93,42 @@ class Viewer:
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
-        self._position = 0
 
-    def __call__(self, rgb: np.ndarray, frame: Frame) -> View:
-        """Return the view of a picture (H, W, 3) uint8, and of the frame that a run makes of it."""
+    def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> View:
+        """Return the view of the picture (H, W, 3) uint8 at a position, and of the frame that a run makes of it."""
         small = smaller(rgb, SMALL_PX)
         lit = is_lit(small, _MASK.dark_level)
         field = self._field(lit, np.ones_like(lit))
         masked = self._masker(frame)
-        figures = self._figures(rgb, small, lit, field, masked)
-        self._position += 1
+        figures = self._figures(position, rgb, (small, lit, field), masked)
         return View(rgb, small, lit, field, masked, figures)
 
     def _figures(
-        self, rgb: np.ndarray, small: np.ndarray, lit: np.ndarray, field: np.ndarray, masked: Frame
+        self, position: int, rgb: np.ndarray, reduced: tuple[np.ndarray, np.ndarray, np.ndarray], masked: Frame
     ) -> Figures:
+        small, lit, field = reduced
         inside = field if field.any() else np.ones_like(field)
-        pixels = small[inside]
-        middle = np.sort(pixels, axis=1)[:, 1]
-        red, green, blue = (
-            pixels[middle < _MASK.bright_level].mean(0) if (middle < _MASK.bright_level).any() else (0, 0, 0)
-        )
+        count, mask = np.count_nonzero(inside), inside.astype(np.uint8)
+        red, green, blue = cv2.split(small)
+        low, high = cv2.min(red, green), cv2.max(red, green)
+        middle = cv2.max(low, cv2.min(high, blue))
+        clipped = (middle >= _MASK.bright_level) & inside
+        means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
+        lit_share = np.count_nonzero(lit & inside) / count
+        highlights = specular(cv2.min(low, blue), inside, _MASK.highlight_ratio) & inside
         return Figures(
-            position=self._position,
+            position=position,
             index=masked.index,
             time_s=masked.time_s,
-            blank=is_constant(small) or float(lit[inside].mean()) < _LEAST_LIT,
-            brightness=float(pixels.mean()),
+            blank=bool(is_constant(small) or lit_share < _LEAST_LIT),
+            brightness=sum(cv2.mean(small, mask)[:3]) / 3,
             detail=detail_of(masked),
             change=self._change(rgb, small),
             motion=self._motion(small),
-            redness=float(red / max(green, blue, 1.0)),
-            clipped=float((middle >= _MASK.bright_level).mean()),
-            dark=1 - float(lit[inside].mean()),
-            highlights=float(specular(small.min(-1), inside, _MASK.highlight_ratio)[inside].mean()),
+            redness=means[0] / max(means[1], means[2], 1.0),
+            clipped=np.count_nonzero(clipped) / count,
+            dark=1 - lit_share,
+            highlights=np.count_nonzero(highlights) / count,
             usable=float(masked.valid.mean()),
         )
 

@@ -1,0 +1,68 @@
+"""Opening a data set for its truth as a run read it: the same size, the same view of two, the same camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from scopemap.config import Config, InputSettings
+from scopemap.datasets import Sequence, open_sequence
+from scopemap.errors import CalibrationError, InputError, SettingsError
+
+_SAME_CAMERA_PX = 0.01
+
+
+def open_truth(run: Path, truth: Path) -> Sequence:
+    """Return the data set in `truth`, rectified as the run in folder `run` rectified its input.
+
+    The camera is the data set's own; where that is unknown, does not fit or is not the run's, it is the one that the
+    run kept, so that depth is compared pixel by pixel. Any folder or file may stand for a run: what it does not say is
+    left to the data set. Raises as `open_sequence`.
+    """
+    size, settings = working_size(run), _input_settings(run)
+    kept = run / "source_camera.yaml"
+    try:
+        sequence = open_sequence(truth, size=size, settings=settings)
+    except CalibrationError:
+        if not kept.is_file():
+            raise
+    else:
+        if not kept.is_file() or (sequence.calibrated and is_camera_of(run, sequence)):
+            return sequence
+    exact = settings.model_copy(update={"camera_fit": "exact"})
+    return open_sequence(truth, camera=kept, size=size, settings=exact)
+
+
+def is_camera_of(run: Path, sequence: Sequence) -> bool:
+    """Whether the working camera of a run is that of the sequence; `InputError` where nothing tells the run's."""
+    camera = _camera_of(run)
+    return all(
+        abs(camera[name] - getattr(sequence.camera, name)) <= _SAME_CAMERA_PX for name in ("fx", "fy", "cx", "cy")
+    )
+
+
+def working_size(run: Path) -> tuple[int, int] | None:
+    """Return the working size (width, height) of a run, which its depth maps have; None where nothing tells."""
+    try:
+        camera = _camera_of(run)
+    except InputError:
+        return None
+    return int(camera["width"]), int(camera["height"])
+
+
+def _camera_of(run: Path) -> dict[str, float]:
+    try:
+        camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
+        return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"cannot tell the camera of the run {run} from its provenance.json: {error}") from None
+
+
+def _input_settings(run: Path) -> InputSettings:
+    """How the run read its input; truth is thinned by nothing: frames are found by their numbers."""
+    file = run / "config.toml"
+    try:
+        settings = Config.load(file=file).input if file.is_file() else InputSettings()
+    except SettingsError:  # of another version
+        settings = InputSettings()
+    return settings.model_copy(update={"fps": None, "skip_duplicates": False})
