@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from scopemap import Config, open_sequence, read_trajectory, reconstruct
+from scopemap import Config, open_sequence, reconstruct
+from scopemap.datasets.reference import read_reference
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.phantom import PhantomSpec, write_phantom
@@ -88,6 +89,8 @@ def real_runs(data: Path) -> Iterator[Run]:
     yield Run("cecum_t1_a, Depth Anything files, near-far, RAFT small, LPIPS", cecum, "sim3", files | near_far | raft)
     yield Run("the same, DIS, structural similarity", cecum, "sim3", files | near_far | LIGHT)
     yield Run("the same, no back end", cecum, "sim3", files | near_far | LIGHT | TRACKED)
+    one_field = {"input.deinterlace": True}
+    yield Run("the same, one field of each picture", cecum, "sim3", files | near_far | LIGHT | one_field)
     yield Run("anchored by shading, DIS", cecum, "sim3", files | {"depth.anchor": "shading"} | LIGHT)
     yield Run("cecum_t1_a, scopenet, RAFT small, LPIPS", cecum, "sim3", raft)
     yield Run("cecum_t1_a, scopenet, DIS, structural similarity", cecum, "sim3", LIGHT)
@@ -163,9 +166,10 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
 def row(run: Run, out: Path | None) -> str:
     """Reconstruct, measure, and return the table row."""
     started = time.perf_counter()
-    result = reconstruct(open_sequence(run.source), Config.load(settings=run.settings), out=out)
+    config = Config.load(settings=run.settings)
+    result = reconstruct(open_sequence(run.source, settings=config.input), config, out=out)
     ms = 1e3 * (time.perf_counter() - started) / len(result.records)
-    matched = match(result.trajectory, read_trajectory(run.source), run.align)
+    matched = match(result.trajectory, read_reference(run.source), run.align)
     report, mesh_file = pose_report(matched), run.source / "mesh_truth.ply"
     surface = ""
     if mesh_file.is_file() and len(result.mesh.faces):
