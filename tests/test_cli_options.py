@@ -94,3 +94,18 @@ def test_progress_comes_now_and_then(
     assert [line.split(":")[0] for line in lines] == [f"frame {n}" + " of 100" * (total is not None) for n in (10, 20)]
     assert all("1.0 frames/s" in line and line.endswith("lost: too dark") for line in lines)
     assert all(("90 s left" in line or "80 s left" in line) == (total is not None) for line in lines)
+
+
+def test_what_is_prepared_before_the_first_frame_slows_no_rate(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: clock.now)
+    with run_progress(100, silent=False) as observers:
+        clock.now = 60.0
+        observers[0](_step())  # type: ignore[arg-type]
+        for _ in range(20):
+            clock.now += 0.5
+            observers[0](_step())  # type: ignore[arg-type]
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == ["frame 1 of 100: ok", "frame 21 of 100: 2.0 frames/s, 40 s left, ok"]

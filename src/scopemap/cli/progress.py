@@ -36,11 +36,13 @@ def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[
             TextColumn("{task.fields[state]}"),
         )
         with Progress(*columns, console=Console(stderr=True)) as bar:
-            task, state = bar.add_task("", total=total, rate="", state=""), _State(total)
+            # An unknown camera is looked for, kernels are compiled, networks loaded, before a frame passes.
+            task, state = bar.add_task("", total=total, rate="", state="preparing"), _State(total)
 
             def show(step: Step) -> None:
                 state.add(step)
-                bar.update(task, advance=1, rate=f"{state.rate:.1f} frames/s", state=state.text)
+                rate = "" if state.rate is None else f"{state.rate:.1f} frames/s"
+                bar.update(task, advance=1, rate=rate, state=state.text)
 
             yield (show,)
 
@@ -53,10 +55,13 @@ class _State:
         self._total = total
 
     @property
-    def rate(self) -> float:
-        return self.done / max(time.perf_counter() - self.started, 1e-9)
+    def rate(self) -> float | None:
+        """Frames per second since the first one, which waits for all that is prepared; None so far."""
+        return (self.done - 1) / max(time.perf_counter() - self.started, 1e-9) if self.done > 1 else None
 
     def add(self, step: Step) -> None:
+        if self.done == 0:
+            self.started = time.perf_counter()
         self.done += 1
         if step.track.status == "lost":
             self.lost += 1
@@ -80,9 +85,12 @@ class _Lines:
         if now - self._last < _SECONDS_BETWEEN_LINES and state.done != self._total:
             return
         self._last = now
-        left = "" if not self._total else f", {max(self._total - state.done, 0) / state.rate:.0f} s left"
+        speed = ""
+        if state.rate is not None:
+            left = "" if not self._total else f", {max(self._total - state.done, 0) / state.rate:.0f} s left"
+            speed = f"{state.rate:.1f} frames/s{left}, "
         total = f" of {self._total}" if self._total else ""
-        typer.echo(f"frame {state.done}{total}: {state.rate:.1f} frames/s{left}, {state.text}", err=True)
+        typer.echo(f"frame {state.done}{total}: {speed}{state.text}", err=True)
 
 
 @contextmanager
