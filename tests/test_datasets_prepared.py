@@ -14,7 +14,7 @@ from drawn_videos import HEIGHT, WIDTH, above, beside, beside_squeezed, encode, 
 from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.config import InputSettings
-from scopemap.datasets import open_sequence
+from scopemap.datasets import open_sequence, prepared
 from scopemap.errors import CalibrationError, InputError
 from scopemap.pictures.duplicates import difference, repeats
 from scopemap.pictures.interlacing import combing
@@ -84,6 +84,25 @@ def test_ordinary_videos_and_data_sets_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'c3vd' knows which view is meant; leave input\.stereo=left-right"):
         open_sequence(folder, settings=InputSettings(stereo="left-right"))
     assert open_sequence(folder, settings=InputSettings(stereo="none")).source.name == "c3vd"
+
+
+@pytest.mark.parametrize(("pictures", "held"), [(0.5, 2), (3.5, 3), (100, 8)])
+@pytest.mark.parametrize("video", [True, False])
+def test_few_large_pictures_are_held_at_once(
+    pictures: float, held: int, video: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if video:
+        # Each picture is a key frame, which the video can be entered at.
+        file = encode(tmp_path / "v.mp4", [tissue(n) for n in range(COUNT)], options={"qp": "0", "g": "1"})
+    else:
+        for number in range(COUNT):
+            save(tmp_path / f"{number:03d}.png", tissue(number))
+        file = tmp_path
+    seen = []
+    monkeypatch.setattr(prepared, "_SAMPLES_BYTES", int(pictures * 3 * WIDTH * HEIGHT))
+    monkeypatch.setattr(prepared, "packing", lambda samples, aspect: seen.append(len(samples)))
+    open_sequence(file)
+    assert seen == [held]
 
 
 def test_a_shape_that_looks_like_two_views_is_told(tmp_path: Path) -> None:

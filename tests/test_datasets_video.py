@@ -144,8 +144,8 @@ def test_mended_times_increase(stamps: list[float | None]) -> None:
         ([7.5, 7.54, 7.58], [7.5, 7.54, 7.58], 0),
         ([None, None, None], [0.0, 0.04, 0.08], 3),
         ([0.0, None, 0.08], [0.0, 0.04, 0.08], 1),
-        ([0.0, 0.04, 0.04, 0.08], [0.0, 0.04, 0.08, 0.12], 1),
-        ([0.0, 0.04, 0.0, 0.04], [0.0, 0.04, 0.08, 0.12], 1),
+        ([0.0, 0.04, 0.04, 0.08], [0.0, 0.04, 0.08, 0.12], 2),
+        ([0.0, 2.0, 0.0, 0.04], [0.0, 2.0, 2.04, 2.08], 1),
         ([0.0, 0.04, 1e5, 1e5 + 0.04], [0.0, 0.04, 0.08, 0.12], 1),
     ],
 )
@@ -153,6 +153,26 @@ def test_how_times_are_mended(stamps: list[float | None], expected: list[float],
     mend = TimeStamps(25.0)
     assert [mend(index, stamp) for index, stamp in enumerate(stamps)] == pytest.approx(expected)
     assert mend.repaired == repaired
+
+
+@pytest.mark.parametrize("lag", [1, 2])
+def test_stamps_out_of_order_do_not_make_time_run_away(lag: int) -> None:
+    stated = [(index + (lag if index % 3 == 1 else -lag if index % 3 == 2 else 0)) / 25 for index in range(300)]
+    mend = TimeStamps(25.0)
+    times_s = [mend(index, stamp) for index, stamp in enumerate(stated)]
+    np.testing.assert_allclose(times_s, np.arange(300) / 25, atol=(2 * lag + 1) / 25)
+
+
+def test_a_time_lapse_keeps_its_stamps() -> None:
+    mend = TimeStamps(1 / 90)
+    assert [mend(index, 90.0 * index) for index in range(4)] == [0, 90, 180, 270]
+    assert mend.repaired == 0
+
+
+def test_reordered_frames_in_avi_last_as_long_as_they_do(tmp_path: Path) -> None:
+    source = VideoFile(encode(tmp_path / "v.avi", clip(60, size=(64, 48)), pix_fmt="yuv420p"))
+    times_s = [frame.time_s for frame in source.frames(slice(None))]
+    assert times_s[-1] - times_s[0] == pytest.approx(59 / source.rate_hz, abs=5 / source.rate_hz)
 
 
 def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:

@@ -152,3 +152,10 @@ def test_frames_are_the_same_for_all_methods_of_a_plan() -> None:
     with pytest.raises(ValueError, match="all methods see the same frames"):
         MethodPlan(name="thin", settings={"input.fps": 5})
     assert MethodPlan(name="assumed", settings={"input.focal": "assume"}).settings
+
+
+def test_a_run_on_two_views_is_compared_with_a_data_set_of_one(tmp_path: Path) -> None:
+    folder, run = WRITERS["hamlyn"](tmp_path / "input"), tmp_path / "run"
+    run.mkdir()
+    (run / "config.toml").write_text('input.stereo = "left-right"\n', encoding="utf-8")
+    assert open_truth(run, folder).source.name == "hamlyn"

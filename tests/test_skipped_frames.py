@@ -17,6 +17,8 @@ from scopemap.calibration import write_calibration
 from scopemap.camera import PinholeCamera
 from scopemap.cli import main
 from scopemap.config import Config
+from scopemap.datasets import SourceFrame
+from scopemap.datasets.frame_choice import FrameChoice
 from scopemap.trajectory import read_trajectory
 
 FAST = ("--preset", "realtime", "--quiet")
@@ -120,3 +122,10 @@ def test_the_published_method_takes_every_frame() -> None:
     assert not Config.load("paper").input.skip_duplicates
     assert Config.load("paper").input.focal == "assume"
     assert Config.load().input.skip_duplicates
+
+
+@pytest.mark.parametrize(("rate_hz", "fps", "step"), [(30, 30, 1), (30, 15, 2), (60, 60, 1), (25, 25, 1), (24, 12, 2)])
+def test_stamps_in_milliseconds_thin_evenly(rate_hz: float, fps: float, step: int) -> None:
+    shown = np.zeros((8, 8, 3), np.uint8)
+    frames = [SourceFrame(index, round(index / rate_hz, 3), shown) for index in range(40)]
+    assert [frame.index for frame in FrameChoice(fps)(frames)] == list(range(0, 40, step))

@@ -52,6 +52,57 @@ def test_views_in_circles_are_found() -> None:
     assert found.layout == "left-right"
 
 
+def _blurred(seed: int, scale_px: float, deviation: float) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 1, (2 * HEIGHT, 2 * WIDTH)).astype(np.float32)
+    blurred = cv2.GaussianBlur(noise, (0, 0), scale_px)
+    return 110 + blurred / blurred.std() * deviation
+
+
+def _grey(levels: np.ndarray) -> np.ndarray:
+    return np.clip(levels, 0, 255).astype(np.uint8)[..., None].repeat(3, 2)
+
+
+@pytest.mark.parametrize("disparity", [-0.02, 0.01, 0.03, 0.05])
+@pytest.mark.parametrize("stack", [np.hstack, np.vstack])
+def test_other_disparities_are_found(disparity: float, stack: Callable[..., np.ndarray]) -> None:
+    assert packing([stack(stereo(number, disparity)) for number in NUMBERS]) is not None
+
+
+@pytest.mark.parametrize(("scale_px", "deviation"), [(20, 6), (8, 8), (5, 12)])
+@pytest.mark.parametrize("gap", [0.5, 0.45])
+@pytest.mark.parametrize("peak", [150, 400])
+def test_reflections_of_two_lamps_are_not_stereo(scale_px: float, deviation: float, gap: float, peak: float) -> None:
+    v, u = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH]
+    pictures = []
+    for number in range(8):
+        levels = _blurred(number, scale_px, deviation)
+        for side in (-1, 1):
+            away = np.hypot(u - 2 * WIDTH * (0.45 + 0.02 * number + side * gap / 2), v - HEIGHT * (0.7 + 0.1 * number))
+            levels += peak * np.exp(-(away**2) / 300)
+        pictures.append(_grey(levels))
+    assert packing(pictures) is None
+    assert not any(packing([one]) for one in pictures)
+
+
+@pytest.mark.parametrize(("scale_px", "deviation"), [(25, 8), (6, 20)])
+@pytest.mark.parametrize("level", [200, 255])
+def test_text_in_both_halves_is_not_stereo(scale_px: float, deviation: float, level: int) -> None:
+    pictures = [_grey(_blurred(number, scale_px, deviation)) for number in range(6)]
+    for view in pictures:
+        for left in (20, 20 + WIDTH):
+            cv2.putText(view, "PATIENT 123", (left, HEIGHT), cv2.FONT_HERSHEY_SIMPLEX, 0.8, [level] * 3, 2)
+            cv2.rectangle(view, (left, HEIGHT + 20), (left + 100, HEIGHT + 60), [level] * 3, 2)
+    assert packing(pictures) is None
+
+
+def test_stereo_with_text_over_both_views_is_found() -> None:
+    pictures = [beside(number) for number in NUMBERS]
+    for view in pictures:
+        for left in (10, 10 + WIDTH):
+            cv2.putText(view, "PATIENT", (left, HEIGHT // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.8, [255] * 3, 2)
+    assert packing(pictures) is not None
+
+
 def test_views_of_different_scenes_are_not_stereo() -> None:
     assert packing([np.hstack([tissue(n), tissue(n, seed=4)]) for n in NUMBERS]) is None
 

@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 from scopemap.config import Config, InputSettings
-from scopemap.datasets import Sequence, open_sequence
+from scopemap.datasets import Sequence, open_sequence, open_source
+from scopemap.datasets.prepared import OF_UNKNOWN_VIEWS
 from scopemap.errors import CalibrationError, InputError, SettingsError
 
 _SAME_CAMERA_PX = 0.01
@@ -20,6 +21,8 @@ def open_truth(run: Path, truth: Path) -> Sequence:
     left to the data set. Raises as `open_sequence`.
     """
     size, settings = working_size(run), _input_settings(run)
+    if settings.stereo != "auto" and open_source(truth).name not in OF_UNKNOWN_VIEWS:
+        settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader knows which view is meant
     kept = run / "source_camera.yaml"
     try:
         sequence = open_sequence(truth, size=size, settings=settings)

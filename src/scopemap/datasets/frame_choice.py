@@ -12,8 +12,8 @@ from scopemap.pictures.duplicates import repeats
 if TYPE_CHECKING:
     from scopemap.datasets.sequence import SourceFrame
 
-# A 60th of a second written with few digits must not make a frame miss its turn.
-_SLACK = 1e-3
+# Stamps that are written in milliseconds must not make a frame miss its turn; nor may this be a good part of one.
+_SLACK_S, _SLACK_SHARE = 1e-3, 0.25
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FrameChoice:
         start_s, turn, last = math.nan, -math.inf, None
         for frame in frames:
             start_s = frame.time_s if last is None else start_s
-            due = math.floor((frame.time_s - start_s) * self.fps + _SLACK) if self.fps is not None else math.inf
+            due = math.inf if self.fps is None else _slot(frame.time_s - start_s, self.fps)
             if due <= turn and self.fps is not None:
                 self._skip(frame, "thinned", f"beyond {self.fps:g} frames/s")
             elif last is not None and self.skip_repeated and repeats(last.rgb, frame.rgb):
@@ -58,3 +58,7 @@ class FrameChoice:
 
     def _skip(self, frame: SourceFrame, kind: Literal["repeated", "thinned"], reason: str) -> None:
         self.skipped[frame.index] = SkippedFrame(frame.index, frame.time_s, frame.name, kind, reason)
+
+
+def _slot(passed_s: float, fps: float) -> int:
+    return math.floor(passed_s * fps + min(_SLACK_S * fps, _SLACK_SHARE))

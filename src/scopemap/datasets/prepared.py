@@ -22,8 +22,11 @@ from scopemap.pictures.stereo_packing import Packing, packing, squeezed_views, s
 UNKNOWN_MAKE = ("video", "images", "dicom")
 """Readers of pictures that nothing more is known of; those of data sets know what a picture holds, and have truth."""
 
-_NO_DATA_SET = (*UNKNOWN_MAKE, "rosbag")
+OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag")
+"""Readers that do not know whether their pictures hold two views: `input.stereo` may say it."""
+
 _SAMPLES, _SAMPLED_EVERY = 8, 10
+_FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
@@ -33,7 +36,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
     With `stereo` = auto, videos and folders of images that belong to no data set are looked at, and interlaced ones
     told of. Raises `InputError` where `stereo` names the views of a data set, whose reader knows them.
     """
-    if settings.stereo in _LEFT and source.name not in _NO_DATA_SET:
+    if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
         raise InputError(
             f"reading {source.path}: the reader of the data set '{source.name}' knows which view is meant; leave "
             f"input.stereo={settings.stereo} (--stereo) out"
@@ -125,16 +128,18 @@ def of_one_view(source: Source) -> str:
 
 
 def _samples(source: Source) -> list[np.ndarray]:
-    """Return a few pictures from all parts of the input."""
+    """Return a few pictures from all parts of the input, fewer where they are large: all are held at once."""
+    picture_bytes = max(1, 3 * source.width * source.height)
+    count = max(_FEWEST_SAMPLES, min(_SAMPLES, _SAMPLES_BYTES // picture_bytes))
     found: list[np.ndarray] = []
     told = len(source.warnings)
     # Where reading stops or finds faults, the run says so: it may not reach them.
     with suppress(InputError):
         if isinstance(source, VideoFile):
-            found.extend(source.samples(_SAMPLES))
+            found.extend(source.samples(count))
         else:
-            step = max(1, (source.count or 0) // _SAMPLES) if isinstance(source, ImageFolder) else _SAMPLED_EVERY
-            found.extend(frame.rgb for frame in islice(source.frames(slice(0, None, step)), _SAMPLES))
+            step = max(1, (source.count or 0) // count) if isinstance(source, ImageFolder) else _SAMPLED_EVERY
+            found.extend(frame.rgb for frame in islice(source.frames(slice(0, None, step)), count))
     del source.warnings[told:]
     return found
 

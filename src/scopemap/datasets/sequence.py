@@ -243,11 +243,10 @@ class Sequence:
     def _why_so_few(self) -> str:
         if not self.skipped:
             return ""
-        frame = self.skipped[-1]
-        return (
-            f" ({len(self.skipped)} skipped: frame {frame.index} {frame.reason}; a higher input.fps or "
-            "input.skip_duplicates=false uses more)"
-        )
+        frame, kinds = self.skipped[-1], {skipped.kind for skipped in self.skipped}
+        remedies = {"thinned": "a higher input.fps", "repeated": "input.skip_duplicates=false"}
+        remedy = " or ".join(text for kind, text in remedies.items() if kind in kinds)
+        return f" ({len(self.skipped)} skipped: frame {frame.index} {frame.reason}; {remedy} uses more)"
 
     def _truth(self, index: int) -> Truth | None:
         truth = self.source.truth(index)

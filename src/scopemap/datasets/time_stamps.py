@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-# A recording may pause; a stamp that runs ahead by more is of another clock.
-_LONGEST_GAP_S = 60.0
+# A recording may pause, a time lapse be slow; a stamp that runs ahead by more is of another clock.
+_LONGEST_GAP_S, _LONGEST_GAP_FRAMES = 60.0, 10
+# AVI and WMV keep the stamps of reordered frames slightly out of order; a clock that goes back by more began anew.
+_DISORDER_S = 1.0
 
 
 class TimeStamps:
     """Repairs stamps while frames are read in order.
 
     rate_hz : frames per second. A stamp that is missing is put at the rate after the last one that was there. One that
-    does not increase, or runs ahead by more than a minute, is too, and all that follow are moved with it: files that
-    were joined each begin at 0.
+    does not increase is too; where it goes back by more than a second, or runs ahead by more than a minute (ten frames
+    of a slow clip), all that follow are moved with it: files that were joined each begin at 0.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -36,7 +38,8 @@ class TimeStamps:
         if stamp_s is not None and self._is_meant(stamp_s + self._shift_s):
             time_s = stamp_s + self._shift_s
         else:
-            self._shift_s += 0.0 if stamp_s is None else time_s - (stamp_s + self._shift_s)
+            if stamp_s is not None and not self._is_disordered(stamp_s + self._shift_s):
+                self._shift_s = time_s - stamp_s
             self.first_repaired = index if self.first_repaired is None else self.first_repaired
             self.repaired += 1
         if stamp_s is not None:
@@ -46,4 +49,8 @@ class TimeStamps:
         return time_s
 
     def _is_meant(self, time_s: float) -> bool:
-        return self._last_s is None or 0 < time_s - self._last_s <= _LONGEST_GAP_S
+        longest_s = max(_LONGEST_GAP_S, _LONGEST_GAP_FRAMES / self._rate_hz)
+        return self._last_s is None or 0 < time_s - self._last_s <= longest_s
+
+    def _is_disordered(self, time_s: float) -> bool:
+        return self._last_s is not None and -_DISORDER_S <= time_s - self._last_s <= 0

@@ -62,9 +62,9 @@ class VideoFile(KnowsNothing):
             rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
             if 0 < rate_hz <= _HIGHEST_RATE_HZ:
                 self.rate_hz = rate_hz
-            else:
-                self.stamped = False
-                self.notes.append(f"time stamps: frame number / {DEFAULT_RATE_HZ:g} s (the video holds none)")
+            self.stamped = any(frame.time is not None for frame in first)
+            if not self.stamped:
+                self.notes.append(f"time stamps: frame number / {self.rate_hz:g} s (the video holds none)")
             aspect = float(stream.sample_aspect_ratio or 1.0)
             self.pixel_aspect = 1 / aspect if sideways else aspect
             self._counted = stream.frames > 0
@@ -171,7 +171,7 @@ class VideoFile(KnowsNothing):
             self._warn(f"the video {self.path.name} breaks off after {read}{of} frames; these were used")
         if damaged:
             self._warn(f"the video {self.path.name} holds {damaged} damaged picture(s), which were left out")
-        if stamps.repaired:
+        if stamps.repaired and self.stamped:
             self._warn(
                 f"the video {self.path.name} has {stamps.repaired} time stamp(s) that are missing, do not increase or "
                 f"jump, first at frame {stamps.first_repaired}; these frames follow those before them at "

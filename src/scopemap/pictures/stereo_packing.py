@@ -2,13 +2,16 @@
 
 A shape that is unusual for one view raises the suspicion; only pictures confirm it: the halves of a stereo picture show
 the same tissue, moved sideways by a few percent and not at all up or down. What is compared is fine detail: the light
-of an ordinary picture, brightest in its middle and dark around, is alike in its halves, too.
+of an ordinary picture, brightest in its middle and dark around, is alike in its halves, too. So are the reflections of
+two lamps and what is written over both halves: saturated pixels and those that never change are left out, bright ones
+count no more than others, and the halves must agree in several parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -17,7 +20,10 @@ import numpy as np
 Layout = Literal["left-right", "top-bottom"]
 
 LEAST_CORRELATION = 0.6
-"""Normalised cross-correlation of the detail of two halves that are two views of one scene."""
+"""Normalised cross-correlation of the detail of two halves, and of their parts, that are two views of one scene."""
+
+LEAST_CORRELATION_USUAL_SHAPE = 0.64
+"""The same for pictures that have the shape of one view."""
 
 # Width over height of one view as it is displayed; beyond it the view was squeezed, or it is none.
 _NARROWEST, _WIDEST = 0.95, 2.0
@@ -32,6 +38,12 @@ _LEAST_LEAD = 0.25
 # Grey levels of detail: less is what coding makes of an even slope.
 _LEAST_DEVIATION = 2.0
 _LEAST_PICTURES_SHARE = 0.25
+_SATURATED_LEVEL, _MOST_SATURATED_SHARE = 250, 0.1
+# Detail beyond so many standard deviations counts as that many.
+_MOST_DEVIATIONS = 2.5
+_TILES, _LEAST_TILES, _LEAST_TILES_SHARE = 3, 3, 0.5
+# A pixel whose grey level changes by less over this many pictures or more is written over them.
+_STILL_LEVELS, _LEAST_STILL_PICTURES, _MOST_STILL_SHARE = 3, 3, 0.5
 
 
 @dataclass(frozen=True)
@@ -96,24 +108,68 @@ def packing(pictures: Sequence[np.ndarray], pixel_aspect: float = 1.0) -> Packin
     layouts: tuple[Layout, Layout] = ("left-right", "top-bottom")
     found = []
     for layout in layouts:
-        values = [value for picture in pictures if (value := _alike(*halves(picture, layout))) is not None]
+        least = LEAST_CORRELATION
+        if suspected(width, height, pixel_aspect) != layout:
+            least = LEAST_CORRELATION_USUAL_SHAPE
+        values = _correlations(pictures, layout)
         enough = len(values) >= max(1, _LEAST_PICTURES_SHARE * len(pictures))
-        if enough and np.median(values) > LEAST_CORRELATION:
+        if enough and np.median(values) > least:
             squeezed = squeezed_views(width, height, layout, pixel_aspect)
             found.append(Packing(layout, squeezed, float(np.median(values))))
     return max(found, key=lambda one: one.correlation, default=None)
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> float | None:
-    """Return the correlation of the detail of two halves, 0 where it singles out no shift; None: nothing to compare."""
-    if min(one.shape[:2]) < 16:
-        return None
-    (first, lit), (second, other_lit) = _detail(one), _detail(other)
+def _correlations(pictures: Sequence[np.ndarray], layout: Layout) -> list[float]:
+    """Return the correlation of the halves of the pictures in which there is something to compare."""
+    views = [halves(picture, layout) for picture in pictures]
+    if min(views[0][0].shape[:2]) < 16:
+        return []
+    firsts, seconds = [_comparable([pair[side] for pair in views]) for side in (0, 1)]
+    values = [_alike(one, other) for one, other in zip(firsts, seconds, strict=True)]
+    return [value for value in values if value is not None]
+
+
+def _comparable(views: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return each view as a small grey picture (h, w) and which of its pixels are compared (h, w), 0 or 1, float32.
+
+    Left out are those that are black or saturated, and what stays the same while most of the view changes.
+    """
+    size = (_WIDTH_PX, max(16, round(_WIDTH_PX * views[0].shape[0] / views[0].shape[1])))
+    small = [_small(view, size) for view in views]
+    greys = np.stack([grey for grey, _ in small])
+    used = np.stack([_eroded(one) for _, one in small])
+    if len(views) >= _LEAST_STILL_PICTURES:
+        still = np.ptp(greys, axis=0) < _STILL_LEVELS
+        lit = used.any(axis=0)
+        # A video that stands still as a whole has nothing written over it that could be told from it.
+        if lit.any() and still[lit].mean() < _MOST_STILL_SHARE:
+            used *= _eroded((~still | ~lit).astype(np.float32))
+    return list(zip(greys, used, strict=True))
+
+
+def _small(view: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a view in grey at a small size, and which pixels are neither black nor touched by saturated ones."""
+    grey = cv2.cvtColor(view, cv2.COLOR_RGB2GRAY)
+    saturated = cv2.resize((grey >= _SATURATED_LEVEL).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return small, ((small > _BLACK_LEVEL) & (saturated < _MOST_SATURATED_SHARE)).astype(np.float32)
+
+
+def _eroded(mask: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.erode(mask, np.ones((3, 3))))
+
+
+def _alike(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
+    """Return the correlation of the detail of two halves, 0 where they agree in no one shift or in too few parts.
+
+    Each half is a grey picture and the pixels of it that are compared; None: nothing to compare.
+    """
+    (first, used), (second, other_used) = _detail(*one), _detail(*other)
     height, width = first.shape
     across, up = round(_MOST_SHIFT_SHARE * width), round(_MOST_SHIFT_SHARE * height)
     middle = np.s_[up : height - up, across : width - across]
     least_deviation = min(first[middle].std(), second[middle].std())
-    if min(lit, other_lit) < _LEAST_LIT_SHARE or least_deviation < _LEAST_DEVIATION:
+    if min(used, other_used) < _LEAST_LIT_SHARE or least_deviation < _LEAST_DEVIATION:
         return None
     scores = cv2.matchTemplate(second, first[middle], cv2.TM_CCOEFF_NORMED)
     _, best, _, (at, row) = cv2.minMaxLoc(scores)
@@ -122,15 +178,43 @@ def _alike(one: np.ndarray, other: np.ndarray) -> float | None:
     reach = max(3, round(_DETAIL_SHARE * 2 * width))
     v, u = np.mgrid[: scores.shape[0], : scores.shape[1]]
     elsewhere = scores[np.hypot(v - row, u - at) > reach]
-    return float(best) if elsewhere.size and best - elsewhere.max() > _LEAST_LEAD else 0.0
+    if not elsewhere.size or best - elsewhere.max() <= _LEAST_LEAD:
+        return 0.0
+    tiles = _tiles(first, second, (at - across, row - up))
+    agree = sum(tile > LEAST_CORRELATION for tile in tiles)
+    return float(best) if agree >= max(_LEAST_TILES, _LEAST_TILES_SHARE * len(tiles)) else 0.0
 
 
-def _detail(view: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return a view (h, w) at a small size less its local mean, 0 where it is black, and the share that is not."""
-    size = (_WIDTH_PX, max(16, round(_WIDTH_PX * view.shape[0] / view.shape[1])))
-    grey = cv2.resize(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    lit = cv2.erode((grey > _BLACK_LEVEL).astype(np.float32), np.ones((3, 3)))
+def _tiles(first: np.ndarray, second: np.ndarray, shift: tuple[int, int]) -> list[float]:
+    """Return the correlation of each part of the first view that has detail with the second at about a shift, px."""
+    height, width = first.shape
+    across, up = shift
+    # The depth of the tissue, hence the shift, differs from part to part.
+    reach, rise = max(2, round(_DETAIL_SHARE * width)), max(1, round(0.02 * height))
+    rows, columns = (np.linspace(0, length, _TILES + 1).astype(int) for length in first.shape)
+    found = []
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            # Of the tile, what the other view shows, too.
+            low, high = max(left, -across), min(right, width - across)
+            upper, lower = max(top, rise - up), min(bottom, height - rise - up)
+            if high - low < (right - left) / 2 or lower - upper < (bottom - top) / 2:
+                continue
+            tile = first[upper:lower, low:high]
+            begin, end = max(0, low + across - reach), min(width, high + across + reach)
+            around = second[upper + up - rise : lower + up + rise, begin:end]
+            if min(tile.std(), around.std()) >= _LEAST_DEVIATION:
+                found.append(float(cv2.matchTemplate(around, tile, cv2.TM_CCOEFF_NORMED).max()))
+    return found
+
+
+def _detail(grey: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return a view (h, w) less its local mean, clipped, 0 where it is not used, and the share that is."""
     sigma_px = _DETAIL_SHARE * _WIDTH_PX
-    weight = cv2.GaussianBlur(lit, (0, 0), sigma_px)
-    mean = cv2.GaussianBlur(grey * lit, (0, 0), sigma_px) / np.maximum(weight, 1e-6)
-    return (grey - mean) * lit, float(lit.mean())
+    weight = cv2.GaussianBlur(used, (0, 0), sigma_px)
+    mean = cv2.GaussianBlur(grey * used, (0, 0), sigma_px) / np.maximum(weight, 1e-6)
+    detail = (grey - mean) * used
+    # By the median: few bright pixels must not widen what they are clipped to.
+    deviation = 1.4826 * float(np.median(np.abs(detail[used > 0]))) if used.any() else 0.0
+    most = _MOST_DEVIATIONS * max(deviation, 1.0)
+    return np.clip(detail, -most, most), float(used.mean())
