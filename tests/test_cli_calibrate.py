@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import pytest
 from drawn_boards import CHECKERBOARD, PINHOLE, SIZE, Studio
 from drawn_inputs import save
 from drawn_videos import encode
+from front_door import call
 
 from scopemap.calibration import read_calibration
-from scopemap.cli import main
 from scopemap.datasets import open_sequence
 from scopemap.datasets.images import read_image
 from scopemap.errors import CalibrationError
@@ -31,14 +30,11 @@ def calibrate(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.chdir(tmp_path)
 
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["scopemap", "calibrate", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        said = capfd.readouterr()
-        return int(caught.value.code or 0), said.out, said.err
+    def said(*arguments: object) -> tuple[int, str, str]:
+        code, printed = call("calibrate", *arguments), capfd.readouterr()
+        return code, printed.out, printed.err
 
-    return call
+    return said
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import pytest
 from drawn_clips import clip, inset, text, write
-
-from scopemap.cli import main
+from front_door import call
 
 Say = Callable[..., tuple[int, str, str]]
 
@@ -24,14 +22,11 @@ def say(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["scopemap", "inspect", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        said = capfd.readouterr()
-        return int(caught.value.code or 0), said.out, said.err
+    def said(*arguments: object) -> tuple[int, str, str]:
+        code, printed = call("inspect", *arguments), capfd.readouterr()
+        return code, printed.out, printed.err
 
-    return call
+    return said
 
 
 @pytest.fixture(scope="module")
