@@ -104,3 +104,18 @@ def test_where_no_sighting_says_anything_the_tracked_motion_stays() -> None:
     found = adjust(Problem(INTRINSICS, tracked, points, some, Priors())).T_camera_world
     np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
     np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
+
+
+def test_how_certain_a_depth_is_follows_from_the_way_between_its_views() -> None:
+    rng = np.random.default_rng(8)
+    pixels, depth_mm, way_mm = rng.uniform([10, 10], [150, 118], (50, 2)), rng.uniform(25, 60, 50), 4.0
+    rays = np.column_stack([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(50)])
+    T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, -way_mm, 0, 0]))])
+    moved = depth_mm[:, None] * rays - [way_mm, 0, 0]
+    seen = INTRINSICS[:2] * moved[:, :2] / moved[:, 2:] + INTRINSICS[2:]
+    # The last point is seen by nobody else.
+    points = Points(np.zeros(50, int), rays, np.log(depth_mm), np.full(50, 0.1))
+    found = adjust(Problem(INTRINSICS, T, points, Sightings(np.arange(49), np.ones(49, int), seen[:49]), Priors()))
+    # A pixel moves by fx way / depth, and the floor of a pixel's deviation is 0.1.
+    np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (INTRINSICS[0] * way_mm), rtol=0.02)
+    assert np.isinf(found.log_depth_sigma[49])

@@ -17,6 +17,7 @@ from scopemap.pipeline import Estimators, Pipeline, Step
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
+EXPONENT = 1.3
 SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__keyframe_every": 2}
 
 
@@ -30,7 +31,7 @@ class _Bent:
     def estimate(self, frame: Any) -> Any:
         found = self.inner.estimate(frame)
         middle = np.nanmedian(found.values)
-        return replace(found, kind="depth", values=middle * (found.values / middle) ** np.float32(1.3))
+        return replace(found, kind="depth", values=middle * (found.values / middle) ** np.float32(EXPONENT))
 
     def provenance(self) -> dict[str, str]:
         return {"depth": self.name}
@@ -38,6 +39,7 @@ class _Bent:
 
 @dataclass(frozen=True)
 class _Run:
+    step_sigma: float
     phantom: Path
     out: Path
     steps: list[Step]
@@ -45,8 +47,8 @@ class _Run:
     tracked: Reconstruction
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
+@pytest.fixture(scope="module", params=[0.0, 0.1], ids=["depth scaled", "depth bent"])
+def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> _Run:
     folder = tmp_path_factory.mktemp("backend")
     phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}", frames=FRAMES)
     create, steps = Estimators.create, []
@@ -57,11 +59,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Estimators, "create", bent)
-        config = with_true_depth(phantom, **SETTINGS)
+        config = with_true_depth(phantom, **SETTINGS, backend__depth_step_sigma=request.param)
         adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
         plain = with_true_depth(phantom, **SETTINGS, backend__method="none")
         tracked = reconstruct(open_sequence(phantom), plain)
-    return _Run(phantom, folder / "out", steps, adjusted, tracked)
+    return _Run(request.param, phantom, folder / "out", steps, adjusted, tracked)
 
 
 def _turn_errors_rad(result: Reconstruction, phantom: Path) -> np.ndarray:
@@ -80,8 +82,8 @@ def test_a_lost_frame_stays_lost_where_the_camera_was_last_seen(run: _Run) -> No
     np.testing.assert_array_equal(trajectory.T_world_camera[LOST], trajectory.T_world_camera[LOST - 1])
 
 
-def test_depth_maps_in_the_folder_have_the_adjusted_scale(run: _Run) -> None:
-    reader, factors = DepthReader(run.out), []
+def test_depth_maps_in_the_folder_have_the_adjusted_scale_and_shape(run: _Run) -> None:
+    reader, factors, before_all, after_all = DepthReader(run.out), [], [], []
     for step, before, after in zip(run.steps, run.tracked.records, run.adjusted.records, strict=True):
         if step.track.status == "lost":
             continue
@@ -89,8 +91,20 @@ def test_depth_maps_in_the_folder_have_the_adjusted_scale(run: _Run) -> None:
         known = np.isfinite(step.refined.depth_mm)
         kept = reader.read(step.frame.index)
         assert kept is not None
-        np.testing.assert_allclose(kept[known], factors[-1] * step.refined.depth_mm[known], atol=0.02)
+        scaled = factors[-1] * step.refined.depth_mm[known]
+        if run.step_sigma == 0:
+            np.testing.assert_allclose(kept[known], scaled, atol=0.02)
+        before_all.append(_shape_error(scaled, step.raw_mm[known]))
+        after_all.append(_shape_error(kept[known], step.raw_mm[known]))
     assert max(np.abs(np.log(factors))) > 1e-4
+    if run.step_sigma > 0:
+        assert np.mean(after_all) < 0.7 * np.mean(before_all)
+
+
+def _shape_error(depth_mm: np.ndarray, bent_mm: np.ndarray) -> float:
+    """Mean error of ln depth against the true one, whose power `bent_mm` is, up to a scale."""
+    off = np.log(depth_mm) - np.log(bent_mm) / EXPONENT
+    return float(np.abs(off - np.median(off)).mean())
 
 
 def test_the_mesh_lies_where_adjusted_poses_and_depth_put_it(run: _Run) -> None:

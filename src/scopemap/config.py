@@ -280,6 +280,11 @@ class BackendSettings(Settings):
     )
     depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
+    depth_step_sigma: float = Field(
+        0.1,
+        ge=0,
+        description="how a keyframe's depth may be bent, ln from node to node of a coarse grid; 0: only scaled",
+    )
     turn_sigma_deg: float = Field(3.0, gt=0, description="how far tracked turns between keyframes are trusted")
     way_sigma_share: float = Field(0.1, gt=0, description="the same of ways, over the mean depth")
     max_sigma_px: float = Field(

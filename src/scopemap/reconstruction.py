@@ -204,14 +204,14 @@ class DepthWriter:
         self._write(step.frame.index, step.refined.depth_mm / self._scale_mm)
 
     def correct(self, records: list[FrameRecord], correction: Correction) -> None:
-        """Write the depth of all tracked frames once more, with the scale that the back end gave it."""
+        """Write the depth of all tracked frames once more, as the back end corrected it."""
         for record in records if correction.taken else []:
             if record.track.status != "lost":
                 image = cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED)
                 if image is None:
                     raise InputError(f"cannot read back {self._file(record.index)}: was it removed during the run?")
-                units = np.asarray(image) * np.float32(correction.depth_factor(record.index))
-                self._write(record.index, np.where(units > 0, units, np.nan))
+                units = np.where(np.asarray(image) > 0, image, np.nan).astype(np.float32)
+                self._write(record.index, units * correction.depth_factors(record.index, units * self._scale_mm))
 
     def _file(self, index: int) -> Path:
         return self._folder / f"{index:06d}.png"

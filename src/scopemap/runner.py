@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from scopemap.backend import LARGEST_LOG_FACTOR
 from scopemap.config import Config, FusionSettings
 from scopemap.datasets import Sequence
 from scopemap.depth import DepthEstimator
@@ -175,8 +176,9 @@ def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
 
 
 def _most_depth_mm(config: Config, estimators: Estimators) -> float:
-    """How far depth may reach, mm, with room for the scale that a back end may give a frame (three deviations)."""
-    room = 1.0 if config.backend.method == "none" else math.exp(3 * config.backend.scale_sigma)
+    """How far depth may reach, mm, with room for what a back end may make of it (three deviations of the scale)."""
+    bent = LARGEST_LOG_FACTOR if config.backend.depth_step_sigma > 0 else 0.0
+    room = 1.0 if config.backend.method == "none" else math.exp(3 * config.backend.scale_sigma + bent)
     return estimators.reach_mm(config.depth, room)
 
 

@@ -2,5 +2,6 @@
 
 from scopemap.backend.backend import Backend
 from scopemap.backend.correction import Correction
+from scopemap.backend.depth_grid import LARGEST_LOG_FACTOR
 
-__all__ = ["Backend", "Correction"]
+__all__ = ["LARGEST_LOG_FACTOR", "Backend", "Correction"]

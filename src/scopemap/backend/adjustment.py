@@ -90,12 +90,15 @@ class Solution:
     Attributes
     ----------
     T_camera_world : (K, 4, 4), the first as it was. log_scale : (K,) ln of each keyframe's depth scale.
-    log_depth : (P,). sigma_px : robust standard deviation of the sightings, px. iterations : accepted and refused.
+    log_depth : (P,). log_depth_sigma : (P,) its standard deviation by the sightings alone, keyframes held; infinite
+    where nothing sees a point again. sigma_px : robust standard deviation of the sightings, px. iterations : accepted
+    and refused.
     """
 
     T_camera_world: np.ndarray
     log_scale: np.ndarray
     log_depth: np.ndarray
+    log_depth_sigma: np.ndarray
     sigma_px: float
     iterations: int
 
@@ -122,7 +125,7 @@ def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1
     count = len(problem.T_camera_world)
     state = _State(problem.T_camera_world.copy(), np.zeros(count), problem.points.log_depth.copy())
     if not len(problem.sightings.point) or count < 2:
-        return Solution(state.T, state.scale, state.u, float("nan"), 0)
+        return Solution(state.T, state.scale, state.u, np.full(len(state.u), np.inf), float("nan"), 0)
     if problem.start is not None:
         T, scale = problem.start
         state = _State(T.copy(), scale.copy(), state.u + scale[problem.points.host])
@@ -146,7 +149,7 @@ def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1
         if gain < least_gain:
             break
     T = np.stack([orthonormalised(pose) for pose in state.T])
-    return Solution(T, state.scale, state.u, sigma, iterations)
+    return Solution(T, state.scale, state.u, _log_depth_sigma(problem, state, sigma), sigma, iterations)
 
 
 def _seen(problem: Problem, state: _State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -278,6 +281,17 @@ def _host_sums(problem: Problem, state: _State, host: int, parts: tuple[np.ndarr
     b[scale] -= (hold * off).sum()
     own = (_OWN * keyframes[:, None] + np.arange(_OWN)).ravel()
     return _HostSums(own, A, b, np.arange(here.start, here.stop), h, g, E)
+
+
+def _log_depth_sigma(problem: Problem, state: _State, sigma: float) -> np.ndarray:
+    """Standard deviation of each point's ln depth (P,) by where it is seen again, all keyframes held."""
+    seen, in_host, turn = _seen(problem, state)
+    error, ahead = _errors(problem, seen)
+    weight = np.where(ahead, _cauchy((error**2).sum(1) / sigma**2)[1], 0.0) / sigma**2
+    by_depth = _jacobians(problem.intrinsics, seen, in_host, turn, ahead)[2]
+    information = np.bincount(problem.sightings.point, weight * (by_depth**2).sum(1), len(state.u))
+    with np.errstate(divide="ignore"):
+        return 1 / np.sqrt(information)
 
 
 def _jacobians(

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from scopemap.backend.adjustment import Priors, Problem, adjust
+from scopemap.backend.adjustment import Points, Priors, Problem, Solution, adjust
 from scopemap.backend.correction import Correction, unchanged
+from scopemap.backend.depth_grid import DepthGrid, fit_grid
 from scopemap.backend.links import Linker
 from scopemap.backend.loops import Loop, LoopFinder
 from scopemap.backend.pose_graph import spread_loops
@@ -106,4 +107,17 @@ class _Map:
         if not found.sigma_px <= settings.max_sigma_px:
             return unchanged(index, found.sigma_px)
         T_world_world = inverse(found.T_camera_world) @ inverse(T_world_camera)
-        return Correction(index, T_world_world, found.log_scale, found.sigma_px, loops=loops)
+        grids = self._grids(camera, points, found) if settings.depth_step_sigma > 0 else ()
+        return Correction(index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids)
+
+    def _grids(self, camera: PinholeCamera, points: Points, found: Solution) -> tuple[DepthGrid, ...]:
+        """Fit what each keyframe's depth lacks beside its scale, by its adjusted points."""
+        error = found.log_depth - points.log_depth - found.log_scale[points.host]
+        pixels = points.rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        places = (pixels + 0.5) / [camera.width, camera.height]
+        of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(self.index))]
+        step_sigma = self.settings.depth_step_sigma
+        return tuple(
+            fit_grid(places[own], points.log_depth[own], error[own], found.log_depth_sigma[own], step_sigma)
+            for own in of
+        )

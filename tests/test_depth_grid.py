@@ -1,0 +1,177 @@
+"""The back end's correction of depth: closed forms come back, lies do little harm, what is not known stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import plane_scene
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scopemap.backend import LARGEST_LOG_FACTOR, Backend, Correction
+from scopemap.backend.depth_grid import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid
+from scopemap.config import BackendSettings
+from scopemap.frame import Frame
+
+HEIGHT, WIDTH = 120, 160
+
+
+def _points(rng: np.random.Generator, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, 2) and ln depths (n,) of random points between 20 and 80 mm."""
+    return rng.random((count, 2)), np.log(rng.uniform(20, 80, count))
+
+
+def _image(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(20, 80, (HEIGHT, WIDTH)).astype(np.float32)
+
+
+def _bend(x: np.ndarray, y: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
+    """An error that is linear in everything, which a trilinear grid can follow exactly."""
+    return 0.3 * (x - 0.5) - 0.2 * (y - 0.5) + 0.1 * (log_depth - np.log(40))
+
+
+def test_an_error_linear_in_place_and_ln_depth_is_found_everywhere() -> None:
+    rng = np.random.default_rng(0)
+    places, log_depth = _points(rng, 3000)
+    error = _bend(*places.T, log_depth)
+    grid = fit_grid(places, log_depth, error, np.full(len(error), 0.005), step_sigma=0.3)
+    depth_mm = _image(rng)
+    y, x = (np.mgrid[:HEIGHT, :WIDTH] + 0.5) / np.reshape([HEIGHT, WIDTH], (2, 1, 1))
+    off = grid.log_factor(depth_mm) - _bend(x, y, np.log(depth_mm))
+    assert np.abs(off).mean() < 0.005
+    assert np.abs(off).max() < 0.05
+
+
+def test_organs_at_two_depths_get_a_factor_each_where_they_meet() -> None:
+    rng = np.random.default_rng(1)
+    places = rng.random((800, 2))
+    near = rng.random(800) < 0.5
+    grid = fit_grid(places, np.where(near, np.log(30), np.log(70)), np.where(near, 0.3, -0.2), np.full(800, 0.01), 0.2)
+    depth_mm = np.full((HEIGHT, WIDTH), 70, np.float32)
+    depth_mm[::2] = 30
+    found = grid.log_factor(depth_mm)
+    np.testing.assert_allclose(found[::2], 0.3, atol=0.02)
+    np.testing.assert_allclose(found[1::2], -0.2, atol=0.02)
+
+
+def test_a_quarter_of_lying_points_does_little_harm() -> None:
+    rng = np.random.default_rng(2)
+    places, log_depth = _points(rng)
+    error = _bend(*places.T, log_depth)
+    told = np.where(rng.random(len(error)) < 0.25, error + rng.normal(0, 1.0, len(error)), error)
+    grids = [fit_grid(places, log_depth, e, np.full(len(e), 0.02), 0.1) for e in (error, told)]
+    depth_mm = _image(rng)
+    clean, spoilt = (grid.log_factor(depth_mm) for grid in grids)
+    assert np.abs(clean - spoilt).mean() < 0.015
+
+
+def test_points_that_know_nothing_change_nothing() -> None:
+    rng = np.random.default_rng(3)
+    places, log_depth = _points(rng)
+    wild = rng.normal(0, 1, len(log_depth))
+    for sigma in (np.full(len(wild), np.inf), np.full(len(wild), 1e3)):
+        grid = fit_grid(places, log_depth, wild, sigma, 0.1)
+        assert np.abs(grid.log_factor(_image(rng))).max() < 1e-3
+
+
+def test_fewer_than_ten_points_change_nothing() -> None:
+    places, log_depth = _points(np.random.default_rng(4), 9)
+    grid = fit_grid(places, log_depth, np.full(9, 0.3), np.full(9, 0.01), 0.1)
+    np.testing.assert_array_equal(grid.values, 0)
+
+
+def test_one_depth_for_all_points_is_no_division_by_nothing() -> None:
+    places, _ = _points(np.random.default_rng(5))
+    grid = fit_grid(places, np.full(len(places), 3.7), np.full(len(places), 0.2), np.full(len(places), 0.01), 0.1)
+    np.testing.assert_allclose(grid.log_factor(np.full((8, 8), np.exp(3.7), np.float32)), 0.2, atol=0.01)
+
+
+@given(st.floats(-3, 3), st.floats(0.01, 1.0), st.integers(0, 2**32 - 1))
+def test_no_factor_is_beyond_the_limit_and_unknown_depth_stays_unknown(error: float, step: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places, log_depth = _points(rng, 60)
+    grid = fit_grid(places, log_depth, np.full(60, error), np.full(60, 0.01), step)
+    depth_mm = np.exp(rng.uniform(-3, 9, (20, 30))).astype(np.float32)
+    depth_mm[rng.random(depth_mm.shape) < 0.3] = np.nan
+    found = grid.log_factor(depth_mm)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(depth_mm))
+    assert np.nanmax(np.abs(found), initial=0) <= LARGEST_LOG_FACTOR + 1e-5
+
+
+def test_a_frame_between_two_keyframes_takes_a_share_of_both_grids() -> None:
+    grids = tuple(DepthGrid(np.full((ROWS, COLUMNS, LEVELS), value), 3.0, 4.0) for value in (0.1, 0.3))
+    correction = Correction(np.array([10, 20]), np.stack([np.eye(4)] * 2), np.array([0.0, 0.2]), 0.2, grids=grids)
+    depth_mm = np.array([[30.0, np.nan]], np.float32)
+    for index, log in ((0, 0.1), (10, 0.1), (15, 0.2 + 0.1), (20, 0.3 + 0.2), (99, 0.3 + 0.2)):
+        np.testing.assert_allclose(correction.depth_factors(index, depth_mm), np.exp([[log, np.nan]]), rtol=1e-5)
+    frame = Frame(
+        15,
+        0.0,
+        np.zeros((1, 2, 3), np.uint8),
+        plane_scene.CAMERA.resized(2, 1),
+        np.ones((1, 2), bool),
+        depth_mm,
+        np.eye(4),
+        depth_sigma_mm=np.array([[3.0, np.nan]], np.float32),
+    )
+    done = correction.frame(frame)
+    assert done.depth_sigma_mm is not None
+    np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
+    assert "corrected by 22 %" in correction.description
+
+
+def _bent(number: int) -> Frame:
+    """View of the plane whose depth is bent, as a network's is: up to 30 % off, differently from left to right."""
+    at = (2.0 * number, 0.6 * number, 0.5 * number)
+    view = plane_scene.see(plane_scene.pose(at_mm=at, turn_rad=(0.01 * number, -0.01 * number, 0.02 * number)))
+    assert view.depth_mm is not None
+    bend = np.exp(0.3 * np.sin(np.linspace(-2, 2, view.depth_mm.shape[1]))).astype(np.float32)
+    depth_mm = (view.depth_mm * bend).astype(np.float32)
+    return Frame(number, 0.0, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, view.T_world_camera)
+
+
+def _shape_error(frame: Frame, factors: np.ndarray) -> float:
+    """Mean error of depth, its scale set right."""
+    assert frame.T_world_camera is not None
+    assert frame.depth_mm is not None
+    off = np.log(frame.depth_mm * factors / plane_scene.see(frame.T_world_camera).depth_mm)
+    return float(np.abs(off - np.median(off)).mean())
+
+
+def test_bent_depth_of_a_plane_seen_from_six_places_is_straightened() -> None:
+    frames = [_bent(number) for number in range(6)]
+    results = {}
+    for step_sigma in (0.0, 0.1):
+        backend = Backend(BackendSettings(depth_step_sigma=step_sigma))
+        for frame in frames:
+            backend.add(frame)
+        correction = backend.adjust()
+        assert correction.taken
+        results[step_sigma] = [_shape_error(f, correction.depth_factors(f.index, f.depth_mm)) for f in frames]
+    assert min(results[0.0]) > 0.1
+    assert max(results[0.1]) < 0.3 * min(results[0.0])
+
+
+def test_where_the_adjustment_is_refused_depth_stays_too() -> None:
+    backend = Backend(BackendSettings(max_sigma_px=1e-6))
+    frames = [_bent(number) for number in range(4)]
+    for frame in frames:
+        backend.add(frame)
+    correction = backend.adjust()
+    assert not correction.taken
+    np.testing.assert_array_equal(correction.depth_factors(2, frames[2].depth_mm), 1.0)
+
+
+def test_a_camera_that_only_turns_tells_nothing_of_depth() -> None:
+    backend = Backend(BackendSettings())
+    frames = []
+    for number in range(5):
+        view = plane_scene.see(plane_scene.pose(turn_rad=(0.01 * number, -0.012 * number, 0.02 * number)))
+        seen = replace(_bent(0), rgb=view.rgb, depth_mm=view.depth_mm, T_world_camera=view.T_world_camera)
+        frames.append(replace(seen, index=number))
+        backend.add(frames[-1])
+    correction = backend.adjust()
+    for frame in frames:
+        np.testing.assert_allclose(correction.depth_factors(frame.index, frame.depth_mm), 1.0, atol=0.05)
