@@ -139,7 +139,7 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
         for variant, changes in {
             "as tracked": TRACKED,
             "default": {},
-            "always adjusted": {"backend.max_sigma_px": 99.0},
+            "always adjusted": {"backend.max_sigma_px": 99.0, "backend.max_depth_change": 9.0},
         }.items():
             yield Run(f"{name}, {variant}", source, "sim3", LIGHT | NO_SURFACE | changes)
 

@@ -2,7 +2,7 @@
 
     python benchmarks/surface_of_runs.py --data FOLDER [--depth BACKEND]
 
-FOLDER is the real data's (README, "Real data"). Four phantoms that took part in no choice are rendered first; on the
+FOLDER is the real data's (README, "Real data"). Six phantoms that took part in no choice are rendered first; on the
 real clip cecum_t1_a the truth is two clouds of points, what its frames 0 and 1 see. Each is run with poses and depth as
 tracked, with depth only scaled by the back end, and as by default. Depth: mean |d - g| / g with one scale for all
 frames, and with each frame's own median; mesh, after `sim3` alignment of the poses: mean distances, mm (of the clip:
@@ -54,6 +54,8 @@ def phantoms(folder: Path, data: Path) -> Iterator[tuple[str, Path]]:
         "colon, seed 22, real camera path c4v2": PhantomSpec(scene="colon", frames=150, seed=22, path_file=path),
         "laparoscopy, seed 23": PhantomSpec(scene="laparoscopy", frames=120, seed=23),
         "laparoscopy, seed 24, 65 degrees": PhantomSpec(scene="laparoscopy", frames=120, seed=24, fov_deg=65),
+        "colon that breathes, seed 25": PhantomSpec(scene="colon", frames=150, seed=25, deform=True),
+        "laparoscopy that breathes, seed 26": PhantomSpec(scene="laparoscopy", frames=150, seed=26, deform=True),
     }
     for number, (name, spec) in enumerate(specs.items()):
         write_phantom(spec, folder / f"phantom{number}")

@@ -166,11 +166,24 @@ def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
         moved = cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR)
         backend.add(replace(frame, rgb=moved))
     correction = backend.adjust()
-    assert not correction.taken
-    assert correction.sigma_px > 0.4
+    assert correction.refused
+    assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
     assert "moves by itself" in correction.description
+
+
+def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> None:
+    factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
+    for most, refused in ((0.2, True), (0.6, False)):
+        backend = Backend(BackendSettings(max_depth_change=most, depth_share=0.5))
+        for number in range(5):
+            frame = _frame(number)
+            assert frame.depth_mm is not None
+            backend.add(replace(frame, depth_mm=frame.depth_mm * factors))
+        correction = backend.adjust()
+        assert bool(correction.refused) == refused
+        assert ("depth would have to change by" in correction.description) == refused
 
 
 def test_nothing_to_adjust_is_an_error_of_the_caller() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -384,3 +385,10 @@ def test_evaluate_takes_what_run_wrote(scopemap: Say, folder: Path, tmp_path: Pa
     assert (figures["frames"], figures["tracked"]) == (FRAMES, FRAMES)
     assert figures["ate_rmse_mm"] < 0.5
     assert figures["tlr"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_python_m_scopemap_is_the_same_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "scopemap", "--version"], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, f"scopemap {__version__}")

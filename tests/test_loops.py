@@ -158,6 +158,6 @@ def test_loops_that_lead_astray_are_done_without(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("scopemap.backend.backend.adjust", failing)
     correction = backend.adjust()
     assert [start is None for start in starts] == [False, True]
-    assert correction.taken
+    assert not correction.refused
     assert correction.loops == 0
     assert _off(correction.pose(110, POSES[11]), POSES[11])[1] < 0.3

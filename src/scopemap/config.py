@@ -281,17 +281,15 @@ class BackendSettings(Settings):
     depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     depth_step_sigma: float = Field(
-        0.1,
-        ge=0,
-        description="how a keyframe's depth may be bent, ln from node to node of a coarse grid; 0: only scaled",
+        0.1, ge=0, description="how depth may be bent, ln from node to node of a coarse grid; 0: only scaled"
     )
     turn_sigma_deg: float = Field(3.0, gt=0, description="how far tracked turns between keyframes are trusted")
     way_sigma_share: float = Field(0.1, gt=0, description="the same of ways, over the mean depth")
     max_sigma_px: float = Field(
-        0.4,
-        gt=0,
-        description="where points seen again stay farther off than that (robust standard deviation), tissue moves by "
-        "itself or the camera is not what it is said to be: poses then stay as tracked",
+        0.8, gt=0, description="poses stay as tracked where points seen again stay farther off (robust deviation)"
+    )
+    max_depth_change: float = Field(
+        0.3, gt=0, description="the same where points ask for more than that change of ln depth (their median)"
     )
 
 

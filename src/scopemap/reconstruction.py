@@ -205,7 +205,7 @@ class DepthWriter:
 
     def correct(self, records: list[FrameRecord], correction: Correction) -> None:
         """Write the depth of all tracked frames once more, as the back end corrected it."""
-        for record in records if correction.taken else []:
+        for record in records if not correction.refused else []:
             if record.track.status != "lost":
                 image = cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED)
                 if image is None:

@@ -21,6 +21,9 @@ from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 
+# Points whose depth is known to a tenth.
+_SURE = 0.1
+
 
 class Backend:
     """Takes keyframes as they come and returns what has to be corrected, map by map.
@@ -100,19 +103,32 @@ class _Map:
             start, loops = (inverse(graph.T_world_camera), graph.log_scale), graph.believed
         problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, start)
         found = adjust(problem)
-        if start is not None and not found.sigma_px <= settings.max_sigma_px:
+        if start is not None and self._doubt(points, found):
             # Loops may be what is wrong.
             found, loops = adjust(replace(problem, start=None)), 0
-        index = np.array(self.index)
-        if not found.sigma_px <= settings.max_sigma_px:
-            return unchanged(index, found.sigma_px)
+        index, doubt = np.array(self.index), self._doubt(points, found)
+        if doubt:
+            return unchanged(index, found.sigma_px, doubt)
         T_world_world = inverse(found.T_camera_world) @ inverse(T_world_camera)
         grids = self._grids(camera, points, found) if settings.depth_step_sigma > 0 else ()
         return Correction(index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids)
 
+    def _doubt(self, points: Points, found: Solution) -> str:
+        """Say why a rigid scene does not explain what was seen, "" where it does."""
+        settings = self.settings
+        if not found.sigma_px <= settings.max_sigma_px:
+            return f"points seen again lie {found.sigma_px:.2f} px from where they should"
+        sure = found.log_depth_sigma < _SURE
+        change = np.abs(_depth_change(points, found)[sure])
+        # Depth that is wrong by a third almost everywhere is not what networks do; tissue that swells under a camera
+        # at rest looks just so.
+        if sure.any() and np.median(change) > settings.max_depth_change:
+            return f"depth would have to change by {100 * np.expm1(np.median(change)):.0f} %"
+        return ""
+
     def _grids(self, camera: PinholeCamera, points: Points, found: Solution) -> tuple[DepthGrid, ...]:
         """Fit what each keyframe's depth lacks beside its scale, by its adjusted points."""
-        error = found.log_depth - points.log_depth - found.log_scale[points.host]
+        error = _depth_change(points, found)
         pixels = points.rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         places = (pixels + 0.5) / [camera.width, camera.height]
         of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(self.index))]
@@ -121,3 +137,8 @@ class _Map:
             fit_grid(places[own], points.log_depth[own], error[own], found.log_depth_sigma[own], step_sigma)
             for own in of
         )
+
+
+def _depth_change(points: Points, found: Solution) -> np.ndarray:
+    """What each point (P,) adds to ln of its estimated depth, beside its keyframe's scale."""
+    return found.log_depth - points.log_depth - found.log_scale[points.host]

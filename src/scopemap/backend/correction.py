@@ -20,7 +20,7 @@ class Correction:
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the world as
     tracked around a keyframe to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
     sigma_px : robust standard deviation of what remains between keyframes, px; NaN where nothing linked them.
-    taken : False where that was too much, and nothing is changed. loops : pairs of keyframes, far apart in time,
+    refused : why nothing is changed, "" where it is. loops : pairs of keyframes, far apart in time,
     that were found to show the same place. grids : K of them, by what more the depth of each place is to be multiplied;
     none: nothing more.
     """
@@ -29,7 +29,7 @@ class Correction:
     T_world_world: np.ndarray
     log_scale: np.ndarray
     sigma_px: float = float("nan")
-    taken: bool = True
+    refused: str = ""
     loops: int = 0
     grids: tuple[DepthGrid, ...] = ()
 
@@ -38,10 +38,10 @@ class Correction:
         """One sentence for the provenance: what was adjusted, and what of it did not agree."""
         if not np.isfinite(self.sigma_px):
             return f"back end: nothing linked the {len(self.index)} keyframes; poses are as tracked"
-        if not self.taken:
+        if self.refused:
             return (
-                f"back end: poses are as tracked; even adjusted, points seen again lie {self.sigma_px:.2f} px from "
-                "where they should: tissue that moves by itself, or another focal length"
+                f"back end: poses are as tracked; even adjusted, {self.refused}: tissue that moves by itself, or "
+                "another focal length"
             )
         turn_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         closed = f", {self.loops} loops closed" if self.loops else ""
@@ -105,7 +105,7 @@ class Correction:
         return before, after, float(share)
 
 
-def unchanged(index: np.ndarray, sigma_px: float) -> Correction:
-    """Return the correction of keyframes (K,) that leaves every frame as it is."""
+def unchanged(index: np.ndarray, sigma_px: float, refused: str) -> Correction:
+    """Return the correction of keyframes (K,) that leaves every frame as it is, and says why."""
     count = len(index)
-    return Correction(index, np.stack([np.eye(4)] * count), np.zeros(count), sigma_px, taken=False)
+    return Correction(index, np.stack([np.eye(4)] * count), np.zeros(count), sigma_px, refused=refused)
