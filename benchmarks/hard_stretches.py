@@ -1,15 +1,17 @@
 """What becomes of frames that show nothing, of places seen again, and of a wall without texture; as Markdown.
 
-    python benchmarks/hard_stretches.py [--only veiled|loop|bare]
+    python benchmarks/hard_stretches.py [--only veiled|loop|cut|bare]
 
 Phantoms drawn by our own code, scopenet, DIS flow, no surface. veiled: 200 frames, of which 10 are black, 10 blurred
 and 10 full of smoke; errors of the clear frames alone, in the same run without that and in this one. loop: 601 frames
-that end where they began. bare: a straight tube without texture.
+that end where they began. cut: 401 such frames without numbers 80 to 179, as where a recording was stopped on the way
+out. bare: a straight tube without texture.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +28,7 @@ from scopemap.phantom import PhantomSpec, parse_events, write_phantom
 from scopemap.trajectory import Trajectory, read_trajectory
 
 EVENTS = "black:60-69,blur:95-104,smoke:130-139"
+CUT = range(80, 180)
 BAD = [*range(60, 70), *range(95, 105), *range(130, 140)]
 VARIANTS: dict[str, dict[str, Any]] = {"default": {}, "no back end": TRACKED}
 
@@ -92,8 +95,45 @@ def loop(folder: Path) -> list[str]:
     return rows
 
 
-def bare(folder: Path) -> list[str]:
+def cut(folder: Path) -> list[str]:
     """Rows of the third table."""
+    rows = [
+        "| phantom | maps | frames kept | ATE mm | rotation mean / max deg | scale after the cut over that before |",
+        "|---|---|---|---|---|---|",
+    ]
+    for scene in ("colon", "laparoscopy"):
+        whole, source = folder / f"{scene}_whole", folder / f"{scene}_cut"
+        write_phantom(PhantomSpec(scene=scene, frames=401, seed=12, loop=True), whole)
+        keep(whole, source, [n for n in range(401) if n not in CUT])
+        for name, changes in {"no loops": {"backend.loop_landmarks": 0}, **VARIANTS}.items():
+            result = run(source, changes)
+            trajectory, truth = result.trajectory, read_trajectory(source)
+            report = pose_report(match(trajectory, truth, "sim3"))
+            tracked = [record.track.map for record in result.records if record.track.status != "lost"]
+            parts = [without(trajectory, [n for n in range(301) if (n < CUT[0]) != early]) for early in (True, False)]
+            scales = [match(part, truth, "sim3").similarity.scale if part.tracked.any() else np.nan for part in parts]
+            rows.append(
+                f"| {scene}, {name} | {len(set(tracked))} | {len(tracked)} of {len(result.records)} "
+                f"| {report.ate_rmse_mm:.3f} "
+                f"| {report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f} "
+                f"| {scales[0] / scales[1]:.2f} |"
+            )
+    return rows
+
+
+def keep(source: Path, target: Path, frames: list[int]) -> None:
+    """Copy some frames of a phantom, numbered anew."""
+    target.mkdir()
+    for number, frame in enumerate(frames):
+        for file in source.glob(f"{frame:04d}_*"):
+            shutil.copy(file, target / f"{number:04d}{file.name[4:]}")
+    poses = (source / "pose.txt").read_text().splitlines()
+    (target / "pose.txt").write_text("\n".join(poses[frame] for frame in frames) + "\n")
+    shutil.copy(source / "camera.yaml", target)
+
+
+def bare(folder: Path) -> list[str]:
+    """Rows of the last table."""
     source = folder / "tube"
     write_phantom(PhantomSpec(scene="tube", frames=120, seed=13), source)
     result = run(source, {})
@@ -108,7 +148,7 @@ def bare(folder: Path) -> list[str]:
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    tables: dict[str, Callable[[Path], list[str]]] = {"veiled": veiled, "loop": loop, "bare": bare}
+    tables: dict[str, Callable[[Path], list[str]]] = {"veiled": veiled, "loop": loop, "cut": cut, "bare": bare}
     parser.add_argument("--only", choices=tables)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:

@@ -150,3 +150,13 @@ def test_what_cannot_be_fitted_is_refused() -> None:
         with pytest.raises(AlignmentError, match=r"on one line.*singular values"):
             align_trajectories(poses, poses, mode, first=6)  # type: ignore[arg-type]
         assert align_trajectories(poses, poses, mode)[1].scale == pytest.approx(1)  # type: ignore[arg-type]
+
+
+@few
+@given(seeds)
+def test_similarities_are_undone_and_done_one_after_the_other(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second, poses = random_similarity(rng), random_similarity(rng), random_poses(rng)
+    moved = first.transform_poses(poses)
+    np.testing.assert_allclose(first.inverse().transform_poses(moved), poses, atol=1e-9)
+    np.testing.assert_allclose(second.after(first).transform_poses(poses), second.transform_poses(moved), atol=1e-8)

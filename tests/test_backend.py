@@ -11,7 +11,7 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.backend import Backend, Correction
+from scopemap.backend import Backend, Correction, Seat
 from scopemap.backend.links import Linker
 from scopemap.config import BackendSettings
 from scopemap.flow import DisFlow
@@ -132,7 +132,7 @@ def test_more_points_than_opencv_takes_columns_are_sampled() -> None:
 
 
 def test_what_goes_wrong_with_a_keyframe_is_heard_of_at_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: Linker, keyframe: Frame) -> None:
+    def broken(self: Linker, keyframe: Frame, map_number: int) -> None:
         raise RuntimeError("flow broke")
 
     monkeypatch.setattr(Linker, "add", broken)
@@ -153,6 +153,33 @@ def test_outside_all_keyframes_the_nearest_correction_holds() -> None:
     middle = correction.pose(30, np.eye(4))
     assert rotation_angle_rad(middle[:3, :3]) == pytest.approx(0.15)
     assert "as tracked" in correction.description
+
+
+def _seated(keyframe: int, x_mm: float) -> Seat:
+    return Seat(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])))
+
+
+def test_a_frame_takes_as_much_of_the_next_correction_as_it_has_moved() -> None:
+    T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))])
+    seats = {0: _seated(0, 0), 2: _seated(0, 1), 5: _seated(0, 2), 7: _seated(0, 9), 10: _seated(0, 10)}
+    correction = Correction(np.array([0, 10]), T, np.log([1.0, 2.0]), seats=seats, depth_mm=50.0)
+    for index, share in ((0, 0), (2, 0.1), (5, 0.2), (7, 0.9), (10, 1)):
+        assert correction.pose(index, np.eye(4))[0, 3] == pytest.approx(4 * share)
+        assert correction.depth_factor(index) == pytest.approx(2.0**share)
+    # Of frame 4 nothing is known, and of a camera at rest nothing can be: time has to do.
+    assert correction.pose(4, np.eye(4))[0, 3] == pytest.approx(1.6)
+    resting = replace(correction, seats={0: _seated(0, 3), 5: _seated(0, 3), 10: _seated(0, 3)})
+    assert resting.pose(5, np.eye(4))[0, 3] == pytest.approx(2.0)
+
+
+def test_a_camera_found_again_is_corrected_as_from_there_on() -> None:
+    T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(4)])
+    # Up to frame 23 all goes on from keyframe 20; then keyframe 10 finds the camera again, and 30 comes of that.
+    seats = {0: _seated(0, 0), 10: _seated(0, 1), 20: _seated(10, 2), 30: _seated(10, 3)}
+    seats |= {22: _seated(20, 2.2), 26: _seated(10, 2.6), 33: _seated(30, 3.3), 35: _seated(20, 3.5)}
+    correction = Correction(np.array([0, 10, 20, 30]), T, np.zeros(4), seats=seats, depth_mm=50.0)
+    for index, of in ((20, 2), (22, 2), (26, 3), (30, 3), (33, 3), (35, 2)):
+        np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
 
 
 def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:

@@ -12,6 +12,7 @@ from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transfor
 
 INTRINSICS = np.array([150.0, 152.0, 80.0, 64.0])
 KEYFRAMES, PER_KEYFRAME = 6, 80
+LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
 
 
 def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Sightings]:
@@ -48,7 +49,7 @@ def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 def test_exact_sightings_and_depths_give_back_exact_poses() -> None:
     rng = np.random.default_rng(0)
     T, points, sightings = _world(rng)
-    found = adjust(Problem(INTRINSICS, _tracked(T, rng), points, sightings, Priors(turn_rad=10, way_share=10)))
+    found = adjust(Problem(INTRINSICS, _tracked(T, rng), points, sightings, Priors(turn_rad=10, way_share=10), LINE))
     turn, way = _pose_errors(found.T_camera_world, T)
     assert turn < 1e-4
     assert way < 1e-2
@@ -63,7 +64,14 @@ def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
         points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=np.full(len(points.host), 0.02)
     )
     found = adjust(
-        Problem(INTRINSICS, _tracked(T, rng), wrong, sightings, Priors(scale=0.3, turn_rad=10, way_share=10))
+        Problem(
+            INTRINSICS,
+            _tracked(T, rng),
+            wrong,
+            sightings,
+            Priors(scale=0.3, turn_rad=10, way_share=10),
+            LINE,
+        )
     )
     assert found.log_scale[3] - np.delete(found.log_scale, 3).mean() == pytest.approx(0.2, abs=0.02)
     assert _pose_errors(found.T_camera_world, T)[0] < 2e-3
@@ -77,7 +85,7 @@ def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
     pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
     tracked = _tracked(T, rng)
     noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
-    found = adjust(Problem(INTRINSICS, tracked, noisy, replace(sightings, pixel=pixel), Priors()))
+    found = adjust(Problem(INTRINSICS, tracked, noisy, replace(sightings, pixel=pixel), Priors(), LINE))
     turn, way = _pose_errors(found.T_camera_world, T)
     turn_before, way_before = _pose_errors(tracked, T)
     assert turn < 0.2 * turn_before
@@ -89,7 +97,7 @@ def test_without_sightings_nothing_changes() -> None:
     rng = np.random.default_rng(3)
     T, points, _ = _world(rng)
     nothing = Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    found = adjust(Problem(INTRINSICS, T, points, nothing, Priors()))
+    found = adjust(Problem(INTRINSICS, T, points, nothing, Priors(), LINE))
     np.testing.assert_array_equal(found.T_camera_world, T)
     assert found.iterations == 0
 
@@ -101,7 +109,7 @@ def test_where_no_sighting_says_anything_the_tracked_motion_stays() -> None:
     known = (sightings.keyframe < 4) & (points.host[sightings.point] < 4)
     some = Sightings(sightings.point[known], sightings.keyframe[known], sightings.pixel[known])
     tracked = _tracked(T, rng)
-    found = adjust(Problem(INTRINSICS, tracked, points, some, Priors())).T_camera_world
+    found = adjust(Problem(INTRINSICS, tracked, points, some, Priors(), LINE)).T_camera_world
     np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
     np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
 
@@ -115,7 +123,9 @@ def test_how_certain_a_depth_is_follows_from_the_way_between_its_views() -> None
     seen = INTRINSICS[:2] * moved[:, :2] / moved[:, 2:] + INTRINSICS[2:]
     # The last point is seen by nobody else.
     points = Points(np.zeros(50, int), rays, np.log(depth_mm), np.full(50, 0.1))
-    found = adjust(Problem(INTRINSICS, T, points, Sightings(np.arange(49), np.ones(49, int), seen[:49]), Priors()))
+    found = adjust(
+        Problem(INTRINSICS, T, points, Sightings(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1])
+    )
     # A pixel moves by fx way / depth, and the floor of a pixel's deviation is 0.1.
     np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (INTRINSICS[0] * way_mm), rtol=0.02)
     assert np.isinf(found.log_depth_sigma[49])

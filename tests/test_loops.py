@@ -22,6 +22,7 @@ from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
 POSES = [*OUT, *OUT[-2::-1]]
 COUNT = len(POSES)
+LINE = np.column_stack([np.arange(COUNT - 1), np.arange(1, COUNT)])
 SETTINGS = BackendSettings(gaps=(1, 2))
 
 
@@ -81,7 +82,7 @@ def test_the_graph_takes_drift_of_poses_and_of_scale_away() -> None:
         T = inverse(POSES[new]) @ POSES[past]
         T[:3, 3] *= scale[past]
         loops.append(replace(_said(past, new, T), log_ratio=float(np.log(scale[new] / scale[past]))))
-    graph = spread_loops(np.stack(tracked), loops, depth_mm=50.0)
+    graph = spread_loops(np.stack(tracked), LINE, loops, depth_mm=50.0)
     before, after = (_off(poses[-1], POSES[-1])[1] for poses in (tracked, graph.T_world_camera))
     assert before > 5
     assert after < 0.05 * before
@@ -96,7 +97,7 @@ def _said(past: int, new: int, T_new_past: np.ndarray) -> Loop:
 
 def test_a_loop_that_denies_most_of_the_way_is_not_believed() -> None:
     poses = np.stack(OUT)
-    graph = spread_loops(poses, [_said(0, len(OUT) - 1, np.eye(4))], depth_mm=10.0)
+    graph = spread_loops(poses, LINE[: len(OUT) - 1], [_said(0, len(OUT) - 1, np.eye(4))], depth_mm=10.0)
     assert graph.believed == 0
     np.testing.assert_allclose(graph.T_world_camera, poses, atol=1e-9)
 
@@ -105,7 +106,7 @@ def test_one_false_loop_gives_way_to_others() -> None:
     poses = np.stack(POSES)
     true = [_said(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
     false = se3_exp(np.array([0.0, 0.3, 0.0, 20.0, 0.0, 0.0])) @ true[0].T_new_past
-    graph = spread_loops(poses, [*true, _said(0, COUNT - 1, false)], depth_mm=50.0)
+    graph = spread_loops(poses, LINE, [*true, _said(0, COUNT - 1, false)], depth_mm=50.0)
     assert graph.believed == 4
     assert max(_off(a, b)[1] for a, b in zip(graph.T_world_camera, poses, strict=True)) < 1.0
 

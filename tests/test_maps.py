@@ -1,8 +1,9 @@
-"""A run whose camera is lost for good: the largest map is kept, the rest is said to be elsewhere."""
+"""A run whose camera is lost for good: what shows the same place is joined, the largest of the rest is kept."""
 
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,17 @@ import pytest
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.backend import Backend
-from scopemap.config import BackendSettings
+from scopemap.backend import Backend, Seat
+from scopemap.backend.adjustment import Problem, Solution, adjust
+from scopemap.config import BackendSettings, Config
+from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.evaluation.poses import match, pose_report
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.geometry.align import Similarity
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.reconstruction import DepthReader
+from scopemap.trajectory import read_trajectory
 
 FIRST, SECOND, GIVEN_UP = 6, 11, 2
 LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__new_map_after": GIVEN_UP}
@@ -80,21 +87,102 @@ def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> 
     assert len(result.mesh.faces) > 0
 
 
-def test_maps_are_adjusted_apart() -> None:
+def _keyframe(number: int, at_mm: tuple[float, float, float], told: Similarity, factor: float) -> tuple[Frame, Seat]:
+    """A keyframe of a plane, its pose told in another world, its depth times `factor`; every map is told by its own."""
+    view = plane_scene.see(plane_scene.pose(at_mm=at_mm))
+    T_world_camera = told.transform_poses(view.T_world_camera)
+    depth_mm = (factor * view.depth_mm).astype(np.float32)
+    frame = Frame(
+        10 * number, number / 3, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, T_world_camera
+    )
+    return frame, Seat(int(factor != 1), 10 * max(number - 2, 0), T_world_camera)
+
+
+def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
+    worlds = (Similarity.identity(), Similarity(1.3, so3_exp(np.array([0.2, -0.9, 0.4])), np.array([30.0, -8.0, 5.0])))
+    places = [(2.0 * number, 0.5 * number, 0.1 * number) for number in range(10)]
+    backend = Backend(BackendSettings())
+    frames, seats = [], {}
+    for number, at_mm in enumerate(places):
+        # Every other keyframe is of the other map.
+        frame, seats[10 * number] = _keyframe(number, at_mm, worlds[number % 2], worlds[number % 2].scale)
+        backend.add(frame, seats[10 * number])
+        frames.append(frame)
+    assert [backend.keyframes(number) for number in range(3)] == [5, 5, 0]
+    correction = backend.adjust(0, seats)
+    assert sorted(correction.worlds) == [0, 1]
+    assert "2 maps joined" in correction.description
+    for frame, at_mm in zip(frames, places, strict=True):
+        moved = correction.frame(frame)
+        assert moved.T_world_camera is not None
+        assert moved.depth_mm is not None
+        np.testing.assert_allclose(moved.T_world_camera, plane_scene.pose(at_mm=at_mm), atol=0.1)
+        np.testing.assert_allclose(moved.depth_mm, plane_scene.see(plane_scene.pose(at_mm=at_mm)).depth_mm, rtol=0.05)
+
+
+def test_maps_that_do_not_are_adjusted_apart() -> None:
     backend = Backend(BackendSettings())
     with pytest.raises(ValueError, match="no keyframe"):
         backend.adjust()
     for number in range(6):
-        view = plane_scene.see(plane_scene.pose(at_mm=(2.0 * number, 0.5 * number, 0.0)))
-        frame = Frame(
-            10 * number,
-            number / 3,
-            view.rgb,
-            plane_scene.CAMERA,
-            plane_scene.EVERYWHERE,
-            view.depth_mm,
-            view.T_world_camera,
-        )
-        backend.add(frame, number % 2)
-    assert [backend.keyframes(number) for number in range(3)] == [3, 3, 0]
-    np.testing.assert_array_equal(backend.adjust(1).index, [10, 30, 50])
+        at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 3 else (50.0 + 2 * number, 0.0, 0.0)
+        backend.add(*_keyframe(number, at_mm, Similarity.identity(), 1.0 + 0.2 * (number >= 3)))
+    correction = backend.adjust(1)
+    np.testing.assert_array_equal(correction.index, [30, 40, 50])
+    assert list(correction.worlds) == [1]
+
+
+def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Backend(BackendSettings())
+    for number in range(10):
+        backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
+
+    def failing(problem: Problem) -> Solution:
+        found = adjust(problem)
+        return replace(found, sigma_px=9.9) if len(problem.T_camera_world) > 5 else found
+
+    monkeypatch.setattr("scopemap.backend.backend.adjust", failing)
+    correction = backend.adjust()
+    assert not correction.refused
+    np.testing.assert_array_equal(correction.index, [0, 20, 40, 60, 80])
+    assert list(correction.worlds) == [0]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera that goes into a colon and comes out again, filmed with a break on the way in."""
+    folder, (width, height) = tmp_path_factory.mktemp("cut"), SIZE
+    write_phantom(PhantomSpec(frames=81, seed=3, loop=True, width=width, height=height), folder / "whole")
+    (folder / "cut").mkdir()
+    kept = [*range(10), *range(37, 81)]
+    for number, index in enumerate(kept):
+        for source in (folder / "whole").glob(f"{index:04d}_*"):
+            shutil.copy(source, folder / "cut" / f"{number:04d}{source.name[4:]}")
+    poses = (folder / "whole" / "pose.txt").read_text().splitlines()
+    (folder / "cut" / "pose.txt").write_text("\n".join(poses[index] for index in kept) + "\n")
+    shutil.copy(folder / "whole" / "camera.yaml", folder / "cut")
+    return folder / "cut"
+
+
+def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(cut: Path, tmp_path: Path) -> None:
+    settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"odometry.keyframe_every": 3}
+    result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
+    status = [record.track.status for record in result.records]
+    assert status == ["initial"] + ["ok"] * 9 + ["lost"] * GIVEN_UP + ["ok"] * (44 - GIVEN_UP)
+    assert result.records[10 + GIVEN_UP].track.reason == "began a map that was joined"
+    assert any("2 maps joined" in note for note in result.provenance["notes"])
+    assert not [text for text in result.provenance["warnings"] if text.startswith("maps:")]
+    np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
+    report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
+    assert report.ate_rmse_mm < 0.4
+    assert report.rotation_unaligned_max_deg < 2.0
+    # Depth is in the same millimetres before the break and after it.
+    truth, depth = C3vdFolder(cut), DepthReader(tmp_path / "out")
+    ratios = []
+    for index in (2, 8, 20, 30, 50):
+        true, told_mm = truth.truth(index), depth.read(index)
+        assert true is not None
+        assert true.depth_mm is not None
+        assert told_mm is not None
+        ratios.append(np.nanmedian(told_mm / np.where(true.depth_mm > 0, true.depth_mm, np.nan)))
+    np.testing.assert_allclose(np.log(ratios), np.log(np.median(ratios)), atol=0.1)

@@ -11,12 +11,13 @@ motion, so it may run a frame ahead of `step`.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
 
-from scopemap.backend import Backend, Correction
+from scopemap.backend import Backend, Correction, Seat
 from scopemap.config import Config, DepthSettings, FusionSettings
 from scopemap.datasets import Sequence
 from scopemap.depth import (
@@ -148,22 +149,36 @@ class Pipeline:
         self._fusable = 0
         follows = tracker is None and config.odometry.corner_depth_share > 0 and estimators.flow.name != "none"
         self._corners = CornerFollower(DisFlow(), config.mapis.consistency_px) if follows else None
-        self._frames_of_map: dict[int, list[int]] = {}
+        self._seats: dict[int, Seat] = {}
+        self._joined: tuple[int, ...] = ()
 
     @property
     def main_map(self) -> int:
         """Number of the map that counts: the one with most tracked frames."""
-        return max(self._frames_of_map, key=lambda number: len(self._frames_of_map[number]), default=0)
+        frames = self._frames_of_map
+        return max(frames, key=lambda number: frames[number], default=0)
+
+    @property
+    def _frames_of_map(self) -> Counter[int]:
+        """How many frames were tracked in each map."""
+        return Counter(seat.map for seat in self._seats.values())
+
+    @property
+    def kept_maps(self) -> tuple[int, ...]:
+        """Numbers of the maps that are kept: the main one, and those that `adjust` has joined with it."""
+        return self._joined or (self.main_map,)
 
     @property
     def maps_note(self) -> list[str]:
-        """What to say where there are several maps; nothing where there is one."""
-        if len(self._frames_of_map) < 2:
+        """What to say where maps are left out; nothing where all are kept."""
+        frames = self._frames_of_map
+        if not set(frames) - set(self.kept_maps):
             return []
-        total, kept = sum(map(len, self._frames_of_map.values())), len(self._frames_of_map[self.main_map])
+        total, kept = frames.total(), sum(frames[number] for number in self.kept_maps)
+        which = "the largest" if len(self.kept_maps) == 1 else f"{len(self.kept_maps)} that could be joined"
         return [
-            f"maps: there are {len(self._frames_of_map)}, since the camera was lost and not found again; of {total} "
-            f"frames tracked, the {kept} of the largest are kept: how the others lie to them is not known"
+            f"maps: there are {len(frames)}, since the camera was lost and not found again; of {total} "
+            f"frames tracked, the {kept} of {which} are kept: how the others lie to them is not known"
         ]
 
     def perceive(self, frame: Frame) -> Percept:
@@ -213,7 +228,7 @@ class Pipeline:
             self._mapis.forget()
             self._smooth.forget()
         else:
-            self._frames_of_map.setdefault(track.map, []).append(frame.index)
+            self._seats[frame.index] = Seat(track.map, track.keyframe, track.T_world_camera)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
         self._last, self._last_mm = track, refined.depth_mm
@@ -226,12 +241,17 @@ class Pipeline:
         """
         if self._backend is None or not self._backend.keyframes(self.main_map):
             return None
-        return self._backend.adjust(self.main_map)
+        correction = self._backend.adjust(self.main_map, self._seats)
+        self._joined = tuple(sorted(correction.worlds))
+        return correction
 
     def fuse(self, correction: Correction | None = None) -> None:
         """Fuse what waited, in voxels that suit it, as `adjust` corrected it."""
-        elsewhere = {i for number, frames in self._frames_of_map.items() if number != self.main_map for i in frames}
-        typical_mm = self._waiting.typical_mm(elsewhere)
+        main, kept = self.main_map, self.kept_maps
+        elsewhere = {index for index, seat in self._seats.items() if seat.map not in kept}
+        # Other maps' millimetres are not those of the main one.
+        others = {index for index, seat in self._seats.items() if seat.map != main}
+        typical_mm = self._waiting.typical_mm(others)
         if typical_mm is None:
             return
         volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, typical_mm))
@@ -266,7 +286,7 @@ class Pipeline:
         if adopted and self._corners is not None:
             self._corners.start(keyframe)
         if adopted and self._backend is not None:
-            self._backend.add(keyframe, track.map)
+            self._backend.add(keyframe, Seat(track.map, track.keyframe, track.T_world_camera))
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -101,17 +102,23 @@ def corrected(records: list[FrameRecord], correction: Correction) -> list[FrameR
     return out
 
 
-def only_map(records: list[FrameRecord], number: int) -> list[FrameRecord]:
-    """Return the records with the frames of all other maps lost: their world is another."""
+def only_maps(records: list[FrameRecord], kept: Collection[int]) -> list[FrameRecord]:
+    """Return the records of these maps' frames as of one map, and with those of all other maps lost."""
+    if len({record.track.map for record in records if record.track.status != "lost"}) < 2:
+        return records
     out: list[FrameRecord] = []
-    first = next((r.T_world_camera for r in records if r.track.status != "lost" and r.track.map == number), np.eye(4))
+    begun = False
+    first = next((r.T_world_camera for r in records if r.track.status != "lost" and r.track.map in kept), np.eye(4))
     for record in records:
         track = record.track
-        if track.status == "lost" or track.map != number:
+        if track.status == "lost" or track.map not in kept:
             reason = track.reason if track.status == "lost" else f"tracked in another map, number {track.map}"
             pose = out[-1].T_world_camera if out else first
             track = replace(track, status="lost", reason=reason, T_world_camera=pose)
             record = replace(record, track=track, T_world_camera=pose)
+        elif track.status == "initial" and begun:
+            record = replace(record, track=replace(track, status="ok", reason="began a map that was joined"))
+        begun = begun or record.track.status != "lost"
         out.append(record)
     return out
 

@@ -27,7 +27,7 @@ from scopemap.focal import with_focal_from_motion
 from scopemap.odometry import FrameTracker
 from scopemap.pictures.constant import is_constant
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_map, prepare_folder
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder
 
 Observer = Callable[[Step], None]
 _VERSIONS = (
@@ -81,10 +81,8 @@ def reconstruct(
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
-    maps_note = pipeline.maps_note
-    if maps_note:
-        records = only_map(records, pipeline.main_map)
     correction = clock.timed("back end", pipeline.adjust)
+    records = only_maps(records, pipeline.kept_maps)
     if correction is not None:
         records = corrected(records, correction)
         if writer is not None:
@@ -96,7 +94,7 @@ def reconstruct(
     provenance = _provenance(sequence, estimators, clock, records)
     provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
     provenance["notes"] += camera_note + exponent_note
-    provenance["warnings"] += distances.warnings(config.fusion) + maps_note
+    provenance["warnings"] += distances.warnings(config.fusion) + pipeline.maps_note
     provenance["notes"] += [] if correction is None else [correction.description]
     provenance["notes"] += pipeline.fusion_note
     camera, source_camera = sequence.camera, sequence.rectifier.source

@@ -72,7 +72,8 @@ class Priors:
 class Problem:
     """What is adjusted: intrinsics (4,) fx, fy, cx, cy, px; T_camera_world (K, 4, 4) as tracked; the rest as named.
 
-    start : poses T_camera_world (K, 4, 4) and ln of the depth scales (K,) to begin from; None: from what was tracked.
+    neighbours : (C, 2) int, pairs of keyframes whose motion from the first to the second was tracked. start : poses
+    T_camera_world (K, 4, 4) and ln of the depth scales (K,) to begin from; None: from what was tracked.
     """
 
     intrinsics: np.ndarray
@@ -80,6 +81,7 @@ class Problem:
     points: Points
     sightings: Sightings
     priors: Priors
+    neighbours: np.ndarray
     start: tuple[np.ndarray, np.ndarray] | None = None
 
 
@@ -189,20 +191,20 @@ def _cost(problem: Problem, state: _State, sigma: float) -> float:
     # A point behind a camera has no residual: it costs as much as one ten standard deviations off.
     square = np.where(ahead, (error**2).sum(1) / sigma**2, 100.0)
     depth = (state.u - points.log_depth - state.scale[points.host]) / points.sigma
-    chain = sum(float(e @ (weight * e)) for _, e, weight in _chain(problem, state))
+    chain = sum(float(e @ (weight * e)) for *_, e, weight in _chain(problem, state))
     return float(_cauchy(square)[0].sum() + _cauchy(depth**2)[0].sum() + 0.5 * chain) + 0.5 * float(
         ((state.scale / priors.scale) ** 2).sum()
     )
 
 
-def _chain(problem: Problem, state: _State) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """For each keyframe but the last: its number, how far its motion to the next is from the tracked one, weights."""
+def _chain(problem: Problem, state: _State) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
+    """For each pair of neighbours: their numbers, how far the motion between is from the tracked one, weights."""
     priors, tracked = problem.priors, problem.T_camera_world
     depth_mm = float(np.exp(np.median(problem.points.log_depth)))
     weight = np.repeat([priors.turn_rad, priors.way_share * depth_mm], 3) ** -2.0
     return [
-        (k, se3_log(state.T[k + 1] @ inverse(state.T[k]) @ tracked[k] @ inverse(tracked[k + 1])), weight)
-        for k in range(len(tracked) - 1)
+        (i, j, se3_log(state.T[j] @ inverse(state.T[i]) @ tracked[i] @ inverse(tracked[j])), weight)
+        for i, j in problem.neighbours
     ]
 
 
@@ -223,9 +225,9 @@ def _linearised(problem: Problem, state: _State, sigma: float, damping: float) -
         blocks.append((sums.own, sums.A - sums.E.T @ shrunk))
         rhs[sums.own] -= sums.b - shrunk.T @ sums.g
         couplings.append((sums.points, sums.own, shrunk, sums.g / h))
-    for k, off, information in _chain(problem, state):
-        own = np.append(_OWN * k + np.arange(6), _OWN * (k + 1) + np.arange(6))
-        J = np.hstack([-_adjoint(state.T[k + 1] @ inverse(state.T[k])), np.eye(6)])
+    for i, j, off, information in _chain(problem, state):
+        own = np.append(_OWN * i + np.arange(6), _OWN * j + np.arange(6))
+        J = np.hstack([-_adjoint(state.T[j] @ inverse(state.T[i])), np.eye(6)])
         blocks.append((own, J.T @ (information[:, None] * J)))
         rhs[own] -= J.T @ (information * off)
     scales, information = _OWN * np.arange(count) + 6, problem.priors.scale**-2.0

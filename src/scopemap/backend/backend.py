@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from scopemap.backend.adjustment import Points, Priors, Problem, Solution, adjust
-from scopemap.backend.correction import Correction, unchanged
+from scopemap.backend.correction import Correction, Seat, unchanged
 from scopemap.backend.depth_grid import DepthGrid, fit_grid
+from scopemap.backend.joining import join_maps
 from scopemap.backend.links import Linker
 from scopemap.backend.loops import Loop, LoopFinder
 from scopemap.backend.pose_graph import spread_loops
@@ -19,99 +22,129 @@ from scopemap.camera import PinholeCamera
 from scopemap.config import BackendSettings
 from scopemap.flow import DisFlow
 from scopemap.frame import Frame
+from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse
 
 # Points whose depth is known to a tenth.
 _SURE = 0.1
 
 
+class _Keyframe(NamedTuple):
+    """Number of a keyframe's frame, and how it was tracked."""
+
+    frame: int
+    seat: Seat
+
+
 class Backend:
-    """Takes keyframes as they come and returns what has to be corrected, map by map.
+    """Takes keyframes as they come and returns what has to be corrected.
 
     Keyframes are linked in a thread of their own, by OpenCV's DIS flow whatever flow the front end uses: over the wide
     gaps between keyframes many pairs are needed, and the adjustment does away with what it gets wrong. Loops are
-    looked for there, too; what they say is spread over all keyframes before these are adjusted.
+    looked for there, too; those between maps join them, and what all of them say is spread over all keyframes before
+    these are adjusted.
     """
 
     def __init__(self, settings: BackendSettings) -> None:
         self.settings = settings
-        self._maps: dict[int, _Map] = {}
+        self._keyframes: list[_Keyframe] = []
+        self._linker = Linker(settings, DisFlow())
+        self._finder = LoopFinder(settings) if settings.loop_landmarks > 0 else None
+        self._loops: list[Loop] = []
+        self._camera: PinholeCamera | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
         self._links: deque[Future[None]] = deque()
 
     def keyframes(self, map_number: int = 0) -> int:
         """Return how many keyframes of a map were added."""
-        return len(self._maps[map_number].index) if map_number in self._maps else 0
+        return sum(keyframe.seat.map == map_number for keyframe in self._keyframes)
 
-    def add(self, keyframe: Frame, map_number: int = 0) -> None:
-        """Take a keyframe with depth and pose, later than those before; poses of one map share a world."""
+    def add(self, keyframe: Frame, seat: Seat | None = None) -> None:
+        """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
+
+        seat : how it was tracked; None: in map 0, from the keyframe before.
+        """
         if keyframe.T_world_camera is None:
             raise ValueError("a keyframe needs a pose")
-        own = self._maps.setdefault(map_number, _Map(self.settings))
-        own.index.append(keyframe.index)
-        own.T_world_camera.append(keyframe.T_world_camera)
+        if seat is None:
+            before = self._keyframes[-1].frame if self._keyframes else keyframe.index
+            seat = Seat(0, before, keyframe.T_world_camera)
+        self._keyframes.append(_Keyframe(keyframe.index, seat))
         # What went wrong with earlier keyframes is heard of now, not after the last frame.
         while self._links and self._links[0].done():
             self._links.popleft().result()
-        self._links.append(self._worker.submit(own.link, keyframe))
+        self._links.append(self._worker.submit(self._link, keyframe, seat.map))
 
-    def adjust(self, map_number: int = 0) -> Correction:
-        """Return the correction of all frames of a map, after the last keyframe.
+    def adjust(self, map_number: int = 0, seats: Mapping[int, Seat] | None = None) -> Correction:
+        """Return the correction of all frames of a map, and of those maps that show the same, after the last keyframe.
 
-        It changes nothing where a rigid scene cannot explain what was seen. Raises ValueError where no keyframe of that
-        map was added.
+        seats : by number of the frame, how it was tracked; frames of several maps need it. The correction changes
+        nothing where a rigid scene cannot explain what was seen. Raises ValueError where no keyframe of that map was
+        added.
         """
-        if map_number not in self._maps:
+        if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
         while self._links:
             self._links.popleft().result()
         self._worker.shutdown()
-        return self._maps[map_number].adjusted()
+        worlds = self._joined(map_number)
+        correction = self._adjusted(worlds)
+        if correction.refused and len(worlds) > 1:
+            worlds = {map_number: Similarity.identity()}
+            correction = self._adjusted(worlds)
+        return replace(correction, worlds=worlds, seats=seats or {})
 
-
-class _Map:
-    """The keyframes of one map, what links them, and the loops among them."""
-
-    def __init__(self, settings: BackendSettings) -> None:
-        self.settings = settings
-        self.index: list[int] = []
-        self.T_world_camera: list[np.ndarray] = []
-        self._linker = Linker(settings, DisFlow())
-        self._finder = LoopFinder(settings) if settings.loop_landmarks > 0 else None
-        self._loops: list[Loop] = []
-        self._camera: PinholeCamera | None = None
-
-    def link(self, keyframe: Frame) -> None:
-        """Link a keyframe to those just before it, and to those long before that show the same."""
+    def _link(self, keyframe: Frame, map_number: int) -> None:
+        """Link a keyframe to those just before it, and to those elsewhere that show the same."""
         self._camera = keyframe.camera
-        self._linker.add(keyframe)
-        for loop in self._finder.add(keyframe) if self._finder is not None else []:
+        self._linker.add(keyframe, map_number)
+        for loop in self._finder.add(keyframe, map_number) if self._finder is not None else []:
             self._linker.close(loop)
             self._loops.append(loop)
 
-    def adjusted(self) -> Correction:
-        """Adjust all keyframes together."""
+    def _joined(self, map_number: int) -> dict[int, Similarity]:
+        """Return the worlds of the maps that belong together with this one."""
+        map_of = [keyframe.seat.map for keyframe in self._keyframes]
+        points, _ = self._linker.collected(np.flatnonzero(np.array(map_of) == map_number))
+        if len(set(map_of)) < 2 or not len(points.log_depth):
+            return {map_number: Similarity.identity()}
+        depth_mm = float(np.exp(np.median(points.log_depth)))
+        T_world_camera = np.stack([keyframe.seat.T_world_camera for keyframe in self._keyframes])
+        return join_maps(T_world_camera, map_of, self._loops, map_number, depth_mm)
+
+    def _adjusted(self, worlds: Mapping[int, Similarity]) -> Correction:
+        """Adjust all keyframes of the maps with these worlds together."""
         camera, settings = self._camera, self.settings
         assert camera is not None
-        T_world_camera = np.stack(self.T_world_camera)
+        chosen = [k for k, keyframe in enumerate(self._keyframes) if keyframe.seat.map in worlds]
+        own = [self._keyframes[k] for k in chosen]
+        world_of = [worlds[keyframe.seat.map] for keyframe in own]
+        T_world_camera = np.stack(
+            [w.transform_poses(k.seat.T_world_camera) for w, k in zip(world_of, own, strict=True)]
+        )
+        log_unit = np.log([world.scale for world in world_of])
+        points, sightings = self._linker.collected(chosen)
+        points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         priors = Priors(settings.scale_sigma, math.radians(settings.turn_sigma_deg), settings.way_sigma_share)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        points, sightings = self._linker.collected()
-        start, loops = None, 0
-        if self._loops:
-            graph = spread_loops(T_world_camera, self._loops, float(np.exp(np.median(points.log_depth))))
+        pairs, start, loops = _neighbours(own), None, 0
+        depth_mm = float(np.exp(np.median(points.log_depth))) if len(points.log_depth) else 1.0
+        if said := _of(self._loops, chosen, log_unit):
+            graph = spread_loops(T_world_camera, pairs, said, depth_mm)
             start, loops = (inverse(graph.T_world_camera), graph.log_scale), graph.believed
-        problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, start)
+        problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, pairs, start)
         found = adjust(problem)
         if start is not None and self._doubt(points, found):
             # Loops may be what is wrong.
             found, loops = adjust(replace(problem, start=None)), 0
-        index, doubt = np.array(self.index), self._doubt(points, found)
-        if doubt:
+        index = np.array([keyframe.frame for keyframe in own])
+        if doubt := self._doubt(points, found):
             return unchanged(index, found.sigma_px, doubt)
         T_world_world = inverse(found.T_camera_world) @ inverse(T_world_camera)
         grids = self._grids(camera, points, found) if settings.depth_step_sigma > 0 else ()
-        return Correction(index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids)
+        return Correction(
+            index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids, depth_mm=depth_mm
+        )
 
     def _doubt(self, points: Points, found: Solution) -> str:
         """Say why a rigid scene does not explain what was seen, "" where it does."""
@@ -131,7 +164,7 @@ class _Map:
         error = _depth_change(points, found)
         pixels = points.rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         places = (pixels + 0.5) / [camera.width, camera.height]
-        of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(self.index))]
+        of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(found.T_camera_world))]
         step_sigma = self.settings.depth_step_sigma
         return tuple(
             fit_grid(places[own], points.log_depth[own], error[own], found.log_depth_sigma[own], step_sigma)
@@ -142,3 +175,37 @@ class _Map:
 def _depth_change(points: Points, found: Solution) -> np.ndarray:
     """What each point (P,) adds to ln of its estimated depth, beside its keyframe's scale."""
     return found.log_depth - points.log_depth - found.log_scale[points.host]
+
+
+def _neighbours(keyframes: Sequence[_Keyframe]) -> np.ndarray:
+    """Pairs (C, 2) of keyframes of which the second was tracked from the first.
+
+    That is the one it was aligned to, or, where that was none of them, the one before it in its map.
+    """
+    place = {keyframe.frame: k for k, keyframe in enumerate(keyframes)}
+    pairs: list[tuple[int, int]] = []
+    latest: dict[int, int] = {}
+    for k, keyframe in enumerate(keyframes):
+        first = place.get(keyframe.seat.keyframe, k)
+        first = latest.get(keyframe.seat.map, k) if first >= k else first
+        if first < k:
+            pairs.append((first, k))
+        latest[keyframe.seat.map] = k
+    return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _of(loops: Sequence[Loop], chosen: Sequence[int], log_unit: np.ndarray) -> list[Loop]:
+    """Return the loops among the chosen keyframes, called by their place here, in the millimetres that these get.
+
+    log_unit : (K,) ln of what the chosen keyframes' millimetres are multiplied by.
+    """
+    place = {number: k for k, number in enumerate(chosen)}
+    out = []
+    for loop in loops:
+        if loop.past in place and loop.new in place:
+            past, new = place[loop.past], place[loop.new]
+            T_new_past = loop.T_new_past.copy()
+            T_new_past[:3, 3] *= np.exp(log_unit[past])
+            ratio = loop.log_ratio + float(log_unit[new] - log_unit[past])
+            out.append(replace(loop, past=past, new=new, T_new_past=T_new_past, log_ratio=ratio))
+    return out

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,9 +21,14 @@ from scopemap.geometry.uncertainty import sigma_share
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """A keyframe that others can be linked to: number, image, mask, places (n, 2) of its points, first point."""
+    """A keyframe that others can be linked to.
+
+    number : among all keyframes. nth : among those of its map. rgb, valid : image and mask. places : (n, 2) of its
+    points, of which `first` is the number of the first.
+    """
 
     number: int
+    nth: int
     rgb: np.ndarray
     valid: np.ndarray
     places: np.ndarray
@@ -36,17 +42,17 @@ class _Sighting(NamedTuple):
 
 
 class Linker:
-    """Collects keyframes one by one; each is linked to those `settings.gaps` before it, both ways."""
+    """Collects keyframes one by one; each is linked to those of its map `settings.gaps` before it, both ways."""
 
     def __init__(self, settings: BackendSettings, flow: FlowEstimator) -> None:
         self.settings, self._flow = settings, flow
-        self._recent: deque[_Keyframe] = deque(maxlen=max(settings.gaps))
+        self._recent: defaultdict[int, deque[_Keyframe]] = defaultdict(lambda: deque(maxlen=max(settings.gaps)))
         self._points: list[Points] = []
         self._sightings: list[_Sighting] = []
         self._count = self._keyframes = 0
         self._camera: PinholeCamera | None = None
 
-    def add(self, keyframe: Frame) -> None:
+    def add(self, keyframe: Frame, map_number: int = 0) -> None:
         """Take a keyframe with depth: choose its points, find them in earlier keyframes, and theirs in it."""
         assert keyframe.depth_mm is not None
         places = corners(keyframe, self.settings.cell_px)
@@ -55,11 +61,13 @@ class Linker:
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
         share = sigma_share(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._host(self._keyframes, places, log_depth, np.nan_to_num(share, nan=0.0))
-        new = _Keyframe(self._keyframes, keyframe.rgb, keyframe.valid, places, first)
-        for past in self._recent:
-            if new.number - past.number in self.settings.gaps:
+        recent = self._recent[map_number]
+        nth = recent[-1].nth + 1 if recent else 0
+        new = _Keyframe(self._keyframes, nth, keyframe.rgb, keyframe.valid, places, first)
+        for past in recent:
+            if new.nth - past.nth in self.settings.gaps:
                 self._link(past, new)
-        self._recent.append(new)
+        recent.append(new)
         self._keyframes += 1
 
     def close(self, loop: Loop) -> None:
@@ -73,16 +81,24 @@ class Linker:
             number = first + np.arange(known.sum())
             self._sightings.append(_Sighting(number, np.full(len(number), other), pixels[known]))
 
-    def collected(self) -> tuple[Points, Sightings]:
-        """Return all points so far, sorted by host, and all sightings of them, sorted by point."""
+    def collected(self, keyframes: Collection[int] | None = None) -> tuple[Points, Sightings]:
+        """Return all points so far, sorted by host, and all sightings of them, sorted by point.
+
+        keyframes : numbers, increasing, of those that count, and by whose place here they are then called; None: all.
+        """
+        called = np.full(self._keyframes, -1)
+        chosen = np.arange(self._keyframes) if keyframes is None else np.array(keyframes, dtype=int)
+        called[chosen] = np.arange(len(chosen))
         points = Points(*(np.concatenate([getattr(p, n) for p in self._points]) for n in Points.__annotations__))
         empty = _Sighting(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
         point, keyframe, pixel = (np.concatenate(parts) for parts in zip(empty, *self._sightings, strict=True))
-        by_host = np.argsort(points.host, kind="stable")
-        place = np.empty_like(by_host)
+        host, keyframe = called[points.host], called[keyframe]
+        by_host = np.argsort(host, kind="stable")[np.count_nonzero(host < 0) :]
+        place = np.full(len(host), -1)
         place[by_host] = np.arange(len(by_host))
         order = np.argsort(place[point], kind="stable")
-        sorted_points = Points(*(getattr(points, name)[by_host] for name in Points.__annotations__))
+        order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
+        sorted_points = Points(host[by_host], points.rays[by_host], points.log_depth[by_host], points.sigma[by_host])
         return sorted_points, Sightings(place[point][order], keyframe[order], pixel[order])
 
     def _host(self, keyframe: int, places: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:

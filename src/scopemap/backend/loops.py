@@ -49,13 +49,14 @@ class LoopFinder:
     def __init__(self, settings: BackendSettings) -> None:
         self.settings = settings
         self._known: list[Landmarks] = []
+        self._map_of: list[int] = []
         self._closed: defaultdict[int, list[int]] = defaultdict(list)
 
-    def add(self, keyframe: Frame) -> list[Loop]:
-        """Return the loops that a keyframe with depth closes."""
+    def add(self, keyframe: Frame, map_number: int = 0) -> list[Loop]:
+        """Return the loops that a keyframe with depth closes, those into other maps among them."""
         new = find_landmarks(keyframe)
         loops = []
-        for past in self._candidates(new):
+        for past in self._candidates(new, map_number):
             known = self._known[past]
             located = locate(known, new, keyframe.camera, self.settings.loop_landmarks)
             if located is None:
@@ -82,17 +83,28 @@ class LoopFinder:
             )
         # Half of the precision tells descriptors apart as well, in half of the memory.
         self._known.append(replace(new, descriptors=new.descriptors.astype(np.float16)))
+        self._map_of.append(map_number)
         return loops
 
-    def _candidates(self, new: Landmarks) -> list[int]:
-        """Numbers of the keyframes, all before those that flow links to anyhow, that look most alike."""
-        long_before, strongest = len(self._known) - max(self.settings.gaps), new.descriptors[:_STRONGEST]
-        votes = []
-        for known in self._known[: max(long_before, 0)]:
-            alike = strongest @ known.descriptors[:_STRONGEST].T.astype(np.float32)
-            votes.append(float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0)
-        ranked = np.argsort(-np.array(votes), kind="stable")
-        return [int(k) for k in ranked if votes[k] > 0 and self._may_close(int(k))][:_CANDIDATES]
+    def _candidates(self, new: Landmarks, map_number: int) -> list[int]:
+        """Numbers of the keyframes that look most alike, of this map and of others.
+
+        Those that flow links to anyhow, the last ones of this map, are left out.
+        """
+        map_of, strongest = np.array(self._map_of, dtype=int), new.descriptors[:_STRONGEST]
+        own, elsewhere = np.flatnonzero(map_of == map_number), np.flatnonzero(map_of != map_number)
+        likely: list[int] = []
+        for some in (own[: max(len(own) - max(self.settings.gaps), 0)], elsewhere):
+            votes = np.array([self._votes(strongest, self._known[k]) for k in some])
+            ranked = [int(some[k]) for k in np.argsort(-votes, kind="stable") if votes[k] > 0]
+            likely += [k for k in ranked if self._may_close(k)][:_CANDIDATES]
+        return likely
+
+    @staticmethod
+    def _votes(strongest: np.ndarray, known: Landmarks) -> float:
+        """How much a keyframe looks like one with these descriptors."""
+        alike = strongest @ known.descriptors[:_STRONGEST].T.astype(np.float32)
+        return float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0
 
     def _may_close(self, past: int) -> bool:
         closed = self._closed[past]

@@ -54,14 +54,15 @@ class _Edges(NamedTuple):
     sigma: np.ndarray  # (E, 7)
 
 
-def spread_loops(T_world_camera: np.ndarray, loops: list[Loop], depth_mm: float) -> Graph:
+def spread_loops(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float) -> Graph:
     """Return poses and scales that agree best with the tracked motions and the loops; the first keyframe stays.
 
-    T_world_camera : (K, 4, 4) as tracked. depth_mm : typical depth, the unit of ways.
+    T_world_camera : (K, 4, 4) as tracked. neighbours : (C, 2) int, pairs between which the motion was tracked.
+    depth_mm : typical depth, the unit of ways.
     """
     count = len(T_world_camera)
     loops = [loop for loop in loops if _plausible(T_world_camera, loop, depth_mm)]
-    edges = _edges(T_world_camera, loops, depth_mm)
+    edges = _edges(T_world_camera, neighbours, loops, depth_mm)
     turns, places = Rotation.from_matrix(T_world_camera[:, :3, :3]), T_world_camera[:, :3, 3] / depth_mm
 
     def state(x: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
@@ -92,7 +93,7 @@ def spread_loops(T_world_camera: np.ndarray, loops: list[Loop], depth_mm: float)
         ).x
     R, p, s = state(x)
     poses = [se3(turn, depth_mm * place) for turn, place in zip(R.as_matrix(), p, strict=True)]
-    left = np.linalg.norm(errors(x).reshape(-1, _OWN)[count - 1 :], axis=1) / np.sqrt(_OWN)
+    left = np.linalg.norm(errors(x).reshape(-1, _OWN)[len(neighbours) :], axis=1) / np.sqrt(_OWN)
     return Graph(np.stack(poses), s, int((left < _BELIEVED).sum()))
 
 
@@ -105,11 +106,11 @@ def _plausible(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:
     return off_mm <= _MOST_OF_THE_WAY * (way_mm + depth_mm)
 
 
-def _edges(T_world_camera: np.ndarray, loops: list[Loop], depth_mm: float) -> _Edges:
+def _edges(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float) -> _Edges:
     """Edges between neighbours and of loops, ways in units of `depth_mm`."""
-    steps = inverse(T_world_camera[:-1]) @ T_world_camera[1:]
-    i = np.append(np.arange(len(steps)), [loop.past for loop in loops]).astype(int)
-    j = np.append(np.arange(1, len(steps) + 1), [loop.new for loop in loops]).astype(int)
+    steps = inverse(T_world_camera[neighbours[:, 0]]) @ T_world_camera[neighbours[:, 1]]
+    i = np.append(neighbours[:, 0], [loop.past for loop in loops]).astype(int)
+    j = np.append(neighbours[:, 1], [loop.new for loop in loops]).astype(int)
     T = np.concatenate([steps, *(inverse(loop.T_new_past)[None] for loop in loops)])
     T[:, :3, 3] /= depth_mm
     # The new one's depth is too large by its ratio: its scale has to be smaller.

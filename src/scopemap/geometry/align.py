@@ -52,6 +52,14 @@ class Similarity:
             return float("nan")
         return float(self.singular_values[1] / self.singular_values[0])
 
+    def inverse(self) -> Similarity:
+        """Return the similarity that undoes this one."""
+        return Similarity(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
+
+    def after(self, first: Similarity) -> Similarity:
+        """Return the similarity that does `first` and then this one."""
+        return Similarity(self.scale * first.scale, self.R @ first.R, self.transform_points(first.t))
+
     def transform_points(self, points: np.ndarray) -> np.ndarray:
         """Return points of shape (..., 3), mm, moved to the reference world."""
         return self.scale * points @ self.R.T + self.t

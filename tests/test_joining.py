@@ -1,0 +1,95 @@
+"""Maps put into one world: known similarities come back, and what only one loop says is not believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.backend.joining import join_maps
+from scopemap.backend.loops import Loop
+from scopemap.geometry.align import Similarity
+from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
+
+DEPTH_MM = 50.0
+# Of nine keyframes; the second map is left and entered again.
+MAP_OF = [0, 0, 0, 1, 1, 2, 2, 1, 1]
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=25, deadline=None)
+
+
+class _Scene:
+    """Keyframes of one true world, each told in the world and the millimetres of its map."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        twists = np.column_stack([rng.normal(0, 0.3, (len(MAP_OF), 3)), rng.normal(0, 15, (len(MAP_OF), 3))])
+        self.true = np.stack([se3_exp(twist) for twist in twists])
+        self.true[0] = np.eye(4)
+        # What takes the true world to each map's.
+        self.told = {
+            number: Similarity(float(np.exp(rng.normal(0, 0.4))), so3_exp(rng.normal(size=3)), rng.normal(0, 40, 3))
+            for number in (1, 2)
+        } | {0: Similarity.identity()}
+        self.poses = np.stack([self.told[m].transform_poses(pose) for m, pose in zip(MAP_OF, self.true, strict=True)])
+
+    def loop(self, past: int, new: int) -> Loop:
+        scale_past, scale_new = (self.told[MAP_OF[k]].scale for k in (past, new))
+        T_new_past = inverse(self.true[new]) @ self.true[past]
+        T_new_past[:3, 3] *= scale_past
+        nothing = np.zeros((0, 2))
+        return Loop(past, new, T_new_past, float(np.log(scale_new / scale_past)), *(nothing,) * 4)
+
+
+def _common(scene: _Scene, worlds: dict[int, Similarity]) -> dict[int, np.ndarray]:
+    """Where the keyframes of the joined maps are in the common world."""
+    own = {k: number for k, number in enumerate(MAP_OF) if number in worlds}
+    return {k: worlds[number].transform_poses(scene.poses[k]) for k, number in own.items()}
+
+
+@few
+@given(seeds)
+def test_maps_come_to_lie_as_they_truly_do(seed: int) -> None:
+    scene = _Scene(seed)
+    # The third map is tied to the second only, by loops in both directions of time.
+    loops = [scene.loop(0, 3), scene.loop(2, 7), scene.loop(4, 5), scene.loop(6, 8)]
+    worlds = join_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)
+    assert sorted(worlds) == [0, 1, 2]
+    for k, pose in _common(scene, worlds).items():
+        np.testing.assert_allclose(pose, scene.true[k], atol=1e-6)
+
+
+@few
+@given(seeds)
+def test_the_first_keyframe_stays_and_millimetres_are_the_main_maps(seed: int) -> None:
+    scene = _Scene(seed)
+    worlds = join_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 1, DEPTH_MM)
+    assert sorted(worlds) == [0, 1]
+    assert worlds[1].scale == 1
+    poses = _common(scene, worlds)
+    np.testing.assert_allclose(poses[0], scene.poses[0], atol=1e-6)
+    for k, pose in poses.items():
+        true = inverse(scene.true[0]) @ scene.true[k]
+        true[:3, 3] *= scene.told[1].scale
+        np.testing.assert_allclose(inverse(poses[0]) @ pose, true, atol=1e-6)
+
+
+def test_what_one_loop_says_alone_or_against_another_is_not_believed() -> None:
+    scene = _Scene(0)
+    true, other = scene.loop(0, 3), scene.loop(2, 7)
+    turned = replace(other, T_new_past=se3_exp(np.array([0, 0.3, 0, 0, 0, 0])) @ other.T_new_past)
+    moved = replace(other, T_new_past=se3_exp(np.array([0, 0, 0, 0, 40.0, 0])) @ other.T_new_past)
+    larger = replace(other, log_ratio=other.log_ratio + 0.4)
+    within = scene.loop(0, 2)
+    for loops in ([], [true], [true, within], [true, turned], [true, moved], [true, larger]):
+        assert list(join_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)) == [0]
+
+
+def test_a_false_loop_is_outvoted() -> None:
+    scene = _Scene(1)
+    false = replace(scene.loop(1, 4), T_new_past=np.eye(4))
+    worlds = join_maps(scene.poses, MAP_OF, [false, scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)
+    for k, pose in _common(scene, worlds).items():
+        np.testing.assert_allclose(pose, scene.true[k], atol=1e-6)
