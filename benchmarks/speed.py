@@ -72,7 +72,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    pipeline.fuse(pipeline.adjust())
+    pipeline.fuse(pipeline.pieces()[0])
     seldom = ("keyframe", "back end")
     per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
     # What does not happen at every frame is spread over all.

@@ -155,8 +155,8 @@ def test_outside_all_keyframes_the_nearest_correction_holds() -> None:
     assert "as tracked" in correction.description
 
 
-def _seated(keyframe: int, x_mm: float) -> Seat:
-    return Seat(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])))
+def _seated(keyframe: int, x_mm: float, stretch: int = 0) -> Seat:
+    return Seat(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), stretch)
 
 
 def test_a_frame_takes_as_much_of_the_next_correction_as_it_has_moved() -> None:
@@ -179,6 +179,15 @@ def test_a_camera_found_again_is_corrected_as_from_there_on() -> None:
     seats |= {22: _seated(20, 2.2), 26: _seated(10, 2.6), 33: _seated(30, 3.3), 35: _seated(20, 3.5)}
     correction = Correction(np.array([0, 10, 20, 30]), T, np.zeros(4), seats=seats, depth_mm=50.0)
     for index, of in ((20, 2), (22, 2), (26, 3), (30, 3), (33, 3), (35, 2)):
+        np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
+
+
+def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:
+    T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(2)])
+    # Keyframe 0 finds the camera again after frames 4 and 5 were lost; keyframe 10 comes of that.
+    seats = {0: _seated(0, 0), 2: _seated(0, 0.2), 7: _seated(0, 0.7, 2), 10: _seated(0, 1, 2), 12: _seated(10, 1.2, 2)}
+    correction = Correction(np.array([0, 10]), T, np.zeros(2), seats=seats, depth_mm=50.0)
+    for index, of in ((2, 0), (7, 1), (12, 1)):
         np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import plane_scene
 import pytest
+import trimesh
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
@@ -24,13 +25,13 @@ from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory import read_trajectory
 
-FIRST, SECOND, GIVEN_UP = 6, 11, 2
+FIRST, SECOND, GIVEN_UP = 10, 13, 2
 LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__new_map_after": GIVEN_UP}
 
 
 @pytest.fixture(scope="module")
 def spliced(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six frames of one scene, then eleven of another."""
+    """Ten frames of one scene, then thirteen of another."""
     folder = tmp_path_factory.mktemp("maps")
     width, height = SIZE
     parts = (PhantomSpec(frames=FIRST, seed=3), PhantomSpec(scene="laparoscopy", frames=SECOND, seed=5))
@@ -49,8 +50,13 @@ def spliced(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result(spliced: Path) -> Reconstruction:
-    return reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT))
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run") / "out"
+
+
+@pytest.fixture(scope="module")
+def result(spliced: Path, out: Path) -> Reconstruction:
+    return reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT), out=out)
 
 
 def test_the_largest_map_is_kept_and_the_rest_lost(result: Reconstruction) -> None:
@@ -60,7 +66,7 @@ def test_the_largest_map_is_kept_and_the_rest_lost(result: Reconstruction) -> No
     assert "keyframe" in result.records[FIRST].track.reason
     note = next(text for text in result.provenance["warnings"] if text.startswith("maps:"))
     assert "there are 2" in note
-    assert f"of {FIRST + SECOND - GIVEN_UP} frames tracked, the {SECOND - GIVEN_UP} of the largest" in note
+    assert f"of {FIRST + SECOND - GIVEN_UP} frames tracked, {SECOND - GIVEN_UP} are in the result" in note
 
 
 def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
@@ -77,6 +83,36 @@ def test_only_the_kept_map_is_fused(result: Reconstruction, spliced: Path) -> No
     alone = reconstruct(open_sequence(scene, frames=slice(GIVEN_UP, None)), with_true_depth(scene, **LIGHT))
     for one, other in zip(result.mesh.bounds, alone.mesh.bounds, strict=True):
         np.testing.assert_allclose(one, other, atol=2.0)
+
+
+def test_the_smaller_map_is_kept_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
+    (other,) = result.others
+    lost = [record.track.status == "lost" for record in other.records]
+    assert lost == [False] * FIRST + [True] * SECOND
+    off = inverse(other.trajectory.T_world_camera[:FIRST]) @ true_poses(spliced)[:FIRST]
+    assert rotation_angle_rad(off[:, :3, :3]).max() < np.radians(0.5)
+    assert other.provenance["tracked"] == FIRST
+    scene = spliced.parent / "0"
+    alone = reconstruct(open_sequence(scene), with_true_depth(scene, **LIGHT))
+    np.testing.assert_allclose(other.mesh.bounds, alone.mesh.bounds, atol=1e-3)
+    assert read_trajectory(out / "maps" / "1").tracked.tolist() == [not missing for missing in lost]
+    written = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
+    np.testing.assert_allclose(written.bounds, other.mesh.bounds, atol=1e-3)
+
+
+def test_another_run_takes_the_place_of_all_of_it(spliced: Path, out: Path, tmp_path: Path) -> None:
+    shutil.copytree(out, tmp_path / "out")
+    short = with_true_depth(spliced, **LIGHT)
+    again = reconstruct(open_sequence(spliced, frames=slice(0, 3)), short, out=tmp_path / "out", overwrite=True)
+    assert again.others == []
+    assert not (tmp_path / "out" / "maps").exists()
+
+
+def test_few_frames_apart_are_left_out(spliced: Path) -> None:
+    some = open_sequence(spliced, frames=slice(1, None))
+    result = reconstruct(some, with_true_depth(spliced, **LIGHT, fusion__enabled=False))
+    assert len(result.records) - len(result.lost) == SECOND - GIVEN_UP
+    assert result.others == []
 
 
 def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> None:

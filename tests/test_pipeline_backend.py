@@ -13,7 +13,7 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.pipeline import Estimators, Pipeline, Step
+from scopemap.pipeline import Estimators, Piece, Pipeline, Step
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
@@ -129,10 +129,8 @@ def test_what_waited_is_fused_though_no_keyframe_ever_came(run: _Run) -> None:
     config = with_true_depth(run.phantom, fusion__min_weight=0.0, **SETTINGS)
     pipeline = Pipeline(config, Estimators.create(config, open_sequence(run.phantom)))
     pipeline._waiting.put(run.steps[0].frame)
-    assert pipeline.adjust() is None
-    pipeline.fuse()
-    assert len(pipeline._waiting) == 0
-    assert len(pipeline.surface().vertices) > 0
+    assert pipeline.pieces() == []
+    assert len(pipeline.fuse(Piece(0, (0,), 1)).mesh.vertices) > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:

@@ -156,8 +156,8 @@ def test_provenance(run: _Run) -> None:
     assert told["estimators"]["anchor"] == "measured depth"
     assert set(told["versions"]) >= {"scopemap", "numpy", "torch", "python"}
     parts = told["seconds"]
-    assert {"read", "perceive", "track and fuse", "mesh", "total"} <= set(parts)
-    assert parts["total"] >= max(parts["track and fuse"], parts["mesh"])
+    assert {"read", "perceive", "track and fuse", "fuse", "total"} <= set(parts)
+    assert parts["total"] >= max(parts["track and fuse"], parts["fuse"])
 
 
 def test_a_result_in_memory_can_be_saved_later(run: _Run, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ motion, so it may run a frame ahead of `step`.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import trimesh
@@ -124,6 +124,35 @@ class Estimators:
         return parts | masks | {"anchor": self.anchor.description}
 
 
+LEAST_FRAMES_APART = 10
+"""Frames that a map must have to be given back beside the main one."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Maps that are in one world after the last frame.
+
+    Attributes
+    ----------
+    main : number of the one with most frames. maps : all numbers. frames : how many were tracked in them. correction :
+    what the back end makes of these frames; None: they are as tracked.
+    """
+
+    main: int
+    maps: tuple[int, ...]
+    frames: int
+    correction: Correction | None = None
+
+
+@dataclass(frozen=True)
+class Fused:
+    """The surface of a piece, world mm, may be empty; the settings with the sizes that it has; what to say of these."""
+
+    mesh: trimesh.Trimesh
+    settings: FusionSettings
+    note: list[str] = field(default_factory=list)
+
+
 class Pipeline:
     """One run over one sequence; frames go through `perceive` and `step` in order, each once.
 
@@ -150,36 +179,7 @@ class Pipeline:
         follows = tracker is None and config.odometry.corner_depth_share > 0 and estimators.flow.name != "none"
         self._corners = CornerFollower(DisFlow(), config.mapis.consistency_px) if follows else None
         self._seats: dict[int, Seat] = {}
-        self._joined: tuple[int, ...] = ()
-
-    @property
-    def main_map(self) -> int:
-        """Number of the map that counts: the one with most tracked frames."""
-        frames = self._frames_of_map
-        return max(frames, key=lambda number: frames[number], default=0)
-
-    @property
-    def _frames_of_map(self) -> Counter[int]:
-        """How many frames were tracked in each map."""
-        return Counter(seat.map for seat in self._seats.values())
-
-    @property
-    def kept_maps(self) -> tuple[int, ...]:
-        """Numbers of the maps that are kept: the main one, and those that `adjust` has joined with it."""
-        return self._joined or (self.main_map,)
-
-    @property
-    def maps_note(self) -> list[str]:
-        """What to say where maps are left out; nothing where all are kept."""
-        frames = self._frames_of_map
-        if not set(frames) - set(self.kept_maps):
-            return []
-        total, kept = frames.total(), sum(frames[number] for number in self.kept_maps)
-        which = "the largest" if len(self.kept_maps) == 1 else f"{len(self.kept_maps)} that could be joined"
-        return [
-            f"maps: there are {len(frames)}, since the camera was lost and not found again; of {total} "
-            f"frames tracked, the {kept} of {which} are kept: how the others lie to them is not known"
-        ]
+        self._losses = 0
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the frame before it."""
@@ -227,55 +227,63 @@ class Pipeline:
         if track.status == "lost":
             self._mapis.forget()
             self._smooth.forget()
+            self._losses += 1
         else:
-            self._seats[frame.index] = Seat(track.map, track.keyframe, track.T_world_camera)
+            self._seats[frame.index] = self._seat(track)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
         self._last, self._last_mm = track, refined.depth_mm
         return Step(frame, track, percept.raw_mm, refined)
 
-    def adjust(self) -> Correction | None:
-        """Adjust all keyframes together after the last frame; None where nothing was adjusted.
+    def pieces(self) -> list[Piece]:
+        """Adjust all keyframes together after the last frame, and join what can be joined; most frames first.
 
         Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
         """
-        if self._backend is None or not self._backend.keyframes(self.main_map):
-            return None
-        correction = self._backend.adjust(self.main_map, self._seats)
-        self._joined = tuple(sorted(correction.worlds))
-        return correction
+        frames = Counter(seat.map for seat in self._seats.values())
+        pieces: list[Piece] = []
+        while frames:
+            main = max(frames, key=lambda number: frames[number])
+            if pieces and frames[main] < LEAST_FRAMES_APART:
+                break
+            correction = None
+            if self._backend is not None and self._backend.keyframes(main):
+                correction = self._backend.adjust(main, self._seats, among=frames)
+            maps = (main,) if correction is None else tuple(sorted(correction.worlds))
+            pieces.append(Piece(main, maps, sum(frames.pop(number) for number in maps), correction))
+        return pieces
 
-    def fuse(self, correction: Correction | None = None) -> None:
-        """Fuse what waited, in voxels that suit it, as `adjust` corrected it."""
-        main, kept = self.main_map, self.kept_maps
-        elsewhere = {index for index, seat in self._seats.items() if seat.map not in kept}
+    def maps_note(self, pieces: list[Piece]) -> list[str]:
+        """What to say where maps are left; nothing where all are one piece."""
+        maps = {seat.map for seat in self._seats.values()}
+        if not pieces or maps == set(pieces[0].maps):
+            return []
+        beside = f"{len(pieces) - 1} more with {LEAST_FRAMES_APART} frames or more are kept beside it (maps/)"
+        return [
+            f"maps: there are {len(maps)}, since the camera was lost and not found again; of {len(self._seats)} frames "
+            f"tracked, {pieces[0].frames} are in the result; how the others lie to them is not known, {beside}"
+        ]
+
+    def fuse(self, piece: Piece) -> Fused:
+        """Fuse what waited of a piece, in voxels that suit it, as the back end corrected it."""
+        volume = self._volume or self._volume_of(piece)
+        if volume is None:
+            return Fused(trimesh.Trimesh(), self.config.fusion)
+        note = [f"fusion: {described(volume.sizes)}"] if follows_scene(self.config.fusion) else []
+        return Fused(volume.extract_mesh(), with_sizes(self.config.fusion, volume.sizes), note)
+
+    def _volume_of(self, piece: Piece) -> TsdfVolume | None:
+        elsewhere = {index for index, seat in self._seats.items() if seat.map not in piece.maps}
         # Other maps' millimetres are not those of the main one.
-        others = {index for index, seat in self._seats.items() if seat.map != main}
+        others = {index for index, seat in self._seats.items() if seat.map != piece.main}
         typical_mm = self._waiting.typical_mm(others)
         if typical_mm is None:
-            return
+            return None
         volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, typical_mm))
         for frame in self._waiting.frames():
             if frame.index not in elsewhere:
-                volume.integrate(frame if correction is None else correction.frame(frame))
-        self._waiting, self._volume = FrameSpool(), volume
-
-    @property
-    def fusion_settings(self) -> FusionSettings:
-        """The settings of fusion, with the sizes that were chosen once anything is fused."""
-        fusion = self.config.fusion
-        return fusion if self._volume is None else with_sizes(fusion, self._volume.sizes)
-
-    @property
-    def fusion_note(self) -> list[str]:
-        """What to say of sizes that nobody set; nothing where there is nothing to say."""
-        if self._volume is None or not follows_scene(self.config.fusion):
-            return []
-        return [f"fusion: {described(self._volume.sizes)}"]
-
-    def surface(self) -> trimesh.Trimesh:
-        """Return the surface of all fused frames, world mm; may be empty."""
-        return trimesh.Trimesh() if self._volume is None else self._volume.extract_mesh()
+                volume.integrate(frame if piece.correction is None else piece.correction.frame(frame))
+        return volume
 
     def _keyed(self, track: Track, frame: Frame, *, measured: bool) -> Track:
         """Make the frame a keyframe where one is due; a first frame that cannot be one fixes no world and is lost."""
@@ -286,10 +294,13 @@ class Pipeline:
         if adopted and self._corners is not None:
             self._corners.start(keyframe)
         if adopted and self._backend is not None:
-            self._backend.add(keyframe, Seat(track.map, track.keyframe, track.T_world_camera))
+            self._backend.add(keyframe, self._seat(track))
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track
+
+    def _seat(self, track: Track) -> Seat:
+        return Seat(track.map, track.keyframe, track.T_world_camera, self._losses)
 
     def _link(self, frame: Frame, kind: DepthKind) -> Correspondence | None:
         """Link a masked frame to the one before it; None for the first, and where MAPIS would not use it."""

@@ -1,7 +1,7 @@
 """What a run gives back, and the folder it is kept in.
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
-      depth/000000.png (16 bit, depth/depth.json has the scale)
+      depth/000000.png (16 bit, depth/depth.json has the scale)  maps/1 (the same of what could not be joined), ...
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _OWN_FILES = (
     *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
     *("config.toml", "provenance.json"),
 )
-_OWN_FOLDERS = ("depth", "pictures")
+_OWN_FOLDERS = ("depth", "pictures", "maps")
 # What tells a run's folder from any other: the first is written last, the second first.
 _MARKS = ("provenance.json", "depth/depth.json")
 
@@ -137,6 +137,8 @@ class Reconstruction:
         tells where a pixel was before (`camera.source_pixel`).
     skipped : frames that were read and not used.
     focal_sigma_px : standard deviation of the focal length of `camera` where it is an estimate, or None.
+    others : what else was reconstructed, each in a world and in millimetres of its own, since nothing tells how it lies
+        to this; most frames first.
     """
 
     camera: PinholeCamera
@@ -147,6 +149,7 @@ class Reconstruction:
     source_camera: CameraModel | None = None
     skipped: list[SkippedFrame] = field(default_factory=list)
     focal_sigma_px: float | None = None
+    others: list[Reconstruction] = field(default_factory=list)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -170,6 +173,8 @@ class Reconstruction:
         Raises `InputError` where the folder cannot be written.
         """
         folder = Path(folder)
+        for number, other in enumerate(self.others, 1):
+            other.save(folder / "maps" / str(number))
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_tum(folder / "trajectory.tum", self.trajectory)

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from scopemap.errors import InputError
 from scopemap.focal import with_focal_from_motion
 from scopemap.odometry import FrameTracker
 from scopemap.pictures.constant import is_constant
-from scopemap.pipeline import Estimators, Percept, Pipeline, Step
+from scopemap.pipeline import Estimators, Fused, Percept, Piece, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder
 
 Observer = Callable[[Step], None]
@@ -58,10 +59,10 @@ def reconstruct(
 
     The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there, and so
     is the size of the voxels.
+    Where maps could not be joined the one with most frames is the result, and `others` are beside it.
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
     """
-    config = config or Config()
-    started = time.perf_counter()
+    config, clock = config or Config(), _Clock()
     estimators = Estimators.create(config, sequence)
     writer = None
     if out is not None:
@@ -69,7 +70,6 @@ def reconstruct(
         prepare_folder(Path(out), overwrite=overwrite)
         writer = DepthWriter(Path(out), _most_depth_mm(config, estimators))
         observers = (writer, *observers)
-    clock = _Clock()
     sequence, camera_note = _with_best_camera(sequence, config, estimators, clock)
     config, exponent_note = _with_exponent(sequence, config, estimators, clock)
     if exponent_note:
@@ -81,26 +81,11 @@ def reconstruct(
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
-    correction = clock.timed("back end", pipeline.adjust)
-    records = only_maps(records, pipeline.kept_maps)
-    if correction is not None:
-        records = corrected(records, correction)
-        if writer is not None:
-            clock.timed("depth corrected", writer.correct, records, correction)
-    clock.timed("fuse", pipeline.fuse, correction)
-    config = config.model_copy(update={"fusion": pipeline.fusion_settings})
-    mesh = clock.timed("mesh", pipeline.surface)
-    clock.seconds["total"] = time.perf_counter() - started
-    provenance = _provenance(sequence, estimators, clock, records)
-    provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
-    provenance["notes"] += camera_note + exponent_note
-    provenance["warnings"] += distances.warnings(config.fusion) + pipeline.maps_note
-    provenance["notes"] += [] if correction is None else [correction.description]
-    provenance["notes"] += pipeline.fusion_note
-    camera, source_camera = sequence.camera, sequence.rectifier.source
-    result = Reconstruction(
-        camera, records, mesh, config, provenance, source_camera, sequence.skipped, sequence.focal_sigma_px
-    )
+    pieces = clock.timed("back end", pipeline.pieces)
+    tracked = _Tracked(sequence, config, pipeline, clock, records, camera_note + exponent_note, distances, writer)
+    results = [tracked.result(piece) for piece in pieces]
+    results[0].provenance["warnings"] += pipeline.maps_note(pieces)
+    result = replace(results[0], others=results[1:])
     if out is not None:
         result.save(Path(out))
     return result
@@ -110,14 +95,20 @@ class _Clock:
     """Seconds spent per part; parts in different threads overlap."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+        self._started = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds of the parts so far, and of all."""
+        return self._seconds | {"total": time.perf_counter() - self._started}
 
     def timed(self, part: str, call: Callable[..., Any], *arguments: Any) -> Any:
         started = time.perf_counter()
         try:
             return call(*arguments)
         finally:
-            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - started
+            self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - started
 
 
 class _Distances:
@@ -143,6 +134,40 @@ class _Distances:
             f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
             f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
         ]
+
+
+@dataclass(frozen=True)
+class _Tracked:
+    """All that there is of a run once the last frame is tracked."""
+
+    sequence: Sequence
+    config: Config
+    pipeline: Pipeline
+    clock: _Clock
+    records: list[FrameRecord]
+    notes: list[str]
+    distances: _Distances
+    writer: DepthWriter | None
+
+    def result(self, piece: Piece) -> Reconstruction:
+        """Correct and fuse one piece; its depth is written anew."""
+        sequence, clock, correction = self.sequence, self.clock, piece.correction
+        records = only_maps(self.records, piece.maps)
+        if correction is not None:
+            records = corrected(records, correction)
+            if self.writer is not None:
+                clock.timed("depth corrected", self.writer.correct, records, correction)
+        fused: Fused = clock.timed("fuse", self.pipeline.fuse, piece)
+        config = self.config.model_copy(update={"fusion": fused.settings})
+        estimators = self.pipeline.estimators
+        provenance = _provenance(sequence, estimators, clock, records)
+        provenance["notes"] += self.notes + ([] if correction is None else [correction.description]) + fused.note
+        provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
+        provenance["warnings"] += self.distances.warnings(config.fusion)
+        source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
+        return Reconstruction(
+            sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
+        )
 
 
 def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[Step]:

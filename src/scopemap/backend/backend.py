@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
@@ -75,19 +75,21 @@ class Backend:
             self._links.popleft().result()
         self._links.append(self._worker.submit(self._link, keyframe, seat.map))
 
-    def adjust(self, map_number: int = 0, seats: Mapping[int, Seat] | None = None) -> Correction:
+    def adjust(
+        self, map_number: int = 0, seats: Mapping[int, Seat] | None = None, among: Collection[int] | None = None
+    ) -> Correction:
         """Return the correction of all frames of a map, and of those maps that show the same, after the last keyframe.
 
-        seats : by number of the frame, how it was tracked; frames of several maps need it. The correction changes
-        nothing where a rigid scene cannot explain what was seen. Raises ValueError where no keyframe of that map was
-        added.
+        seats : by number of the frame, how it was tracked; frames of several maps need it. among : numbers of the maps
+        that may be joined; None: all. The correction changes nothing where a rigid scene cannot explain what was seen.
+        Raises ValueError where no keyframe of that map was added.
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
         while self._links:
             self._links.popleft().result()
         self._worker.shutdown()
-        worlds = self._joined(map_number)
+        worlds = self._joined(map_number, among)
         correction = self._adjusted(worlds)
         if correction.refused and len(worlds) > 1:
             worlds = {map_number: Similarity.identity()}
@@ -102,15 +104,17 @@ class Backend:
             self._linker.close(loop)
             self._loops.append(loop)
 
-    def _joined(self, map_number: int) -> dict[int, Similarity]:
-        """Return the worlds of the maps that belong together with this one."""
+    def _joined(self, map_number: int, among: Collection[int] | None) -> dict[int, Similarity]:
+        """Return the worlds of the maps, of those named, that belong together with this one."""
         map_of = [keyframe.seat.map for keyframe in self._keyframes]
         points, _ = self._linker.collected(np.flatnonzero(np.array(map_of) == map_number))
         if len(set(map_of)) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
         depth_mm = float(np.exp(np.median(points.log_depth)))
         T_world_camera = np.stack([keyframe.seat.T_world_camera for keyframe in self._keyframes])
-        return join_maps(T_world_camera, map_of, self._loops, map_number, depth_mm)
+        free = set(map_of if among is None else among)
+        loops = [loop for loop in self._loops if {map_of[loop.past], map_of[loop.new]} <= free]
+        return join_maps(T_world_camera, map_of, loops, map_number, depth_mm)
 
     def _adjusted(self, worlds: Mapping[int, Similarity]) -> Correction:
         """Adjust all keyframes of the maps with these worlds together."""

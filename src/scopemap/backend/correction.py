@@ -17,11 +17,16 @@ _AT_REST = 1e-6  # rad
 
 
 class Seat(NamedTuple):
-    """How a frame was tracked: number of its map, of the frame that it was aligned to, its pose in that map's world."""
+    """How a frame was tracked.
+
+    map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), its pose in
+    that map's world. stretch : the same number for all frames between which the camera was not lost.
+    """
 
     map: int
     keyframe: int
     T_world_camera: np.ndarray
+    stretch: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,17 +131,17 @@ class Correction:
 
         A frame moves with the keyframe that it was aligned to, and more and more with the next one, if that was aligned
         to the same: as much as the camera had moved by then. (Where a recording was cut that is all at once, and what
-        is wrong with the jump is wrong from there on.) After a loss the camera is found again by some older keyframe:
-        what is wrong with that is wrong from there on, too, with frames and the keyframe that comes of them alike.
+        is wrong with the jump is wrong from there on.) Where the camera was lost between them, or found again by an
+        older keyframe, what is wrong with that is wrong from there on, too: with all that was aligned to the same.
         """
         after = int(np.searchsorted(self.index, index))
         if after < len(self.index) and self.index[after] == index:
             return after, after, 0.0
         own = self._reference(index)
         if own is not None:
-            if after == len(self.index) or self._reference(int(self.index[after])) != own:
+            if after == len(self.index) or not self._alike(index, int(self.index[after])):
                 return own, own, 0.0
-            if own != after - 1:
+            if own != after - 1 or self._lost_between(int(self.index[own]), index):
                 return after, after, 0.0
         if after == 0 or after == len(self.index):
             nearest = min(after, len(self.index) - 1)
@@ -156,6 +161,14 @@ class Correction:
     def _motion(self, T_world_one: np.ndarray, T_world_other: np.ndarray) -> float:
         T = inverse(T_world_one) @ T_world_other
         return float(np.hypot(rotation_angle_rad(T[:3, :3]), np.linalg.norm(T[:3, 3]) / self.depth_mm))
+
+    def _alike(self, index: int, keyframe: int) -> bool:
+        """Whether a frame and a later keyframe were aligned to the same, and the camera was not lost between them."""
+        same = self._reference(index) == self._reference(keyframe)
+        return same and not self._lost_between(index, keyframe)
+
+    def _lost_between(self, one: int, other: int) -> bool:
+        return one in self.seats and other in self.seats and self.seats[one].stretch != self.seats[other].stretch
 
     def _reference(self, index: int) -> int | None:
         """Number of the keyframe that a frame was aligned to, where that is known."""

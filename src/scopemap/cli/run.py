@@ -160,7 +160,8 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
     elif not quiet:
         for line in summary_lines(result):
             typer.echo(line)
-        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv")
+        beside = ", maps/" if result.others else ""
+        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv{beside}")
 
 
 def summary_lines(result: Reconstruction) -> list[str]:
