@@ -12,11 +12,15 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.backend import Backend, Correction, Seat
+from scopemap.backend.backend import _Keyframe, _neighbours, _of
+from scopemap.backend.depth_grid import DepthGrid
 from scopemap.backend.links import Linker
+from scopemap.backend.loops import Loop
 from scopemap.config import BackendSettings
 from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool
+from scopemap.geometry.align import Similarity
 from scopemap.geometry.corners import corners, sampled_at
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 
@@ -180,6 +184,42 @@ def test_a_camera_found_again_is_corrected_as_from_there_on() -> None:
     correction = Correction(np.array([0, 10, 20, 30]), T, np.zeros(4), seats=seats, depth_mm=50.0)
     for index, of in ((20, 2), (22, 2), (26, 3), (30, 3), (33, 3), (35, 2)):
         np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
+
+
+def test_keyframes_hang_on_those_that_they_were_aligned_to() -> None:
+    T = np.eye(4)
+    seats = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
+    keyframes = [_Keyframe(frame, Seat(number, of, T)) for frame, number, of in seats]
+    # What keyframe 40 was aligned to is none: the one before it in its map has to do.
+    expected = [[0, 1], [2, 3], [0, 4], [4, 5], [3, 6]]
+    np.testing.assert_array_equal(_neighbours(keyframes), expected)
+    assert _neighbours(keyframes[:1]).shape == (0, 2)
+
+
+def test_loops_are_told_in_the_millimetres_of_the_joined_world() -> None:
+    T = se3_exp(np.array([0.1, 0, 0, 2.0, 3.0, 4.0]))
+    loops = [Loop(3, 7, T, 0.1, *(np.zeros((0, 2)),) * 4), Loop(3, 5, T, 0.1, *(np.zeros((0, 2)),) * 4)]
+    (loop,) = _of(loops, [3, 6, 7], np.log([2.0, 1.0, 3.0]))
+    assert (loop.past, loop.new) == (0, 2)
+    np.testing.assert_allclose(loop.T_new_past[:3, 3], [2 * x for x in T[:3, 3]])
+    np.testing.assert_allclose(loop.T_new_past[:3, :3], T[:3, :3])
+    assert loop.log_ratio == pytest.approx(0.1 + np.log(1.5))
+    np.testing.assert_array_equal(loops[0].T_new_past, T)
+
+
+def test_the_way_and_the_depth_of_a_joined_map_are_taken_in_the_common_world() -> None:
+    grid = DepthGrid(np.broadcast_to(np.linspace(-0.2, 0.2, 4), (6, 7, 4)).copy(), np.log(20.0), np.log(80.0))
+    world = Similarity(2.0, np.eye(3), np.array([5.0, 0, 0]))
+    T, depth_mm = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))]), np.full((10, 12), 20.0, np.float32)
+    # Keyframe 10 of map 0 is at 5 mm; those of map 1, whose world begins there, at twice their millimetres from it.
+    seats = {10: Seat(1, 10, np.eye(4)), 14: _seated(10, 1.0)._replace(map=1), 20: _seated(10, 4.0)._replace(map=1)}
+    correction = Correction(
+        np.array([10, 20]), T, np.zeros(2), grids=(grid, grid), worlds={0: Similarity.identity(), 1: world}, seats=seats
+    )
+    assert correction.pose(14, seats[14].T_world_camera)[0, 3] == pytest.approx(5 + 2 + 1)
+    expected = 2 * np.exp(grid.log_factor(2 * depth_mm))
+    np.testing.assert_allclose(correction.depth_factors(14, depth_mm), expected, rtol=1e-5)
+    assert not np.allclose(expected, 2 * np.exp(grid.log_factor(depth_mm)))
 
 
 def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:

@@ -30,7 +30,9 @@ class _Scene:
         self.true[0] = np.eye(4)
         # What takes the true world to each map's.
         self.told = {
-            number: Similarity(float(np.exp(rng.normal(0, 0.4))), so3_exp(rng.normal(size=3)), rng.normal(0, 40, 3))
+            number: Similarity(
+                float(np.exp(rng.uniform(-0.45, 0.45))), so3_exp(rng.normal(size=3)), rng.normal(0, 40, 3)
+            )
             for number in (1, 2)
         } | {0: Similarity.identity()}
         self.poses = np.stack([self.told[m].transform_poses(pose) for m, pose in zip(MAP_OF, self.true, strict=True)])
@@ -83,8 +85,15 @@ def test_what_one_loop_says_alone_or_against_another_is_not_believed() -> None:
     moved = replace(other, T_new_past=se3_exp(np.array([0, 0, 0, 0, 40.0, 0])) @ other.T_new_past)
     larger = replace(other, log_ratio=other.log_ratio + 0.4)
     within = scene.loop(0, 2)
-    for loops in ([], [true], [true, within], [true, turned], [true, moved], [true, larger]):
+    beside = scene.loop(0, 8)  # of the same keyframe as the first
+    for loops in ([], [true], [true, within], [true, turned], [true, moved], [true, larger], [true, beside]):
         assert list(join_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)) == [0]
+
+
+def test_a_scale_that_cannot_be_is_not_believed() -> None:
+    scene = _Scene(0)
+    scene.told[1] = replace(scene.told[1], scale=3.0)
+    assert list(join_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)) == [0]
 
 
 def test_a_false_loop_is_outvoted() -> None:

@@ -276,7 +276,7 @@ class BackendSettings(Settings):
     cell_px: int = Field(16, ge=4, description="one point in each cell of that size")
     consistency_px: float = Field(1.0, gt=0, description="largest error of flow there and back")
     loop_landmarks: int = Field(
-        25, ge=0, description="that must agree where a keyframe shows an old place; 0: no loops"
+        25, ge=0, description="that must agree where a keyframe shows an old place; 0: no loops, no joining of maps"
     )
     depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")

@@ -125,7 +125,7 @@ class Estimators:
 
 
 LEAST_FRAMES_APART = 10
-"""Frames that a map must have to be given back beside the main one."""
+"""Frames that a piece must have to be given back beside the largest."""
 
 
 @dataclass(frozen=True)
@@ -244,14 +244,13 @@ class Pipeline:
         pieces: list[Piece] = []
         while frames:
             main = max(frames, key=lambda number: frames[number])
-            if pieces and frames[main] < LEAST_FRAMES_APART:
-                break
             correction = None
             if self._backend is not None and self._backend.keyframes(main):
                 correction = self._backend.adjust(main, self._seats, among=frames)
             maps = (main,) if correction is None else tuple(sorted(correction.worlds))
             pieces.append(Piece(main, maps, sum(frames.pop(number) for number in maps), correction))
-        return pieces
+        pieces.sort(key=lambda piece: -piece.frames)
+        return pieces[:1] + [piece for piece in pieces[1:] if piece.frames >= LEAST_FRAMES_APART]
 
     def maps_note(self, pieces: list[Piece]) -> list[str]:
         """What to say where maps are left; nothing where all are one piece."""

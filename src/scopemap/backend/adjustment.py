@@ -26,7 +26,9 @@ from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_lo
 _OWN = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _CAUCHY = 2.0  # residuals of that many standard deviations count half
 _LEAST_SIGMA_PX = 0.1
-_MEDIAN_TO_SIGMA_2D = 1 / 1.1774  # of the length of a normal vector in the plane
+MEDIAN_TO_SIGMA_2D = 1 / 1.1774
+"""Standard deviation over the median length of a normal vector in the plane."""
+
 _LEAST_Z = 1e-3
 
 
@@ -154,6 +156,14 @@ def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1
     return Solution(T, state.scale, state.u, _log_depth_sigma(problem, state, sigma), sigma, iterations)
 
 
+def errors_px(problem: Problem, found: Solution) -> np.ndarray:
+    """Return how far points are seen from where the solution says (N,), px; infinite behind a camera."""
+    if not len(problem.sightings.point):
+        return np.zeros(0)
+    error, ahead = _errors(problem, _seen(problem, _State(found.T_camera_world, found.log_scale, found.log_depth))[0])
+    return np.where(ahead, np.linalg.norm(error, axis=1), np.inf)
+
+
 def _seen(problem: Problem, state: _State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points in the keyframes that see them and in their hosts, (N, 3) each, and the turn between, (N, 3, 3)."""
     points, sightings = problem.points, problem.sightings
@@ -176,7 +186,7 @@ def _errors(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def _sigma_px(problem: Problem, state: _State) -> float:
     error, ahead = _errors(problem, _seen(problem, state)[0])
-    return max(float(_MEDIAN_TO_SIGMA_2D * np.median(np.linalg.norm(error[ahead], axis=1))), _LEAST_SIGMA_PX)
+    return max(float(MEDIAN_TO_SIGMA_2D * np.median(np.linalg.norm(error[ahead], axis=1))), _LEAST_SIGMA_PX)
 
 
 def _cauchy(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.backend.adjustment import Points, Priors, Problem, Solution, adjust
+from scopemap.backend.adjustment import MEDIAN_TO_SIGMA_2D, Points, Priors, Problem, Solution, adjust, errors_px
 from scopemap.backend.correction import Correction, Seat, unchanged
 from scopemap.backend.depth_grid import DepthGrid, fit_grid
 from scopemap.backend.joining import join_maps
@@ -25,8 +25,10 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse
 
-# Points whose depth is known to a tenth.
-_SURE = 0.1
+# Points whose depth is known to a tenth; fewer than that share of all may be what moves by itself.
+_SURE, _LEAST_SURE = 0.1, 0.1
+# What remains within the main map may get so much larger where others are joined with it.
+_MAY_SUFFER, _NOISE_PX = 1.5, 0.05
 
 
 class _Keyframe(NamedTuple):
@@ -34,6 +36,24 @@ class _Keyframe(NamedTuple):
 
     frame: int
     seat: Seat
+
+
+class _Adjusted(NamedTuple):
+    """A correction, and the robust deviation of what remains, px: in the main map, the worst in one, between maps.
+
+    NaN where nothing is seen again.
+    """
+
+    correction: Correction
+    main_px: float
+    worst_px: float
+    between_px: float
+
+    def fits(self, alone: _Adjusted, most_px: float) -> bool:
+        """Whether maps belong together: by what ties them, and by the main one, which must not suffer for it."""
+        rigid = not self.correction.refused and self.worst_px <= most_px
+        tied = self.correction.loops > 0 and self.between_px <= most_px
+        return rigid and tied and self.main_px <= _MAY_SUFFER * alone.main_px + _NOISE_PX
 
 
 class Backend:
@@ -89,12 +109,20 @@ class Backend:
         while self._links:
             self._links.popleft().result()
         self._worker.shutdown()
-        worlds = self._joined(map_number, among)
-        correction = self._adjusted(worlds)
-        if correction.refused and len(worlds) > 1:
-            worlds = {map_number: Similarity.identity()}
-            correction = self._adjusted(worlds)
-        return replace(correction, worlds=worlds, seats=seats or {})
+        free = {keyframe.seat.map for keyframe in self._keyframes} if among is None else set(among)
+        worlds = {map_number: Similarity.identity()}
+        found = alone = self._adjusted(worlds, map_number)
+        joined = self._joined(map_number, free)
+        # All at once if that can be; else one by one, for it may be a single one that does not fit.
+        trials = [[*joined][1:]] if len(joined) < 3 else [[*joined][1:], *([number] for number in [*joined][1:])]
+        for some in trials:
+            more = self._joined(map_number, {*worlds, *some})
+            if len(more) == len(worlds):
+                continue
+            together = self._adjusted(more, map_number)
+            if together.fits(alone, self.settings.max_sigma_px):
+                found, worlds = together, more
+        return replace(found.correction, worlds=worlds, seats=seats or {})
 
     def _link(self, keyframe: Frame, map_number: int) -> None:
         """Link a keyframe to those just before it, and to those elsewhere that show the same."""
@@ -104,19 +132,18 @@ class Backend:
             self._linker.close(loop)
             self._loops.append(loop)
 
-    def _joined(self, map_number: int, among: Collection[int] | None) -> dict[int, Similarity]:
-        """Return the worlds of the maps, of those named, that belong together with this one."""
+    def _joined(self, map_number: int, free: Collection[int]) -> dict[int, Similarity]:
+        """Return the worlds of the maps, of those that are free, that belong together with this one."""
         map_of = [keyframe.seat.map for keyframe in self._keyframes]
         points, _ = self._linker.collected(np.flatnonzero(np.array(map_of) == map_number))
         if len(set(map_of)) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
         depth_mm = float(np.exp(np.median(points.log_depth)))
         T_world_camera = np.stack([keyframe.seat.T_world_camera for keyframe in self._keyframes])
-        free = set(map_of if among is None else among)
-        loops = [loop for loop in self._loops if {map_of[loop.past], map_of[loop.new]} <= free]
+        loops = [loop for loop in self._loops if map_of[loop.past] in free and map_of[loop.new] in free]
         return join_maps(T_world_camera, map_of, loops, map_number, depth_mm)
 
-    def _adjusted(self, worlds: Mapping[int, Similarity]) -> Correction:
+    def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> _Adjusted:
         """Adjust all keyframes of the maps with these worlds together."""
         camera, settings = self._camera, self.settings
         assert camera is not None
@@ -132,8 +159,8 @@ class Backend:
         priors = Priors(settings.scale_sigma, math.radians(settings.turn_sigma_deg), settings.way_sigma_share)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         pairs, start, loops = _neighbours(own), None, 0
-        depth_mm = float(np.exp(np.median(points.log_depth))) if len(points.log_depth) else 1.0
         if said := _of(self._loops, chosen, log_unit):
+            depth_mm = float(np.exp(np.median(points.log_depth)))
             graph = spread_loops(T_world_camera, pairs, said, depth_mm)
             start, loops = (inverse(graph.T_world_camera), graph.log_scale), graph.believed
         problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, pairs, start)
@@ -141,11 +168,23 @@ class Backend:
         if start is not None and self._doubt(points, found):
             # Loops may be what is wrong.
             found, loops = adjust(replace(problem, start=None)), 0
-        index = np.array([keyframe.frame for keyframe in own])
+        map_of = np.array([keyframe.seat.map for keyframe in own])
+        host, other = map_of[points.host[sightings.point]], map_of[sightings.keyframe]
+        off_px = errors_px(problem, found)
+        within = {number: _sigma_px(off_px[(host == number) & (other == number)]) for number in worlds}
+        correction, between_px = self._correction(own, problem, found, loops), _sigma_px(off_px[host != other])
+        # A map of one keyframe sees nothing again.
+        return _Adjusted(correction, within[main], np.fmax.reduce(list(within.values())), between_px)
+
+    def _correction(self, own: Sequence[_Keyframe], problem: Problem, found: Solution, loops: int) -> Correction:
+        """Return what a solution makes of these keyframes, or, where it is doubtful, that nothing is to be changed."""
+        index, points, camera = np.array([keyframe.frame for keyframe in own]), problem.points, self._camera
+        assert camera is not None
         if doubt := self._doubt(points, found):
             return unchanged(index, found.sigma_px, doubt)
-        T_world_world = inverse(found.T_camera_world) @ inverse(T_world_camera)
-        grids = self._grids(camera, points, found) if settings.depth_step_sigma > 0 else ()
+        T_world_world = inverse(found.T_camera_world) @ problem.T_camera_world
+        grids = self._grids(camera, points, found) if self.settings.depth_step_sigma > 0 else ()
+        depth_mm = float(np.exp(np.median(points.log_depth))) if len(points.log_depth) else 1.0
         return Correction(
             index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids, depth_mm=depth_mm
         )
@@ -159,7 +198,7 @@ class Backend:
         change = np.abs(_depth_change(points, found)[sure])
         # Depth that is wrong by a third almost everywhere is not what networks do; tissue that swells under a camera
         # at rest looks just so.
-        if sure.any() and np.median(change) > settings.max_depth_change:
+        if sure.sum() > _LEAST_SURE * len(sure) and np.median(change) > settings.max_depth_change:
             return f"depth would have to change by {100 * np.expm1(np.median(change)):.0f} %"
         return ""
 
@@ -174,6 +213,11 @@ class Backend:
             fit_grid(places[own], points.log_depth[own], error[own], found.log_depth_sigma[own], step_sigma)
             for own in of
         )
+
+
+def _sigma_px(off_px: np.ndarray) -> float:
+    """Robust standard deviation of distances in the plane; NaN of none."""
+    return MEDIAN_TO_SIGMA_2D * float(np.median(off_px)) if len(off_px) else float("nan")
 
 
 def _depth_change(points: Points, found: Solution) -> np.ndarray:

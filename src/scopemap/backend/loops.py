@@ -14,13 +14,14 @@ from scopemap.geometry.landmarks import Landmarks, find_landmarks, locate
 _STRONGEST = 64  # landmarks by which candidates are chosen
 _ALIKE = 0.8  # cosine of descriptors from which on they speak for a candidate
 _CANDIDATES = 3
+_STICKS_PX = 2.0
 # A camera that dwells would tie everything to the same few keyframes, and adjusting these together takes their square.
 _REST, _MOST_LOOPS, _MOST_PAIRS = 5, 20, 60  # keyframes between loops to one keyframe, loops to it, points of a loop
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Two keyframes that show the same place.
+    """Two keyframes, long after each other or of two maps, that show the same place.
 
     Attributes
     ----------
@@ -40,7 +41,7 @@ class Loop:
 
 
 class LoopFinder:
-    """Takes keyframes one by one and tells which of those long before show the same place.
+    """Takes keyframes one by one and tells which of those long before, and of other maps, show the same place.
 
     Candidates are those whose strongest landmarks look most like the new one's; only what PnP can place from at least
     `settings.loop_landmarks` of them is a loop.
@@ -59,7 +60,7 @@ class LoopFinder:
         for past in self._candidates(new, map_number):
             known = self._known[past]
             located = locate(known, new, keyframe.camera, self.settings.loop_landmarks)
-            if located is None:
+            if located is None or (self._map_of[past] != map_number and self._sticks(known, new, located.pairs)):
                 continue
             one, other = located.pairs[:: -(-len(located.pairs) // _MOST_PAIRS)].T
             moved = known.points_mm[one] @ located.T_current_reference[2, :3] + located.T_current_reference[2, 3]
@@ -99,6 +100,11 @@ class LoopFinder:
             ranked = [int(some[k]) for k in np.argsort(-votes, kind="stable") if votes[k] > 0]
             likely += [k for k in ranked if self._may_close(k)][:_CANDIDATES]
         return likely
+
+    def _sticks(self, past: Landmarks, new: Landmarks, pairs: np.ndarray) -> bool:
+        """Whether too few landmarks are elsewhere in the picture: dirt on the lens looks alike in unrelated places."""
+        way_px = np.linalg.norm(new.pixels[pairs[:, 1]] - past.pixels[pairs[:, 0]], axis=1)
+        return int((way_px > _STICKS_PX).sum()) < self.settings.loop_landmarks
 
     @staticmethod
     def _votes(strongest: np.ndarray, known: Landmarks) -> float:
