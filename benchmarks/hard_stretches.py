@@ -116,7 +116,7 @@ def cut(folder: Path) -> list[str]:
                 f"| {scene}, {name} | {len(set(tracked))} | {len(tracked)} of {len(result.records)} "
                 f"| {report.ate_rmse_mm:.3f} "
                 f"| {report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f} "
-                f"| {scales[0] / scales[1]:.2f} |"
+                f"| {scales[0] / scales[1]:.2f} |".replace("nan", "")
             )
     return rows
 
