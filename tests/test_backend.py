@@ -12,6 +12,7 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.backend import Backend, Correction, Seat
+from scopemap.backend.adjustment import Points, Solution
 from scopemap.backend.backend import _Keyframe, _neighbours, _of
 from scopemap.backend.depth_grid import DepthGrid
 from scopemap.backend.links import Linker
@@ -220,6 +221,15 @@ def test_the_way_and_the_depth_of_a_joined_map_are_taken_in_the_common_world() -
     expected = 2 * np.exp(grid.log_factor(2 * depth_mm))
     np.testing.assert_allclose(correction.depth_factors(14, depth_mm), expected, rtol=1e-5)
     assert not np.allclose(expected, 2 * np.exp(grid.log_factor(depth_mm)))
+
+
+@pytest.mark.parametrize(("sure", "refused"), [(3, False), (30, True)])
+def test_few_points_that_ask_for_another_depth_are_what_moves_by_itself(sure: int, refused: bool) -> None:
+    count, known = 100, np.arange(100) < sure
+    points = Points(np.zeros(count, int), np.ones((count, 3)), np.zeros(count), np.full(count, 0.1))
+    sigma = np.where(known, 0.01, np.inf)
+    found = Solution(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), sigma, 0.2, 1)
+    assert bool(Backend(BackendSettings())._doubt(points, found)) == refused
 
 
 def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ import trimesh
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.backend import Backend, Seat
+from scopemap.backend import Backend, Correction, Seat
 from scopemap.backend.adjustment import Problem, Solution, adjust
 from scopemap.config import BackendSettings, Config
 from scopemap.datasets.c3vd import C3vdFolder
@@ -24,6 +26,7 @@ from scopemap.fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.pipeline import Estimators, Pipeline
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory import read_trajectory
 
@@ -182,6 +185,32 @@ def test_one_map_that_does_not_fit_is_left_alone(swelling: bool) -> None:
             frame = replace(frame, rgb=cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR))
         backend.add(frame, seat._replace(map=number % 3))
     assert sorted(backend.adjust(0).worlds) == ([0, 2] if swelling else [0, 1, 2])
+
+
+class _Joining:
+    """A back end that joins maps 1 and 2."""
+
+    def keyframes(self, _: int) -> int:
+        return 1
+
+    def adjust(self, main: int, _: Mapping[int, Seat], among: Collection[int]) -> Correction:
+        maps = [number for number in ((1, 2) if main in (1, 2) else (main,)) if number in among]
+        worlds = {number: Similarity.identity() for number in maps}
+        return Correction(np.zeros(1, int), np.eye(4)[None], np.zeros(1), worlds=worlds)
+
+
+def test_what_has_most_frames_in_all_comes_first(spliced: Path) -> None:
+    pipeline = Pipeline(Config(), Estimators.create(with_true_depth(spliced, **LIGHT), open_sequence(spliced)))
+    frames = [0] * 11 + [1] * 8 + [2] * 7 + [3] * 9 + [4] * 10
+    pipeline._seats = {index: Seat(number, 0, np.eye(4)) for index, number in enumerate(frames)}
+    pipeline._backend = None
+    assert [(piece.maps, piece.frames) for piece in pipeline.pieces()] == [((0,), 11), ((4,), 10)]
+    joining: Any = _Joining()
+    pipeline._backend = joining
+    pieces = pipeline.pieces()
+    assert [(piece.maps, piece.frames) for piece in pieces] == [((1, 2), 15), ((0,), 11), ((4,), 10)]
+    assert "there are 5" in pipeline.maps_note(pieces)[0]
+    assert "15 are in the result" in pipeline.maps_note(pieces)[0]
 
 
 def test_what_sticks_to_the_lens_joins_nothing() -> None:

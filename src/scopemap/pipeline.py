@@ -265,7 +265,7 @@ class Pipeline:
 
     def fuse(self, piece: Piece) -> Fused:
         """Fuse what waited of a piece, in voxels that suit it, as the back end corrected it."""
-        volume = self._volume or self._volume_of(piece)
+        volume = self._volume_of(piece) if self._volume is None else self._volume
         if volume is None:
             return Fused(trimesh.Trimesh(), self.config.fusion)
         note = [f"fusion: {described(volume.sizes)}"] if follows_scene(self.config.fusion) else []

@@ -4,12 +4,13 @@ A point p lies on the ray of a pixel of its host keyframe h at depth exp(u_p). W
 seen in another keyframe t at project(T_t T_h^-1 exp(u_p) ray_p), which is compared with where optical flow saw it:
 
     sum of rho(|seen - flow| / s)  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)  +  sum of (a_k / sigma_a)^2
-    +  sum of |log(T_k+1 T_k^-1 (T_k+1 T_k^-1)_tracked^-1)|^2, weighted
+    +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
 
 The second sum holds points to the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these
-factors to 1; the last holds neighbours to what the tracker said where nothing else does. rho is Cauchy's, so tissue
-that moves on its own fades out. Levenberg-Marquardt; points are eliminated one by one (Schur complement), host by host,
-since all points of a host touch the same few keyframes. Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000.
+factors to 1; the last holds a keyframe j to what the tracker said of it, from keyframe i, where nothing else does. rho
+is Cauchy's, so tissue that moves on its own fades out. Levenberg-Marquardt; points are eliminated one by one (Schur
+complement), host by host, since all points of a host touch the same few keyframes. Triggs et al., "Bundle Adjustment -
+A Modern Synthesis", 2000.
 """
 
 from __future__ import annotations

@@ -112,10 +112,9 @@ class Backend:
         free = {keyframe.seat.map for keyframe in self._keyframes} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
         found = alone = self._adjusted(worlds, map_number)
-        joined = self._joined(map_number, free)
+        others = [*self._joined(map_number, free)][1:]
         # All at once if that can be; else one by one, for it may be a single one that does not fit.
-        trials = [[*joined][1:]] if len(joined) < 3 else [[*joined][1:], *([number] for number in [*joined][1:])]
-        for some in trials:
+        for some in (others, *([number] for number in others if len(others) > 1)):
             more = self._joined(map_number, {*worlds, *some})
             if len(more) == len(worlds):
                 continue
