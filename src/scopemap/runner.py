@@ -59,7 +59,7 @@ def reconstruct(
 
     The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there, and so
     is the size of the voxels.
-    Where maps could not be joined the one with most frames is the result, and `others` are beside it.
+    Where maps could not be joined, what has most frames is the result, and `others` are beside it.
     Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
     """
     config, clock = config or Config(), _Clock()

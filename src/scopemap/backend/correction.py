@@ -38,8 +38,8 @@ class Correction:
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the world as
     tracked, or joined, around a keyframe to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
     sigma_px : robust standard deviation of what remains between keyframes, px; NaN where nothing linked them.
-    refused : why nothing is changed, "" where it is. loops : pairs of keyframes, far apart in time,
-    that were found to show the same place. grids : K of them, by what more the depth of each place is to be multiplied;
+    refused : why nothing is changed, "" where it is. loops : pairs of keyframes, far apart in time or of two maps, that
+    were found to show the same place. grids : K of them, by what more the depth of each place is to be multiplied;
     none: nothing more. worlds : by number of each map whose frames it is for, how its world lies in the one that these
     were joined to. seats : by number of the frame, how it was tracked; of frames not in there it is not known.
     depth_mm : typical depth; a way as long as that counts as much as a turn by 1 rad.
