@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.datasets.reference import read_reference
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
+from scopemap.io.datasets.reference import read_reference
 from scopemap.phantom import PhantomSpec, write_phantom
 
 HEADER = (
@@ -31,26 +31,26 @@ HEADER = (
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
 SHADING = {"depth.backend": "shading"}
 NO_SURFACE = {"fusion.enabled": False}
-TRACKED = {"backend.method": "none"}
+TRACKED = {"mapping.method": "none"}
 # One part each taken away or replaced: of what tracks and makes depth consistent, measured without the back end, which
 # would hide most of it ...
 FRONT_END: dict[str, dict[str, Any]] = {
-    "no corners": {"odometry.corner_depth_share": 0.0},
-    "flow never overrules": {"odometry.flow_contradiction": 0.0},
-    "no early keyframes": {"odometry.keyframe_agreement": 0.0},
-    "no distance to the frame's depth": {"odometry.depth_share": 0.0},
-    "uncertainty of depth not used to track": {"odometry.depth_sigma_share": 1e6},
-    "keyframe every 2": {"odometry.keyframe_every": 2},
-    "keyframe every 5": {"odometry.keyframe_every": 5},
-    "keyframe every 20": {"odometry.keyframe_every": 20},
-    "grey values only": {"odometry.channels": "grey"},
-    "normalised values only": {"odometry.channels": "normalised"},
-    "no lamp": {"odometry.lamp_gamma": 0.0},
-    "no gain and bias": {"odometry.gain_bias": False},
-    "neither lamp nor gain and bias": {"odometry.lamp_gamma": 0.0, "odometry.gain_bias": False},
-    "no SO(3) stage": {"odometry.rotation_first": False},
-    "Gauss-Newton": {"odometry.solver": "gauss-newton"},
-    "full resolution": {"odometry.finest_level": 0},
+    "no corners": {"tracking.corner_depth_share": 0.0},
+    "flow never overrules": {"tracking.flow_contradiction": 0.0},
+    "no early keyframes": {"tracking.keyframe_agreement": 0.0},
+    "no distance to the frame's depth": {"tracking.depth_share": 0.0},
+    "uncertainty of depth not used to track": {"tracking.depth_sigma_share": 1e6},
+    "keyframe every 2": {"tracking.keyframe_every": 2},
+    "keyframe every 5": {"tracking.keyframe_every": 5},
+    "keyframe every 20": {"tracking.keyframe_every": 20},
+    "grey values only": {"tracking.channels": "grey"},
+    "normalised values only": {"tracking.channels": "normalised"},
+    "no lamp": {"tracking.lamp_gamma": 0.0},
+    "no gain and bias": {"tracking.gain_bias": False},
+    "neither lamp nor gain and bias": {"tracking.lamp_gamma": 0.0, "tracking.gain_bias": False},
+    "no SO(3) stage": {"tracking.rotation_first": False},
+    "Gauss-Newton": {"tracking.solver": "gauss-newton"},
+    "full resolution": {"tracking.finest_level": 0},
     "no frame scale": {"mapis.frame_scale": "none"},
     "no blending": {"mapis.blend": "none"},
     "constant blend": {"mapis.blend": "constant"},
@@ -62,10 +62,10 @@ FRONT_END: dict[str, dict[str, Any]] = {
 }
 # ... and of the back end, with all of the front end.
 BACK_END: dict[str, dict[str, Any]] = {
-    "no loops": {"backend.loop_landmarks": 0},
-    "links to the keyframe before only": {"backend.gaps": (1,)},
-    "depth of keyframes hardly adjusted": {"backend.scale_sigma": 1e-3},
-    "back end, but no corners while tracking": {"odometry.corner_depth_share": 0.0},
+    "no loops": {"mapping.loop_landmarks": 0},
+    "links to the keyframe before only": {"mapping.gaps": (1,)},
+    "depth of keyframes hardly adjusted": {"mapping.scale_sigma": 1e-3},
+    "back end, but no corners while tracking": {"tracking.corner_depth_share": 0.0},
 }
 
 
@@ -139,7 +139,7 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
         for variant, changes in {
             "as tracked": TRACKED,
             "default": {},
-            "always adjusted": {"backend.max_sigma_px": 99.0, "backend.max_depth_change": 9.0},
+            "always adjusted": {"mapping.max_sigma_px": 99.0, "mapping.max_depth_change": 9.0},
         }.items():
             yield Run(f"{name}, {variant}", source, "sim3", LIGHT | NO_SURFACE | changes)
 

@@ -15,7 +15,7 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 from scipy.stats import spearmanr
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
 from scopemap.evaluation.depth import evaluate_depth
 from scopemap.evaluation.depth_sequence import depth_scale, scale_jitter

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.camera import PinholeCamera
-from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.rectification import Rectifier, working_camera
+from scopemap.io.datasets.c3vd import C3vdFolder
 
 Size: TypeAlias = tuple[int, int]
 """Width and height, px."""

@@ -17,11 +17,11 @@ import numpy as np
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
-from scopemap.datasets import open_sequence
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points
-from scopemap.odometry.flow_pose import flow_error_px
+from scopemap.io.opening import open_sequence
 from scopemap.pipeline import Estimators, Pipeline, Step
+from scopemap.tracking.flow_pose import flow_error_px
 
 LEAST_SHARE = 0.1
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--set", dest="settings", action="append", default=[])
     options = parser.parse_args(arguments)
-    fixed = {"backend.method": "none", "fusion.enabled": "false"}
+    fixed = {"mapping.method": "none", "fusion.enabled": "false"}
     config = Config.load(settings=LIGHT | fixed | parse_settings(options.settings))
     found = measure(options.input, options.frames, config)
     print(

@@ -18,9 +18,10 @@ from pathlib import Path
 
 import cv2
 
+from scopemap.calibration.focal_length import focal_from_motion, with_focal_from_motion
 from scopemap.config import Config
-from scopemap.datasets import Sequence, open_sequence
-from scopemap.focal import focal_from_motion, with_focal_from_motion
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
 from scopemap.phantom import PhantomSpec, write_phantom
 
 # Scene, horizontal field of view in degrees, seed, whether tissue breathes.

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume

@@ -39,15 +39,15 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from drawn_datasets import WRITERS, write_cameras  # noqa: E402
 
-from scopemap.calibration import read_calibration  # noqa: E402
+from scopemap.cameras.formats.reading import read_calibration  # noqa: E402
 from scopemap.config import DepthSettings  # noqa: E402
-from scopemap.datasets import open_sequence  # noqa: E402
-from scopemap.datasets.checking import check  # noqa: E402
-from scopemap.datasets.reference import reference_trajectory  # noqa: E402
-from scopemap.datasets.survey import survey  # noqa: E402
 from scopemap.depth.files import FilesDepth  # noqa: E402
 from scopemap.errors import ScopemapError  # noqa: E402
-from scopemap.mask_files import MaskFiles  # noqa: E402
+from scopemap.io.datasets.checking import check  # noqa: E402
+from scopemap.io.datasets.reference import reference_trajectory  # noqa: E402
+from scopemap.io.datasets.survey import survey  # noqa: E402
+from scopemap.io.opening import open_sequence  # noqa: E402
+from scopemap.masking.mask_files import MaskFiles  # noqa: E402
 
 SLOWEST_S = 10
 MOST_MEMORY_KB = 1 << 20

@@ -25,7 +25,8 @@ from scopemap.config import Config
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.phantom import PhantomSpec, parse_events, write_phantom
-from scopemap.trajectory import Trajectory, read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 EVENTS = "black:60-69,blur:95-104,smoke:130-139"
 CUT = range(80, 180)
@@ -80,7 +81,7 @@ def loop(folder: Path) -> list[str]:
     for scene in ("colon", "laparoscopy"):
         source = folder / f"{scene}_loop"
         write_phantom(PhantomSpec(scene=scene, frames=601, seed=12, loop=True), source)
-        for name, changes in {"no loops": {"backend.loop_landmarks": 0}, **VARIANTS}.items():
+        for name, changes in {"no loops": {"mapping.loop_landmarks": 0}, **VARIANTS}.items():
             result = run(source, changes)
             poses = result.trajectory.T_world_camera
             off = inverse(poses[0]) @ poses[-1]
@@ -105,7 +106,7 @@ def cut(folder: Path) -> list[str]:
         whole, source = folder / f"{scene}_whole", folder / f"{scene}_cut"
         write_phantom(PhantomSpec(scene=scene, frames=401, seed=12, loop=True), whole)
         keep(whole, source, [n for n in range(401) if n not in CUT])
-        for name, changes in {"no loops": {"backend.loop_landmarks": 0}, **VARIANTS}.items():
+        for name, changes in {"no loops": {"mapping.loop_landmarks": 0}, **VARIANTS}.items():
             result = run(source, changes)
             trajectory, truth = result.trajectory, read_trajectory(source)
             report = pose_report(match(trajectory, truth, "sim3"))

@@ -20,13 +20,13 @@ from scopemap import open_sequence, read_trajectory
 from scopemap.benchmark.methods.endo_depth_and_motion import create_endo_depth_and_motion
 from scopemap.benchmark.methods.open3d_odometry import OPEN3D_METHODS
 from scopemap.benchmark.methods.timed import TimedTracker
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier
 from scopemap.depth.files import depth_files
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.frame import Frame
-from scopemap.odometry import FrameTracker
-from scopemap.rectification import Rectifier
-from scopemap.trajectory import Trajectory
+from scopemap.tracking import FrameTracker
+from scopemap.trajectory.trajectory import Trajectory
 
 CAMERA = PinholeCamera(200.58, 200.47, 167.0, 136.7, 337, 270)
 

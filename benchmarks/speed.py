@@ -21,9 +21,9 @@ import numpy as np
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
-from scopemap.datasets import open_sequence
 from scopemap.flow import DisFlow, pair_flow
 from scopemap.fusion import TsdfVolume
+from scopemap.io.opening import open_sequence
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 

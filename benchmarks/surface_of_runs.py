@@ -28,18 +28,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from depth_scenes import drawn
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
-from scopemap.datasets.c3vd import C3vdFolder
-from scopemap.datasets.reference import read_reference
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.io.datasets.c3vd import C3vdFolder
+from scopemap.io.datasets.reference import read_reference
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.reconstruction import DepthReader
 
 HEADER = "| run | ATE | depth, one scale | depth, medians | mesh to truth | truth to mesh |\n|---|---|---|---|---|---|"
 VARIANTS: dict[str, dict[str, Any]] = {
-    "as tracked": {"backend.method": "none"},
-    "depth only scaled": {"backend.depth_step_sigma": 0.0},
+    "as tracked": {"mapping.method": "none"},
+    "depth only scaled": {"mapping.depth_step_sigma": 0.0},
     "default": {},
 }
 _CLIPPED_MM = 99.9

@@ -25,7 +25,7 @@ from test_datasets_simcol import write_simcol
 from test_datasets_stereomis import write_stereomis
 from test_datasets_tum import write_tum
 
-from scopemap.calibration import write_calibration
+from scopemap.cameras.formats.writing import write_calibration
 
 
 def write_pictures(folder: Path) -> Path:

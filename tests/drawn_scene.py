@@ -9,7 +9,7 @@ import numpy as np
 from drawn_inputs import picture
 from scipy.spatial.transform import Rotation
 
-from scopemap.camera import CameraModel
+from scopemap.cameras.camera import CameraModel
 from scopemap.geometry.se3 import se3_exp
 
 COUNT = 7

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.trajectory import Trajectory, write_tum
+from scopemap.trajectory.trajectory import Trajectory, write_tum
 
 
 def write_run(folder: Path, trajectory: Trajectory) -> Path:

@@ -32,7 +32,7 @@ from test_datasets_endonerf import llff
 from test_datasets_endoslam import COLUMNS, write_xlsx
 from test_datasets_endoslam import HEADER as UNITY_HEADER
 
-from scopemap.calibration import write_calibration
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.geometry.se3 import inverse
 
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -11,19 +11,19 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.backend import Backend, Correction, Seat
-from scopemap.backend.adjustment import Points, Solution
-from scopemap.backend.backend import _Keyframe, _neighbours, _of
-from scopemap.backend.depth_grid import DepthGrid
-from scopemap.backend.links import Linker
-from scopemap.backend.loops import Loop
-from scopemap.config import BackendSettings
+from scopemap.config import MappingSettings
 from scopemap.flow import DisFlow
+from scopemap.flow.corners import corners, sampled_at
 from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool
 from scopemap.geometry.align import Similarity
-from scopemap.geometry.corners import corners, sampled_at
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.mapping import Backend, Correction, Seat
+from scopemap.mapping.backend import _Keyframe, _neighbours, _of
+from scopemap.mapping.bundle_adjustment import Points, Solution
+from scopemap.mapping.depth_correction import DepthGrid
+from scopemap.mapping.feature_tracks import Linker
+from scopemap.mapping.loop_closure import Loop
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -46,7 +46,7 @@ def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, flo
 def test_drifting_poses_are_set_right_and_frames_between_keyframes_with_them() -> None:
     drift = [se3_exp(0.01 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     for number in (0, 1, 3, 4, 5):
         backend.add(_frame(number, tracked[number]))
     correction = backend.adjust()
@@ -60,7 +60,7 @@ def test_drifting_poses_are_set_right_and_frames_between_keyframes_with_them() -
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    backend = Backend(BackendSettings(depth_share=0.05, scale_sigma=0.3))
+    backend = Backend(MappingSettings(depth_share=0.05, scale_sigma=0.3))
     for number in range(6):
         backend.add(_frame(number, factor=0.8 if number == 2 else 1.0))
     correction = backend.adjust()
@@ -70,7 +70,7 @@ def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
 
 
 def test_points_are_seen_where_the_plane_says() -> None:
-    linker = Linker(BackendSettings(gaps=(1, 2)), DisFlow())
+    linker = Linker(MappingSettings(gaps=(1, 2)), DisFlow())
     for number in (0, 1, 2):
         linker.add(_frame(number))
     points, sightings = linker.collected()
@@ -93,7 +93,7 @@ def test_points_are_seen_where_the_plane_says() -> None:
 
 
 def test_keyframes_that_are_not_named_by_the_gaps_are_not_linked() -> None:
-    linker = Linker(BackendSettings(gaps=(2,)), DisFlow())
+    linker = Linker(MappingSettings(gaps=(2,)), DisFlow())
     for number in (0, 1, 2):
         linker.add(_frame(number))
     points, sightings = linker.collected()
@@ -119,7 +119,7 @@ def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> N
 
 def test_keyframes_without_a_single_corner_are_no_harm() -> None:
     speckled = np.random.default_rng(0).random(plane_scene.EVERYWHERE.shape) < 0.6
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     for number in range(3):
         backend.add(replace(_frame(number), valid=speckled))
     correction = backend.adjust()
@@ -141,7 +141,7 @@ def test_what_goes_wrong_with_a_keyframe_is_heard_of_at_the_next(monkeypatch: py
         raise RuntimeError("flow broke")
 
     monkeypatch.setattr(Linker, "add", broken)
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     backend.add(_frame(0))
     wait(backend._links)
     with pytest.raises(RuntimeError, match="flow broke"):
@@ -229,7 +229,7 @@ def test_few_points_that_ask_for_another_depth_are_what_moves_by_itself(sure: in
     points = Points(np.zeros(count, int), np.ones((count, 3)), np.zeros(count), np.full(count, 0.1))
     sigma = np.where(known, 0.01, np.inf)
     found = Solution(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), sigma, 0.2, 1)
-    assert bool(Backend(BackendSettings())._doubt(points, found)) == refused
+    assert bool(Backend(MappingSettings())._doubt(points, found)) == refused
 
 
 def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:
@@ -243,7 +243,7 @@ def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:
 
 def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
     rng = np.random.default_rng(1)
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
     for number in range(5):
         frame = _frame(number)
@@ -262,7 +262,7 @@ def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
 def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> None:
     factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
     for most, refused in ((0.2, True), (0.6, False)):
-        backend = Backend(BackendSettings(max_depth_change=most, depth_share=0.5))
+        backend = Backend(MappingSettings(max_depth_change=most, depth_share=0.5))
         for number in range(5):
             frame = _frame(number)
             assert frame.depth_mm is not None
@@ -274,7 +274,7 @@ def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> Non
 
 def test_nothing_to_adjust_is_an_error_of_the_caller() -> None:
     with pytest.raises(ValueError, match="no keyframe"):
-        Backend(BackendSettings()).adjust()
+        Backend(MappingSettings()).adjust()
 
 
 def test_a_waiting_frame_comes_back_as_it_was() -> None:

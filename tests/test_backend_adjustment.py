@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scopemap.backend.adjustment import Points, Priors, Problem, Sightings, adjust
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
+from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Sightings, adjust
 
 INTRINSICS = np.array([150.0, 152.0, 80.0, 64.0])
 KEYFRAMES, PER_KEYFRAME = 6, 80

@@ -26,12 +26,12 @@ from drawn_inputs import picture, save, write_video
 from front_door import call, refused
 from tiny_phantom import FRAMES, write_tiny
 
-from scopemap.calibration import read_calibration
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.survey import survey
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError, ScopemapError
-from scopemap.trajectory import read_trajectory
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.survey import survey
+from scopemap.io.opening import open_sequence
+from scopemap.trajectory.formats.opening import read_trajectory
 
 Capture = pytest.CaptureFixture[str]
 LONG = "a folder with spaces, äöü 中文 and a long name " + "x" * 40

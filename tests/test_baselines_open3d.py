@@ -17,21 +17,21 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap.benchmark.methods import open3d_odometry
 from scopemap.benchmark.methods.open3d_odometry import OPEN3D_METHODS, load_open3d
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
-from scopemap.datasets import open_sequence
 from scopemap.errors import SettingsError
 from scopemap.evaluation.poses import evaluate_poses
 from scopemap.frame import Frame
-from scopemap.odometry import FrameTracker, Track
+from scopemap.io.opening import open_sequence
 from scopemap.runner import reconstruct
-from scopemap.trajectory import read_trajectory
+from scopemap.tracking import FrameTracker, Track
+from scopemap.trajectory.formats.opening import read_trajectory
 
 COLOUR = ["Steinbruecker (Open3D)", "Park (Open3D)"]
 CLOUDS = ["Point-to-point ICP (Open3D)", "Point-to-plane ICP (Open3D)"]
 PLAIN = {
     **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
-    **{"backend__method": "none", "fusion__enabled": False},
+    **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(140.0, 140.0, 79.5, 63.5, 160, 128)
 

@@ -13,22 +13,22 @@ from tiny_phantom import FRAMES, true_poses, with_true_depth, write_tiny
 from scopemap.benchmark.methods.endo_depth_and_motion import SETTINGS, create_endo_depth_and_motion
 from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.benchmark.methods.timed import TimedTracker
-from scopemap.camera import PinholeCamera
-from scopemap.config import Config, OdometrySettings
-from scopemap.datasets import open_sequence
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import Config, TrackingSettings
 from scopemap.errors import AlignmentError
 from scopemap.evaluation.poses import evaluate_poses
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import rotation_angle_rad
-from scopemap.odometry import FrameTracker, Track
-from scopemap.odometry.pyramid import build_pyramid
+from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner import reconstruct
-from scopemap.trajectory import read_trajectory
+from scopemap.tracking import FrameTracker, Track
+from scopemap.tracking.pyramid import build_pyramid
+from scopemap.trajectory.formats.opening import read_trajectory
 
 PLAIN = {
     **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
-    **{"backend__method": "none", "fusion__enabled": False},
+    **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(40.0, 40.0, 31.5, 23.5, 64, 48)
 
@@ -76,7 +76,7 @@ def test_two_scales_and_grey_values_alone() -> None:
     frame = _frame()
     assert [view.weight.shape for view in build_pyramid(frame, SETTINGS)] == [(48, 64), (24, 32)]
     # Of the settings that make our tracker what it is, none is left.
-    ours = OdometrySettings()
+    ours = TrackingSettings()
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start", "keyframe_every", "min_inlier_share"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
     assert SETTINGS.depth_share == SETTINGS.flow_contradiction == SETTINGS.keyframe_agreement == 0
@@ -87,7 +87,7 @@ def test_two_scales_and_grey_values_alone() -> None:
     # or says when an image is empty.
     unnamed = {"flow_least_share", "grey_share", "least_depth_sigma", "min_side_px", "normalise_sigma_px", "radius"}
     unnamed |= {"doubtful_inlier_share", "least_landmarks"}
-    assert set(OdometrySettings.model_fields) - SETTINGS.model_fields_set == unnamed | {"min_valid_share"}
+    assert set(TrackingSettings.model_fields) - SETTINGS.model_fields_set == unnamed | {"min_valid_share"}
 
 
 def test_it_has_no_verdict_on_its_result_but_an_empty_image_is_lost() -> None:

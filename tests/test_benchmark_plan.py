@@ -14,7 +14,7 @@ from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_pl
 from scopemap.benchmark.runner import run_plan
 from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 SMALL = """
 title = "small"
@@ -124,7 +124,7 @@ def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "ours"', 'name = "ours"\nsettings = { "odometry.hubber" = 2 }', "did you mean 'odometry.huber'"),
+        ('name = "ours"', 'name = "ours"\nsettings = { "tracking.hubber" = 2 }', "did you mean 'tracking.huber'"),
         ('name = "ours"', 'name = "theirs"', "two methods have the name 'theirs'"),
         ('name = "ours"', 'name = "ours"\nuse = "import"', "belong together"),
         ('scene = "tube"', 'scene = "nose"', "scene"),

@@ -120,7 +120,7 @@ def test_a_failed_row_is_run_again_when_asked_or_when_its_file_has_come(
 
 
 def test_a_changed_plan_is_run_again(plan: Plan, done: tuple[Benchmark, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = plan.model_copy(update={"settings": plan.settings | {"odometry.huber": 2.0}, "method": plan.method[:1]})
+    changed = plan.model_copy(update={"settings": plan.settings | {"tracking.huber": 2.0}, "method": plan.method[:1]})
     monkeypatch.setattr(runner, "worker_command", lambda file: [sys.executable, "-c", "print('ran')"])
     (row,) = run_plan(changed, done[1], data=done[1]).results
     assert (row.status, row.error) == ("failed", "ended without a result")

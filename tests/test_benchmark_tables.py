@@ -19,7 +19,7 @@ from scopemap.benchmark.sections import OVERVIEW, SECTIONS
 from scopemap.benchmark.summary import over_seeds, summarise
 from scopemap.benchmark.table import Table, Value
 from scopemap.benchmark.tables import TIMING_COLUMNS, benchmark_tables, write_tables
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.evaluation.consistency import ConsistencyMeter
 from scopemap.evaluation.depth import DepthReport

@@ -12,19 +12,19 @@ import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
 from PIL import Image
 
-from scopemap.boards import BoardCalibration, CharucoBoard, Checkerboard, Search, calibrate, save_calibration
-from scopemap.boards.choosing import FORMS, chosen, held_out_error_px
-from scopemap.boards.diagnosis import what_is_seen_instead
-from scopemap.boards.fitting import LensForm, fit_camera, with_bootstrap
-from scopemap.boards.judging import warnings_about
-from scopemap.boards.outliers import agreeing
-from scopemap.boards.picture import draw_calibration
-from scopemap.boards.selection import LeftOut, select_views
-from scopemap.boards.targets import Board, Corners, nearest_px
-from scopemap.boards.views import View, edge_width_px
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.calibration import BoardCalibration, CharucoBoard, Checkerboard, Search, calibrate, save_calibration
+from scopemap.calibration.choosing import FORMS, chosen, held_out_error_px
+from scopemap.calibration.diagnosis import what_is_seen_instead
+from scopemap.calibration.fitting import LensForm, fit_camera, with_bootstrap
+from scopemap.calibration.judging import warnings_about
+from scopemap.calibration.outliers import agreeing
+from scopemap.calibration.picture import draw_calibration
+from scopemap.calibration.selection import LeftOut, select_views
+from scopemap.calibration.targets import Board, Corners, nearest_px
+from scopemap.calibration.views import View, edge_width_px
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError
-from scopemap.lenses import OpenCvCamera
 
 CHARUCO = CharucoBoard(7, 5, 4.0, 3.0)
 WRONG, BLURRED = 100, 101
@@ -140,7 +140,7 @@ def test_the_error_in_views_held_out_is_of_the_views_and_corners_used(
         worst = int(np.argmax(fit_camera(kept, *rest).view_rms_px))
         return (kept, out) if len(counts) == 1 else (kept[:worst] + kept[worst + 1 :], out)
 
-    monkeypatch.setattr("scopemap.boards.calibrating.agreeing", stricter)
+    monkeypatch.setattr("scopemap.calibration.calibrating.agreeing", stricter)
     done = calibrate(pinhole_search, CHECKERBOARD, "pinhole")
     assert len(done.views) == counts[0] - 1
     again = held_out_error_px(done.views, fit_camera(done.views, SIZE, done.fit.form))

@@ -28,10 +28,12 @@ from drawn_calibrations import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.calibration import Calibration, read_calibration, write_calibration
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
-from scopemap.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 
 FORMS = forms()
 

@@ -14,13 +14,14 @@ from drawn_calibrations import COLMAP, FISHEYE, ORB_SLAM, PINHOLE, RADTAN, RADTA
 from drawn_datasets import write_pictures
 from drawn_inputs import picture
 
-from scopemap.calibration import Calibration, read_calibration, stated_calibration
-from scopemap.calibration.plain_numbers import read_intrinsics
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.reading import read_calibration, stated_calibration
+from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.config import InputSettings
-from scopemap.datasets import open_sequence
 from scopemap.errors import CalibrationError
-from scopemap.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.io.opening import open_sequence
 
 K = [[520.5, 0.0, 318.0], [0.0, 525.25, 245.0], [0.0, 0.0, 1.0]]
 FX = {"fx": 520.5, "fy": 525.25, "cx": 318.0, "cy": 245.0}

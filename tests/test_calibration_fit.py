@@ -10,12 +10,15 @@ from drawn_calibrations import CAMERAS, PINHOLE, SIZE
 from drawn_datasets import write_pictures
 from drawn_inputs import write_c3vd
 
-from scopemap.calibration import Calibration, fitted, fitted_to, read_calibration, stated_calibration, write_calibration
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.fitting import fitted, fitted_to
+from scopemap.cameras.formats.reading import read_calibration, stated_calibration
+from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
-from scopemap.datasets import open_sequence
-from scopemap.datasets.tum import CAMERAS as ROOMS
 from scopemap.errors import CalibrationError, SettingsError
+from scopemap.io.datasets.tum import CAMERAS as ROOMS
+from scopemap.io.opening import open_sequence
 
 # The pictures of `write_pictures` are 135x108 px.
 LARGE = PinholeCamera(200.0, 201.0, 140.0, 105.0, 270, 216)

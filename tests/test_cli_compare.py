@@ -16,7 +16,7 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.benchmark.result import RunResult
 from scopemap.cli import app
 from scopemap.errors import InputError
-from scopemap.trajectory import write_kitti
+from scopemap.trajectory.trajectory import write_kitti
 
 
 def run(*arguments: object, code: int = 0) -> object:

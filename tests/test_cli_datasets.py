@@ -12,7 +12,7 @@ import pytest
 from drawn_inputs import picture, save, write_c3vd
 
 from scopemap.cli import main
-from scopemap.datasets import DATASETS
+from scopemap.io.opening import DATASETS
 
 Say = Callable[..., tuple[int, str, str]]
 

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap import demonstration, weights
+from scopemap.benchmark import demonstration
+from scopemap.benchmark.demonstration import Demonstration, Figures
 from scopemap.cli import main
-from scopemap.demonstration import Demonstration, Figures
 from scopemap.errors import InputError, SettingsError
+from scopemap.io import weights
 
 TINY = replace(demonstration.PHANTOM, frames=8, width=160, height=128)
-SETTINGS = {"odometry.keyframe_every": 3}
+SETTINGS = {"tracking.keyframe_every": 3}
 
 
 def _refuse(*_: Any) -> None:
@@ -77,7 +78,7 @@ def test_the_run_is_a_run(demo: Demonstration, out: Path) -> None:
         assert (out / "run" / name).stat().st_size > 0
     assert len(list((out / "run" / "depth").glob("*.png"))) == TINY.frames
     assert demo.result.config.preset == "default"
-    assert demo.result.config.odometry.keyframe_every == SETTINGS["odometry.keyframe_every"]
+    assert demo.result.config.tracking.keyframe_every == SETTINGS["tracking.keyframe_every"]
 
 
 def test_nothing_from_outside_is_used(demo: Demonstration, nothing_outside: Path) -> None:
@@ -91,7 +92,7 @@ def test_weights_that_happen_to_be_there_change_nothing() -> None:
     assert demonstration.demo_config({}).networks.perceptual == "structure"
     assert demonstration.demo_config({"networks.perceptual": "lpips"}).networks.perceptual == "lpips"
     with pytest.raises(SettingsError, match=r"did you mean 'odometry\.huber'"):
-        demonstration.demo_config({"odometry.hubert": 1})
+        demonstration.demo_config({"tracking.hubert": 1})
 
 
 def test_pictures_show_something(demo: Demonstration, out: Path) -> None:
@@ -140,7 +141,7 @@ def test_the_command(demo: Demonstration, out: Path, capsys: pytest.CaptureFixtu
     assert _command("--out", out) == 1
     assert "use --overwrite" in capsys.readouterr().err
 
-    options = ("--overwrite", "--set", "odometry.keyframe_every=3")
+    options = ("--overwrite", "--set", "tracking.keyframe_every=3")
     assert _command("--out", out, *options) == 0
     said = capsys.readouterr()
     assert f"8 of {TINY.frames} frames tracked" in said.out

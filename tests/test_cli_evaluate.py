@@ -18,7 +18,7 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.cli.evaluate import evaluate
 from scopemap.errors import AlignmentError, InputError, SettingsError
 from scopemap.geometry.align import align_trajectories
-from scopemap.trajectory import path_length_mm, write_kitti, write_tum
+from scopemap.trajectory.trajectory import path_length_mm, write_kitti, write_tum
 
 KEYS = [
     *("frames", "tracked", "align", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),

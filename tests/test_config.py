@@ -17,14 +17,14 @@ from scopemap.errors import SettingsError
 SOURCE = Path(scopemap.config.__file__).parent
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
-    "input": ["datasets/*.py", "calibration/*.py", "focal/*.py", "runner.py"],
-    "mask": ["masking.py", "mask_files.py"],
-    "depth": ["depth/*.py", "depth_range.py"],
+    "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner.py"],
+    "mask": ["masking/*.py"],
+    "depth": ["depth/*.py"],
     "mapis": ["depth/mapis.py", "pipeline.py"],
     "networks": ["pipeline.py"],
-    "odometry": ["odometry/*.py"],
-    "smoothing": ["odometry/smoothing.py"],
-    "backend": ["backend/backend.py", "backend/links.py", "pipeline.py"],
+    "tracking": ["tracking/*.py"],
+    "smoothing": ["tracking/smoothing.py"],
+    "mapping": ["mapping/backend.py", "mapping/feature_tracks.py", "pipeline.py"],
     "fusion": ["fusion/*.py", "pipeline.py"],
 }
 
@@ -36,15 +36,15 @@ def _write(tmp_path: Path, text: str) -> Path:
 
 
 def test_precedence(tmp_path: Path) -> None:
-    file = _write(tmp_path, "[odometry]\nhuber = 2.5\nkeyframe_every = 7\n[smoothing]\nmethod = 'none'\n")
-    names = {"odometry.huber": 3.5}
-    assert Config.load().odometry.keyframe_every == 10
-    assert Config.load("paper").odometry.keyframe_every == 2
-    assert Config.load("paper", file).odometry.keyframe_every == 7
+    file = _write(tmp_path, "[tracking]\nhuber = 2.5\nkeyframe_every = 7\n[smoothing]\nmethod = 'none'\n")
+    names = {"tracking.huber": 3.5}
+    assert Config.load().tracking.keyframe_every == 10
+    assert Config.load("paper").tracking.keyframe_every == 2
+    assert Config.load("paper", file).tracking.keyframe_every == 7
     assert Config.load("paper", file).smoothing.method == "none"
-    assert Config.load("paper", file).odometry.huber == 2.5
+    assert Config.load("paper", file).tracking.huber == 2.5
     loaded = Config.load("paper", file, names)
-    assert (loaded.odometry.huber, loaded.odometry.keyframe_every, loaded.mapis.order) == (3.5, 7, "refine-first")
+    assert (loaded.tracking.huber, loaded.tracking.keyframe_every, loaded.mapis.order) == (3.5, 7, "refine-first")
     assert loaded.preset == "paper"
 
 
@@ -71,7 +71,7 @@ def test_every_preset_changes_something_but_the_default() -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "near"),
-    [("odometry.hubber", "odometry.huber"), ("fusion.voxel", "fusion.voxel_mm"), ("odometri", "odometry")],
+    [("tracking.hubber", "tracking.huber"), ("fusion.voxel", "fusion.voxel_mm"), ("trackin", "tracking")],
 )
 def test_an_unknown_key_names_the_nearest(wrong: str, near: str) -> None:
     with pytest.raises(SettingsError, match=rf"unknown setting '{wrong}': did you mean '{near}"):
@@ -91,8 +91,8 @@ def test_an_unknown_key_like_nothing_is_still_refused() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "what"),
     [
-        ("odometry.huber", 0, "greater than 0"),
-        ("odometry.huber", "wide", "valid number"),
+        ("tracking.huber", 0, "greater than 0"),
+        ("tracking.huber", "wide", "valid number"),
         ("mapis.blend", "mixed", "'exponential'"),
         ("mask.dark_level", 300, "less than or equal to 255"),
         ("depth.near_far_mm", [1, 2, 3], "at most 2"),
@@ -107,8 +107,8 @@ def test_an_impossible_value_is_refused_by_name(key: str, value: object, what: s
 
 def test_several_faults_are_told_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
-        Config.load(settings={"odometry.huber": -1, "fusion.voxel_mm": 0})
-    assert all(key in str(caught.value) for key in ("odometry.huber", "fusion.voxel_mm", "got -1"))
+        Config.load(settings={"tracking.huber": -1, "fusion.voxel_mm": 0})
+    assert all(key in str(caught.value) for key in ("tracking.huber", "fusion.voxel_mm", "got -1"))
 
 
 def test_smoothing_weights_that_sum_to_one_are_taken() -> None:
@@ -132,13 +132,13 @@ def test_an_unreadable_file_is_refused(tmp_path: Path, content: bytes) -> None:
 
 
 def test_values_may_be_text() -> None:
-    config = Config.load(settings={"odometry.huber": "2.5", "fusion.enabled": "false", "odometry.levels": "3"})
-    assert (config.odometry.huber, config.fusion.enabled, config.odometry.levels) == (2.5, False, 3)
+    config = Config.load(settings={"tracking.huber": "2.5", "fusion.enabled": "false", "tracking.levels": "3"})
+    assert (config.tracking.huber, config.fusion.enabled, config.tracking.levels) == (2.5, False, 3)
 
 
 def test_settings_are_frozen() -> None:
     with pytest.raises(ValueError, match="frozen"):
-        Config().odometry.huber = 3.0  # type: ignore[misc]
+        Config().tracking.huber = 3.0  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -156,20 +156,20 @@ numbers = st.floats(1e-9, 1e9, allow_nan=False, allow_infinity=False)
 @given(numbers, st.booleans(), st.none() | st.tuples(numbers, numbers), texts)
 def test_toml_round_trip(huber: float, fused: bool, near_far: Range, folder: str) -> None:
     given = {
-        "odometry.huber": huber,
+        "tracking.huber": huber,
         "fusion.enabled": fused,
         "depth.near_far_mm": near_far,
         "depth.backend": f"files:{folder}",
     }
     config = Config.load(settings=given)
     tree = tomllib.loads(config.toml())
-    assert tree["odometry"]["huber"] == huber
+    assert tree["tracking"]["huber"] == huber
     assert tree["depth"]["backend"] == f"files:{folder}"
     assert Config.model_validate(tree) == config
 
 
 def test_a_runs_file_repeats_the_run_without_naming_its_preset(tmp_path: Path) -> None:
-    config = Config.load("paper", settings={"odometry.huber": 3.0})
+    config = Config.load("paper", settings={"tracking.huber": 3.0})
     assert Config.load(file=_write(tmp_path, config.toml())) == config
 
 
@@ -178,8 +178,8 @@ def test_a_preset_named_in_a_file_is_applied(tmp_path: Path) -> None:
 
 
 def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> None:
-    file = _write(tmp_path, 'preset = "paper"\n[odometry]\nhuber = 2.5\n')
-    realtime = Config.load("realtime", settings={"odometry.huber": 2.5})
+    file = _write(tmp_path, 'preset = "paper"\n[tracking]\nhuber = 2.5\n')
+    realtime = Config.load("realtime", settings={"tracking.huber": 2.5})
     assert Config.load(settings={"preset": "paper"}) == Config.load("paper")
     assert Config.load("realtime", file) == realtime
     assert Config.load("default", file, {"preset": "realtime"}) == realtime
@@ -195,7 +195,7 @@ def test_any_text_goes_through_a_file(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "nan", "inf"])
-@pytest.mark.parametrize("key", ["odometry.huber", "fusion.voxel_mm"])
+@pytest.mark.parametrize("key", ["tracking.huber", "fusion.voxel_mm"])
 def test_what_is_no_number_is_refused(key: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"'{key}'.*finite number"):
         Config.load(settings={key: value})

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose, see, true_flow
 
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 from scopemap.evaluation.consistency import ConsistencyMeter, ConsistencyReport, DepthFrame
 from scopemap.evaluation.depth_change import alignment_errors, depth_change, looks_alike, mean_change, projected_depth
 from scopemap.evaluation.image_link import ImageLink, ImageLinker
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
+from scopemap.io.opening import open_sequence
 
 STILL = [pose()] * 4
 ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]

@@ -15,8 +15,8 @@ from scopemap import open_sequence
 from scopemap.flow import CornerFollower, DisFlow
 from scopemap.frame import Frame, SeenAgain
 from scopemap.geometry.se3 import inverse
-from scopemap.odometry import Tracker
 from scopemap.pipeline import Estimators, Pipeline
+from scopemap.tracking import Tracker
 
 HERE = plane_scene.pose()
 THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
@@ -57,7 +57,7 @@ def test_corners_of_masked_or_unknown_tissue_are_not_followed() -> None:
     [
         ("depth", {}, [None, 0, 0, 2, 2]),
         ("measured", {}, [None] * 5),
-        ("depth", {"odometry__corner_depth_share": 0.0}, [None] * 5),
+        ("depth", {"tracking__corner_depth_share": 0.0}, [None] * 5),
         ("depth", {"networks__flow": "none"}, [None] * 5),
     ],
 )
@@ -65,7 +65,7 @@ def test_the_tracker_is_given_the_corners_of_its_keyframe(
     kind: str, changes: dict[str, object], hosts: list[int | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     phantom, given = write_tiny(tmp_path / "phantom", frames=5), []
-    light = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__keyframe_every": 2}
+    light = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__keyframe_every": 2}
     config = with_true_depth(phantom, depth__files_kind=kind, **light | changes)
     sequence = open_sequence(phantom)
     track = Tracker.track

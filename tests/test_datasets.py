@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from drawn_inputs import SIZE, frames_of, number_in, picture, poses, save, write_c3vd, write_video
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
-from scopemap.datasets import open_sequence
-from scopemap.datasets.c3vd import CAMERA, read_poses
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, se3_exp, transform
+from scopemap.io.datasets.c3vd import CAMERA, read_poses
+from scopemap.io.opening import open_sequence
 
 # ---- folders of images
 

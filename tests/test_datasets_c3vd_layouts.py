@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from drawn_inputs import SIZE, number_in, picture, poses, save, write_c3vd
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
+from scopemap.io.opening import open_sequence
 
 FULL = (1350, 1080)
 

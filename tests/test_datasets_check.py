@@ -14,16 +14,17 @@ import numpy as np
 import pytest
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import Sequence, SourceFrame, SourceTruth, open_sequence
-from scopemap.datasets.checking import Finding, check, check_path, refusal
-from scopemap.datasets.pose_depth import PoseDepthTest
-from scopemap.datasets.survey import FrameRecord, Survey, survey
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
+from scopemap.io.datasets.checking import Finding, check, check_path, refusal
+from scopemap.io.datasets.pose_depth import PoseDepthTest
+from scopemap.io.datasets.survey import FrameRecord, Survey, survey
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence, SourceFrame, SourceTruth
 from scopemap.phantom import PhantomSpec, write_phantom
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT, SIZE = 6, (64, 48)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.calibration.colmap import ModelCamera, camera_model
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.colmap import ModelCamera, camera_model
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (80, 64)
 NUMBERS = [2, 9, 10, 12]

@@ -23,10 +23,10 @@ from test_datasets_colmap import (
     write_scene,
 )
 
-from scopemap.calibration.colmap import read_cameras
-from scopemap.datasets import open_sequence
-from scopemap.datasets.colmap_files import read_images
+from scopemap.cameras.formats.colmap import read_cameras
 from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.io.datasets.colmap_files import read_images
+from scopemap.io.opening import open_sequence
 
 ROW = "1 1 0 0 0 0 0 0 1 frame_2.png"
 

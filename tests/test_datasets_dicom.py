@@ -27,9 +27,9 @@ from pydicom.uid import (
     RLELossless,
 )
 
-from scopemap.datasets import open_sequence
-from scopemap.datasets.dicom import Dicom
 from scopemap.errors import InputError
+from scopemap.io.datasets.dicom import Dicom
+from scopemap.io.opening import open_sequence
 
 YBR = {"PhotometricInterpretation": "YBR_FULL"}
 GREY = {"SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "PlanarConfiguration": None}

@@ -13,13 +13,13 @@ import pytest
 from drawn_inputs import number_in, picture
 from test_datasets_stereomis import write_frames
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.endomapper import read_calibu
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.io.datasets.endomapper import read_calibu
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (160, 120)
 FRAMES = 6

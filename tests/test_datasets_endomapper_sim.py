@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import endomapper_sim, open_sequence
-from scopemap.datasets.exr import read_exr_red
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets import endomapper_sim
+from scopemap.io.datasets.exr import read_exr_red
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (96, 72)
 FRAMES = 4

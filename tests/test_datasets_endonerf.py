@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.mask_files import create_masks
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
+from scopemap.masking.mask_files import create_masks
 
 SIZE = (80, 64)
 FOCAL_PX = 71.25

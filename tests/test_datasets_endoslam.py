@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (96, 96)
 K = np.array([[46.8, 0.0, 53.5], [0.0, 46.7, 54.5], [0.0, 0.0, 1.0]])

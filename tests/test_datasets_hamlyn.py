@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.calibration.plain_numbers import read_intrinsics
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import CalibrationError, InputError
-from scopemap.masking import Masker
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
+from scopemap.masking.masker import Masker
 
 SIZE = (80, 64)
 K = np.array([[70.0, 0.0, 41.0], [0.0, 71.0, 30.5], [0.0, 0.0, 1.0]])

@@ -14,14 +14,15 @@ from test_datasets_endoslam import write_xlsx
 from test_datasets_stereomis import FRAMES, write_stereomis
 from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
 
-from scopemap.datasets import colmap_archive, open_sequence, posed_video
-from scopemap.datasets.colmap_archive import read_largest_model
-from scopemap.datasets.exr import read_exr_red
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.spreadsheet import read_sheet
-from scopemap.datasets.survey import survey
-from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError
+from scopemap.io.datasets import colmap_archive, posed_video
+from scopemap.io.datasets.colmap_archive import read_largest_model
+from scopemap.io.datasets.exr import read_exr_red
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.spreadsheet import read_sheet
+from scopemap.io.datasets.survey import survey
+from scopemap.io.opening import open_sequence
+from scopemap.io.video import VideoFile
 
 MODEL = "33/sparse/0/images.bin"
 
@@ -137,7 +138,7 @@ def test_a_count_of_frames_beyond_the_file_is_not_believed(
     else:
         folder = write_endomapper(tmp_path)
         write_models(archive_of(folder), {0: images_bin([1, 2])})
-    monkeypatch.setattr("scopemap.datasets.video._claimed_frames", lambda *_: 2_000_000_000)
+    monkeypatch.setattr("scopemap.io.video._claimed_frames", lambda *_: 2_000_000_000)
     sequence = open_sequence(folder)
     assert (sequence.source.name, sequence.count) == (layout, None)
     assert sequence.source.stamps(slice(None)) is None

@@ -25,10 +25,10 @@ from test_datasets_oneslam import write_json, write_oneslam
 from test_datasets_servct import write_experiment
 from test_datasets_tum import ROOM, write_tum
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence, open_source
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.io.opening import open_sequence, open_source
 
 MINE = PinholeCamera(60.0, 60.0, 40.0, 32.0, 80, 64)
 

@@ -11,13 +11,14 @@ from drawn_clips import RATE, clip, tissue, write
 from drawn_inputs import frames_of, save, write_c3vd
 from drawn_videos import HEIGHT, WIDTH, above, beside, beside_squeezed, encode, half, stereo, woven
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
-from scopemap.datasets import open_sequence, prepared
 from scopemap.errors import CalibrationError, InputError
-from scopemap.pictures.duplicates import difference, repeats
-from scopemap.pictures.interlacing import combing
+from scopemap.io import prepared
+from scopemap.io.opening import open_sequence
+from scopemap.io.video_format.duplicates import difference, repeats
+from scopemap.io.video_format.interlacing import combing
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]

@@ -12,10 +12,10 @@ import pytest
 from drawn_bags import IMAGE, SIZE, START_NS, STEP_NS, Bag, small_bag, write_bag1, write_mcap, write_ros2
 from drawn_inputs import number_in, picture
 
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.rosbag import RosBag
-from scopemap.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.io.datasets.rosbag import RosBag
+from scopemap.io.opening import open_sequence
 
 
 def test_pictures_their_times_and_camera_come_out(tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_times_without_stamps_are_those_of_recording(tmp_path: Path) -> None:
 
 def test_stamps_decode_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = RosBag(small_bag().write_bag1(tmp_path / "a.bag"))
-    monkeypatch.setattr("scopemap.datasets.rosbag.picture_of", lambda message: pytest.fail("decoded"))
+    monkeypatch.setattr("scopemap.io.datasets.rosbag.picture_of", lambda message: pytest.fail("decoded"))
     assert [index for index, _ in source.stamps(slice(None, None, 2))] == [0, 2]
 
 

@@ -14,10 +14,10 @@ from drawn_bags import IMAGE, INFO, SIZE, START_NS, STEP_NS, Bag, small_bag, wri
 from drawn_dicom import jpeg
 from drawn_inputs import number_in, picture
 
-from scopemap.datasets import open_sequence
-from scopemap.datasets.rosbag import RosBag
-from scopemap.datasets.rosbag_unpacking import LARGEST_CHUNK_BYTES, bound_unpacking, unpacked_zstd, zstandard
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.rosbag import RosBag
+from scopemap.io.datasets.rosbag_unpacking import LARGEST_CHUNK_BYTES, bound_unpacking, unpacked_zstd, zstandard
+from scopemap.io.opening import open_sequence
 
 JPEG_START = b"\xff\xd8\xff"
 

@@ -27,14 +27,15 @@ from drawn_scared import (
     write_tar,
 )
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import Sequence, open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.scared import ScaredKeyframe
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.lenses import OpenCvCamera
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.scared import ScaredKeyframe
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
 
 
 @pytest.fixture(scope="module")

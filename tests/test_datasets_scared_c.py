@@ -26,11 +26,11 @@ from drawn_scared import (
     write_tar,
 )
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.numbered import find_numbered
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError, ScopemapError
+from scopemap.io.datasets.numbered import find_numbered
+from scopemap.io.opening import open_sequence
 
 NUMBERS = [1, 2, 4, 7, 8]
 

@@ -25,12 +25,12 @@ from drawn_scared import (
     write_tar,
 )
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.scared import ScaredKeyframe
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.scared import ScaredKeyframe
+from scopemap.io.opening import open_sequence
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (80, 64)
 P1 = [[90.5, 0, 41.25, 0], [0, 91.0, 30.5, 0], [0, 0, 1, 0]]

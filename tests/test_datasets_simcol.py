@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
 
 SIZE = (95, 95)
 K = np.array([[45.52, 0.0, 47.5], [0.0, 45.52, 47.0], [0.0, 0.0, 1.0]])

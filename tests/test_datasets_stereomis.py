@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.stereomis import StereoMisFolder, read_groundtruth
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.lenses import OpenCvCamera
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.stereomis import StereoMisFolder, read_groundtruth
+from scopemap.io.opening import open_sequence
 
 SIZE = (160, 128)
 FRAMES = 6

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from drawn_inputs import frames_of, number_in, picture, save
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.tum import associated
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.lenses import OpenCvCamera
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.tum import associated
+from scopemap.io.opening import open_sequence
 
 SIZE = (64, 48)  # a tenth of the data set's
 START_S = 1305031102.175304

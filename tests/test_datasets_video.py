@@ -15,10 +15,10 @@ from drawn_videos import encode, one_colour
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.datasets import open_sequence
-from scopemap.datasets.time_stamps import TimeStamps
-from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError
+from scopemap.io.opening import open_sequence
+from scopemap.io.time_stamps import TimeStamps
+from scopemap.io.video import VideoFile
 
 
 def test_a_video_whose_title_is_no_utf8_is_read(tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.baseline import AffineDisparity, baseline_closed_form
 from scopemap.depth.estimate import DepthEstimate
+from scopemap.depth.pseudo_stereo import AffineDisparity, baseline_closed_form
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.depth.baseline import (
+from scopemap.depth.pseudo_stereo import (
     AffineDisparity,
     baseline_closed_form,
     fit_affine_disparity,

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.frame import Frame
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))

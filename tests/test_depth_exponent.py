@@ -11,17 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_phantom import only_images, with_true_depth, write_tiny
 
-from scopemap import depth_range, open_sequence, reconstruct
-from scopemap.camera import PinholeCamera
+from scopemap import open_sequence, reconstruct
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.options import parse_settings
 from scopemap.cli.run import summary_lines
 from scopemap.config import Config, DepthSettings
 from scopemap.depth import create_depth
+from scopemap.depth import power_law_fit as depth_range
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.exponent import PairFit, modelled_flow, pair_exponent, ray_lengths, sequence_exponent, stretched
+from scopemap.depth.power_law import PairFit, modelled_flow, pair_exponent, ray_lengths, sequence_exponent, stretched
+from scopemap.depth.power_law_fit import described, fit_exponent, with_exponent
 from scopemap.depth.shading import ShadingDepth
-from scopemap.depth_range import described, fit_exponent, with_exponent
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import se3, so3_exp, transform
@@ -289,7 +290,7 @@ def test_an_impossible_exponent_is_refused(value: object) -> None:
 
 
 def test_the_fit_takes_the_place_of_the_word_and_of_nothing_else() -> None:
-    given = {"odometry.huber": 2.0, "depth.shading_exponent": 0.5}
+    given = {"tracking.huber": 2.0, "depth.shading_exponent": 0.5}
     config = Config.load(settings={"depth.exponent": "fit", **given})
     found = with_exponent(config, sequence_exponent(fits(*[1.25] * 6)))
     assert found == Config.load(settings={"depth.exponent": 1.25, **given})

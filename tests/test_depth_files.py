@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings
-from scopemap.datasets.c3vd import C3vdFolder
 from scopemap.depth import AnchoredDepth, create_anchor, create_depth
 from scopemap.depth.files import FilesDepth, depth_files
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
-from scopemap.lenses import FisheyeCamera
-from scopemap.rectification import Rectifier, working_camera
+from scopemap.io.datasets.c3vd import C3vdFolder
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)

@@ -18,7 +18,7 @@ from transformers import (
     DPTImageProcessor,
 )
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.depth_anything import DepthAnything
 from scopemap.depth.depth_pro import DepthPro
 from scopemap.errors import WeightsError

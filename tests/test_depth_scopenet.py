@@ -14,8 +14,8 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from scopemap import weights
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier
 from scopemap.config import Config, DepthSettings
 from scopemap.depth import create_anchor, create_depth
 from scopemap.depth.scopenet import estimator as module
@@ -24,7 +24,7 @@ from scopemap.depth.scopenet.network import ScopeNet
 from scopemap.depth.scopenet.planes import input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
-from scopemap.rectification import Rectifier
+from scopemap.io import weights
 
 HEIGHT, WIDTH = 50, 61  # no multiple of anything
 CAMERA = PinholeCamera(40.0, 42.0, 28.0, 26.0, WIDTH, HEIGHT)

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.guided import filled, guided_filter, masked_mean
 from scopemap.depth.shading import ShadingDepth, linear_brightness

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from tiny_phantom import only_images, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.camera import PinholeCamera
-from scopemap.config import DepthSettings, FusionSettings, MapisSettings, OdometrySettings
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
 from scopemap.depth import AnchoredDepth, DepthEstimate
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
@@ -22,10 +22,10 @@ from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.geometry.uncertainty import blended_share, by_variance, depth_trust, faded_share, sigma_share
-from scopemap.odometry import Tracker
-from scopemap.odometry.pyramid import build_pyramid
 from scopemap.phantom import PhantomSpec, prepare, render_frame
 from scopemap.pipeline import Estimators, Step
+from scopemap.tracking import Tracker
+from scopemap.tracking.pyramid import build_pyramid
 
 SHAPE = (48, 64)
 CAMERA = PinholeCamera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -35,7 +35,7 @@ SHARE, SHARE_OTHER = (RNG.uniform(0.02, 0.4, SHAPE).astype(np.float32) for _ in 
 DISTANCE = RNG.uniform(0, 1.4, SHAPE).astype(np.float32)
 APPROACH = se3(np.eye(3), np.array([0.0, 0.0, -5.0]))
 SPEC = PhantomSpec(scene="colon", frames=6, width=160, height=128, seed=4)
-TRACKING = OdometrySettings(finest_level=0)
+TRACKING = TrackingSettings(finest_level=0)
 
 
 # ---- the mathematics
@@ -349,9 +349,9 @@ def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.
     folder = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "images")
     create, runs = Estimators.create, {}
     # Shading tells no uncertainty of its own. Equal sigmas change no weight but that of the back end's depth prior.
-    light = {"networks.flow": "dis", "networks.perceptual": "structure", "backend.method": "none"}
+    light = {"networks.flow": "dis", "networks.perceptual": "structure", "mapping.method": "none"}
     # Corners doubt all depth alike, and would hide what the photometric weights do.
-    config = Config.load(settings={"depth.backend": "shading", "odometry.corner_depth_share": 0, **light})
+    config = Config.load(settings={"depth.backend": "shading", "tracking.corner_depth_share": 0, **light})
     for name, left in {"none": None, "equal": 0.1, "doubted": 1.0}.items():
 
         def telling(config: Config, sequence: Any, left: float | None = left) -> Estimators:

@@ -10,10 +10,10 @@ import pytest
 import typer.main
 
 from scopemap import __version__
-from scopemap.checkpoints import REGISTRY
 from scopemap.cli import app
 from scopemap.config import PRESETS, setting_names
-from scopemap.datasets import DATASETS
+from scopemap.io.checkpoints import REGISTRY
+from scopemap.io.opening import DATASETS
 from scopemap.reconstruction import _COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]

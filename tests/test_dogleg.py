@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from scopemap.odometry.dogleg import Options, Problem, Quadratic, dogleg_step, gauss_newton_step, minimise
+from scopemap.tracking.dogleg import Options, Problem, Quadratic, dogleg_step, gauss_newton_step, minimise
 
 
 def _model(seed: int, size: int = 6) -> Quadratic:

@@ -24,7 +24,7 @@ from scopemap.evaluation.pose_errors import (
 from scopemap.evaluation.poses import associate, evaluate_poses, match
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import se3_exp, so3_exp
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 MODES = ("none", "origin", "se3", "sim3", "scale")
 

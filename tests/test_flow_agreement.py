@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_phantom import write_tiny
 
-from scopemap.odometry import Tracker
+from scopemap.tracking import Tracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -24,7 +24,7 @@ def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _said(phantom: Path, capsys: pytest.CaptureFixture[str]) -> tuple[float, float]:
     depth = ["--set", f"depth.backend=files:{phantom}", "--set", "depth.files_kind=depth"]
-    flow_agreement.main(["--input", str(phantom), *depth, "--set", "odometry.flow_contradiction=0"])
+    flow_agreement.main(["--input", str(phantom), *depth, "--set", "tracking.flow_contradiction=0"])
     words = capsys.readouterr().out.split()
     assert "(6 pairs);" in " ".join(words)
     numbers = [float(word) for before, word in pairwise(words) if before in ("by", "are")]

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
-from scopemap.config import Config, OdometrySettings
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import Config, TrackingSettings
 from scopemap.frame import Frame, SeenAgain
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.geometry.warp import carried_points
-from scopemap.odometry import Tracker
-from scopemap.odometry.flow_pose import flow_error_px, pose_by_flow, refined_by_corners
+from scopemap.tracking import Tracker
+from scopemap.tracking.flow_pose import flow_error_px, pose_by_flow, refined_by_corners
 
 CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
 TWIST = np.array([0.05, -0.08, 0.1, 2.0, -1.5, 4.0])
@@ -101,7 +101,7 @@ def _wall(shift_px: int, index: int, seen: SeenAgain | None = None, soft_px: flo
 
 
 def _tracked(frame: Frame, soft_px: float = 0.0, **changes: float) -> tuple[Tracker, float, str, str]:
-    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0, **changes))
+    tracker = Tracker(TrackingSettings(finest_level=0, lamp_gamma=0, **changes))
     first = _wall(0, 0, soft_px=soft_px)
     tracker.track(first)
     tracker.adopt(replace(first, T_world_camera=np.eye(4)), measured=False)
@@ -168,7 +168,7 @@ def test_many_decisions_leave_a_pose_a_pose() -> None:
     moved[0, 3] = -WAY_MM
     turned = se3_exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])) @ moved
     # What correlates with nothing would be lost.
-    tracker = Tracker(OdometrySettings(finest_level=0, lamp_gamma=0, min_correlation=-1))
+    tracker = Tracker(TrackingSettings(finest_level=0, lamp_gamma=0, min_correlation=-1))
     random = np.random.default_rng(0)
     track = tracker.track(_wall(0, 0))
     decided = 0
@@ -184,7 +184,7 @@ def test_many_decisions_leave_a_pose_a_pose() -> None:
 
 
 def test_the_paper_listens_to_no_flow() -> None:
-    assert Config.load("paper").odometry.flow_contradiction == 0
+    assert Config.load("paper").tracking.flow_contradiction == 0
 
 
 def _corners(T_current_host: np.ndarray, depth_error: np.ndarray | float = 1.0, host: int = 0) -> SeenAgain:

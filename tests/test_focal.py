@@ -13,10 +13,7 @@ import numpy as np
 import pytest
 from turning_clip import SIZE, focal_of, write_clip
 
-from scopemap.config import Config
-from scopemap.datasets import Sequence, open_sequence
-from scopemap.errors import CalibrationError
-from scopemap.focal import (
+from scopemap.calibration.focal_length import (
     FocalEstimate,
     Window,
     WindowFit,
@@ -26,9 +23,13 @@ from scopemap.focal import (
     windows_of,
     with_focal_from_motion,
 )
+from scopemap.cameras.rectification import Rectifier, working_camera
+from scopemap.config import Config
+from scopemap.errors import CalibrationError
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import so3_exp
-from scopemap.rectification import Rectifier, working_camera
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
 from scopemap.runner import reconstruct
 
 HALF_PX = 160.0
@@ -277,7 +278,7 @@ def test_which_estimate_is_taken(
     still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, said: str
 ) -> None:
     estimate = ESTIMATES[name]
-    monkeypatch.setattr("scopemap.focal.choice.focal_from_motion", lambda *_: estimate)
+    monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
     assert said in " ".join([found.camera_source, *notes])
     if taken:
@@ -288,7 +289,7 @@ def test_which_estimate_is_taken(
 
 
 def test_asking_for_what_the_motion_does_not_tell_is_an_error(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.focal.choice.focal_from_motion", lambda *_: ESTIMATES["none"])
+    monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: ESTIMATES["none"])
     with pytest.raises(CalibrationError, match=r"input\.focal = flow.*0 stretches"):
         reconstruct(still, _settings("flow"))
 

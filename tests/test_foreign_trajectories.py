@@ -28,8 +28,8 @@ from sample_trajectories import as_trajectory, write_c3vd, write_run
 
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectories.opening import KINDS
-from scopemap.trajectory import Trajectory, read_trajectory
+from scopemap.trajectory.formats.opening import KINDS, read_trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 # ---- SCARED
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scopemap import errors
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError, check_shape
 from scopemap.frame import Frame, Truth
 

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume

@@ -10,7 +10,7 @@ import pytest
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, follows_scene, with_sizes

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory import read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
 
 HELD_OUT = [frame for frame in range(100) if frame % 8 != 7]
 

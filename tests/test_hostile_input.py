@@ -29,10 +29,10 @@ from front_door import refused
 from test_datasets_endomapper import XML, archive_of, images_bin, write_endomapper
 from test_datasets_endoslam import write_real
 
-from scopemap.datasets import open_sequence
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.survey import survey
 from scopemap.errors import InputError, ScopemapError
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.survey import survey
+from scopemap.io.opening import open_sequence
 
 Capture = pytest.CaptureFixture[str]
 
@@ -254,7 +254,7 @@ def test_a_video_of_pictures_beyond_the_limit_takes_no_memory(tmp_path: Path) ->
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((8192, 8192), np.uint8), format="gray")))
         container.mux(stream.encode())
     code = (
-        "import resource, sys\nfrom scopemap.datasets.video import VideoFile\nfrom scopemap.errors import InputError\n"
+        "import resource, sys\nfrom scopemap.io.video import VideoFile\nfrom scopemap.errors import InputError\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try: VideoFile(__import__('pathlib').Path(sys.argv[1]))\nexcept InputError as error: print(error)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"

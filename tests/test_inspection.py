@@ -33,12 +33,12 @@ from drawn_dicom import write_dicom_video
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.datasets import open_sequence
 from scopemap.errors import InputError
 from scopemap.inspection.finding import Finding, covered, stretches_of
 from scopemap.inspection.inspecting import Inspection, inspect
 from scopemap.inspection.masks import write_mask
-from scopemap.mask_files import MaskFiles
+from scopemap.io.opening import open_sequence
+from scopemap.masking.mask_files import MaskFiles
 
 COUNT = 50
 

@@ -10,8 +10,8 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.frame import Frame
-from scopemap.geometry.landmarks import find_landmarks, locate, matches
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.tracking.features import find_landmarks, locate, matches
 
 HERE = plane_scene.pose()
 # Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.

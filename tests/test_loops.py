@@ -10,20 +10,20 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.backend import Backend
-from scopemap.backend.adjustment import Problem, Solution, adjust
-from scopemap.backend.loops import Loop, LoopFinder
-from scopemap.backend.pose_graph import spread_loops
-from scopemap.config import BackendSettings
+from scopemap.config import MappingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.mapping import Backend
+from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
+from scopemap.mapping.loop_closure import Loop, LoopFinder
+from scopemap.mapping.pose_graph import spread_loops
 
 # Out to the side and back again.
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
 POSES = [*OUT, *OUT[-2::-1]]
 COUNT = len(POSES)
 LINE = np.column_stack([np.arange(COUNT - 1), np.arange(1, COUNT)])
-SETTINGS = BackendSettings(gaps=(1, 2))
+SETTINGS = MappingSettings(gaps=(1, 2))
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
@@ -61,7 +61,7 @@ def test_a_place_is_known_again_and_placed_where_it_is() -> None:
 
 
 def test_a_camera_that_only_goes_on_closes_no_loop() -> None:
-    finder = LoopFinder(BackendSettings(gaps=(1,)))
+    finder = LoopFinder(MappingSettings(gaps=(1,)))
     for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):
         view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
         frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
@@ -136,7 +136,7 @@ def test_loops_of_keyframes_without_depth_are_none() -> None:
 
 
 def test_a_camera_that_dwells_ties_no_keyframe_to_all_others() -> None:
-    finder = LoopFinder(BackendSettings(gaps=(1,)))
+    finder = LoopFinder(MappingSettings(gaps=(1,)))
     loops = [loop for number in range(14) for loop in finder.add(replace(_frame(0), index=10 * number))]
     assert len(loops) > 10
     ties = np.bincount([loop.past for loop in loops])
@@ -156,7 +156,7 @@ def test_loops_that_lead_astray_are_done_without(monkeypatch: pytest.MonkeyPatch
         found = adjust(problem)
         return found if problem.start is None else replace(found, sigma_px=9.9)
 
-    monkeypatch.setattr("scopemap.backend.backend.adjust", failing)
+    monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
     correction = backend.adjust()
     assert [start is None for start in starts] == [False, True]
     assert not correction.refused

@@ -10,13 +10,13 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.config import OdometrySettings
+from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.odometry import Track, Tracker
-from scopemap.odometry.clarity import Clarity, detail_of
+from scopemap.tracking import Track, Tracker
+from scopemap.tracking.sharpness import Clarity, detail_of
 
-SETTINGS = OdometrySettings(keyframe_every=3, finest_level=0)
+SETTINGS = TrackingSettings(keyframe_every=3, finest_level=0)
 # Slowly on, then, unseen, far away and turned.
 NEAR = [plane_scene.pose(at_mm=(1.0 * n, 0.3 * n, 0.0), turn_rad=(0.0, 0.0, 0.005 * n)) for n in range(8)]
 FAR = [plane_scene.pose(at_mm=(27.0 + n, 8.0, 4.0), turn_rad=(0.05, -0.1, 0.3)) for n in range(3)]
@@ -36,7 +36,7 @@ def _blurred(frame: Frame) -> Frame:
     return replace(frame, rgb=cv2.GaussianBlur(frame.rgb, (0, 0), 5.0))
 
 
-def _tracked(frames: list[Frame], settings: OdometrySettings = SETTINGS) -> list[Track]:
+def _tracked(frames: list[Frame], settings: TrackingSettings = SETTINGS) -> list[Track]:
     tracker, tracks = Tracker(settings), []
     for frame in frames:
         track = tracker.track(frame)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MapisSettings
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth, robust_scale
 from scopemap.geometry.se3 import se3

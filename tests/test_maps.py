@@ -16,22 +16,22 @@ import trimesh
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.backend import Backend, Correction, Seat
-from scopemap.backend.adjustment import Problem, Solution, adjust
-from scopemap.config import BackendSettings, Config
-from scopemap.datasets.c3vd import C3vdFolder
+from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
+from scopemap.io.datasets.c3vd import C3vdFolder
+from scopemap.mapping import Backend, Correction, Seat
+from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 from scopemap.reconstruction import DepthReader
-from scopemap.trajectory import read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
 
 FIRST, SECOND, GIVEN_UP = 10, 13, 2
-LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__new_map_after": GIVEN_UP}
+LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": GIVEN_UP}
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_few_frames_apart_are_left_out(spliced: Path) -> None:
 
 
 def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> None:
-    at_once = {"backend__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
+    at_once = {"mapping__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
     result = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
     assert [r.track.status for r in result.records] == ["initial"] + ["ok"] * (FIRST - 1) + ["lost"] * SECOND
     assert {record.track.map for record in result.records} == {0}
@@ -142,7 +142,7 @@ def _keyframe(number: int, at_mm: tuple[float, float, float], told: Similarity, 
 def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
     worlds = (Similarity.identity(), Similarity(1.3, so3_exp(np.array([0.2, -0.9, 0.4])), np.array([30.0, -8.0, 5.0])))
     places = [(2.0 * number, 0.5 * number, 0.1 * number) for number in range(10)]
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     frames, seats = [], {}
     for number, at_mm in enumerate(places):
         # Every other keyframe is of the other map.
@@ -162,7 +162,7 @@ def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
 
 
 def test_maps_that_do_not_are_adjusted_apart() -> None:
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     with pytest.raises(ValueError, match="no keyframe"):
         backend.adjust()
     for number in range(6):
@@ -175,7 +175,7 @@ def test_maps_that_do_not_are_adjusted_apart() -> None:
 
 @pytest.mark.parametrize("swelling", [False, True])
 def test_one_map_that_does_not_fit_is_left_alone(swelling: bool) -> None:
-    backend, rng = Backend(BackendSettings()), np.random.default_rng(0)
+    backend, rng = Backend(MappingSettings()), np.random.default_rng(0)
     for number in range(15):
         frame, seat = _keyframe(number, (1.5 * number, 0.4 * number, 0.0), Similarity.identity(), 1.0)
         if swelling and number % 3 == 1:
@@ -214,7 +214,7 @@ def test_what_has_most_frames_in_all_comes_first(spliced: Path) -> None:
 
 
 def test_what_sticks_to_the_lens_joins_nothing() -> None:
-    backend, dirt = Backend(BackendSettings()), np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32)
+    backend, dirt = Backend(MappingSettings()), np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32)
     dirt = cv2.GaussianBlur(dirt, (0, 0), 1.5)
     for number in range(10):
         at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 5 else (45.0 + 2 * number, 0.0, 0.0)
@@ -225,7 +225,7 @@ def test_what_sticks_to_the_lens_joins_nothing() -> None:
 
 
 def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = Backend(BackendSettings())
+    backend = Backend(MappingSettings())
     for number in range(10):
         backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
 
@@ -233,7 +233,7 @@ def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.Monkey
         found = adjust(problem)
         return replace(found, sigma_px=9.9) if len(problem.T_camera_world) > 5 else found
 
-    monkeypatch.setattr("scopemap.backend.backend.adjust", failing)
+    monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
     correction = backend.adjust()
     assert not correction.refused
     np.testing.assert_array_equal(correction.index, [0, 20, 40, 60, 80])
@@ -267,7 +267,7 @@ def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(
 
     whole = TsdfVolume.integrate
     monkeypatch.setattr(TsdfVolume, "integrate", integrate)
-    settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"odometry.keyframe_every": 3}
+    settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
     result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
     status = [record.track.status for record in result.records]
     assert status == ["initial"] + ["ok"] * 9 + ["lost"] * GIVEN_UP + ["ok"] * (44 - GIVEN_UP)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from drawn_inputs import frames_of, picture, save
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import Config, MaskSettings
-from scopemap.datasets import open_sequence
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame
-from scopemap.mask_files import MaskFiles, create_masks
-from scopemap.masking import Masker
+from scopemap.io.opening import open_sequence
+from scopemap.masking.mask_files import MaskFiles, create_masks
+from scopemap.masking.masker import Masker
 from scopemap.pipeline import Estimators, Pipeline
-from scopemap.rectification import Rectifier, working_camera
 
 SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)
 RECTIFIER = Rectifier(SOURCE, working_camera(SOURCE, (320, 240)))

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
-from scopemap.datasets import open_sequence
 from scopemap.frame import Frame
-from scopemap.masking import Masker
-from scopemap.pictures.constant import is_constant
+from scopemap.io.opening import open_sequence
+from scopemap.io.video_format.constant import is_constant
+from scopemap.masking.masker import Masker
 
 SETTINGS = MaskSettings(
     dark_level=12, bright_level=240, highlight_ratio=1.5, highlight_grow_px=2, border_px=3, field_of_view=True,

@@ -15,10 +15,10 @@ from drawn_scared import Files, write_loose, write_tar
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.datasets import numbered, seekable_gzip
-from scopemap.datasets.numbered import NumberedFiles, find_numbered
-from scopemap.datasets.seekable_gzip import SeekableGzip
 from scopemap.errors import InputError
+from scopemap.io.datasets import numbered, seekable_gzip
+from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
+from scopemap.io.datasets.seekable_gzip import SeekableGzip
 
 MB = 1 << 20
 

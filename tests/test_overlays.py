@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from drawn_clips import SIZE, Change, black, clip, during, inside, octagon, text, tissue
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MaskSettings
-from scopemap.datasets import open_sequence
 from scopemap.frame import Frame
-from scopemap.masking import Masker
-from scopemap.overlays import OverlayFinder
+from scopemap.io.opening import open_sequence
+from scopemap.masking.masker import Masker
+from scopemap.masking.overlays import OverlayFinder
 
 CAMERA = PinholeCamera(300.0, 300.0, 159.5, 119.5, *SIZE)
 EVERYWHERE = np.ones(SIZE[::-1], bool)

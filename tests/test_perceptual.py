@@ -13,8 +13,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scopemap.depth.perceptual import LpipsAlex, StructureDistance, create_perceptual
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.perceptual import LpipsAlex, StructureDistance, create_perceptual
 
 SHAPE = (70, 93, 3)
 

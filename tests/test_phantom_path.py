@@ -13,7 +13,7 @@ from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.phantom import PhantomSpec, prepare
 from scopemap.phantom.camera_path import c3vd_line, lumen_path, sweep_path
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from scopemap.phantom.deformation import REST, breathing
 from scopemap.phantom.march import march
 from scopemap.phantom.render import Phantom, camera_path
 from scopemap.phantom.volume import Volume
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 SMALL = {"width": 96, "height": 80, "frames": 12}
 

@@ -22,9 +22,9 @@ from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
-from scopemap.odometry import Track, Tracker
 from scopemap.pipeline import Estimators, Step
-from scopemap.trajectory import read_trajectory
+from scopemap.tracking import Track, Tracker
+from scopemap.trajectory.formats.opening import read_trajectory
 
 WITHOUT_NETWORKS = {"networks__flow": "dis", "networks__perceptual": "structure"}
 

@@ -18,7 +18,7 @@ from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
 EXPONENT = 1.3
-SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "odometry__keyframe_every": 2}
+SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__keyframe_every": 2}
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.odometry import Tracker
-from scopemap.odometry.flow_pose import flow_error_px
+from scopemap.tracking import Tracker
+from scopemap.tracking.flow_pose import flow_error_px
 
 LOST, FRAMES = 4, 9
 # True depth that is said to be predicted, so that MAPIS links the frames.
@@ -20,7 +20,7 @@ SETTINGS = {
     "depth__files_kind": "depth",
     "networks__flow": "dis",
     "networks__perceptual": "structure",
-    "backend__method": "none",
+    "mapping__method": "none",
     "fusion__enabled": False,
 }
 

@@ -19,12 +19,12 @@ from drawn_datasets import WRITERS
 from drawn_scene import Content, content
 from stored_kinds import KINDS, Kind, put
 
-from scopemap.camera import CameraModel, PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.checking import Finding, check, refusal
-from scopemap.datasets.survey import survey
+from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
+from scopemap.io.datasets.checking import Finding, check, refusal
+from scopemap.io.datasets.survey import survey
+from scopemap.io.opening import open_sequence
 
 AT = 3
 LEAST_FAULTS = 12

@@ -19,7 +19,7 @@ from scopemap.evaluation.pose_errors import ErrorSummary, translation_errors_mm
 from scopemap.evaluation.protocols import PROTOCOLS, ProtocolReport, af_from_relative
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
-from scopemap.trajectory import path_length_mm
+from scopemap.trajectory.trajectory import path_length_mm
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=15, deadline=None)

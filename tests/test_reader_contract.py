@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from drawn_datasets import WRITERS
 
-from scopemap.datasets import open_sequence
-from scopemap.datasets.opening import DATASETS
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.sequence import Sequence
 from scopemap.frame import TruthQuality
-from scopemap.mask_files import MaskFiles
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import DATASETS, open_sequence
+from scopemap.io.sequence import Sequence
+from scopemap.masking.mask_files import MaskFiles
 
 NAMES = sorted(WRITERS)
 

@@ -14,13 +14,13 @@ import trimesh
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.calibration import read_calibration
-from scopemap.camera import source_pixel
+from scopemap.cameras.camera import source_pixel
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.pipeline import Step
 from scopemap.reconstruction import DEPTH_SCALE_MM, DepthWriter, FrameRecord, prepare_folder
-from scopemap.trajectory import read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason keyframe residual inlier_share correlation overlap iterations depth_scale"
 COLUMNS += " warped_share"

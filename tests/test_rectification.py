@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.cameras.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera, working_size
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import inverse, se3_exp, transform
-from scopemap.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
-from scopemap.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera, working_size
 
 PINHOLE = PinholeCamera(300.0, 302.0, 318.0, 245.0, 640, 480)
 LENSES = {

@@ -10,12 +10,14 @@ import pytest
 from drawn_inputs import write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
 
-from scopemap.datasets import c3vd, images, open_sequence, sevenscenes
-from scopemap.datasets.reference import reference_trajectory
-from scopemap.datasets.scared_c import ScaredCKeyframe
-from scopemap.datasets.scared_files import ScenePoints
-from scopemap.datasets.video import VideoFile
-from scopemap.trajectory import Trajectory
+from scopemap.io import images
+from scopemap.io.datasets import c3vd, sevenscenes
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.scared_c import ScaredCKeyframe
+from scopemap.io.datasets.scared_files import ScenePoints
+from scopemap.io.opening import open_sequence
+from scopemap.io.video import VideoFile
+from scopemap.trajectory.trajectory import Trajectory
 
 Writer = Callable[[Path], Path]
 

@@ -10,10 +10,11 @@ import pytest
 from tiny_phantom import FRAMES, with_true_depth
 
 from scopemap.config import Config
-from scopemap.datasets import Sequence, open_sequence
 from scopemap.depth.anchor import reach_mm
 from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 from scopemap.runner import reconstruct

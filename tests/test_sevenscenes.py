@@ -10,9 +10,9 @@ import pytest
 from drawn_inputs import number_in, poses, write_sevenscenes
 
 from scopemap.config import DepthSettings
-from scopemap.datasets import open_sequence
 from scopemap.depth import create_depth
 from scopemap.frame import Frame
+from scopemap.io.opening import open_sequence
 
 
 def test_sevenscenes_bring_depth_and_poses_to_the_colour_camera(tmp_path: Path) -> None:

@@ -13,13 +13,13 @@ import pytest
 from drawn_videos import encode
 from tiny_phantom import only_images, write_tiny
 
-from scopemap.calibration import write_calibration
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cli import main
 from scopemap.config import Config
-from scopemap.datasets import SourceFrame
-from scopemap.datasets.frame_choice import FrameChoice
-from scopemap.trajectory import read_trajectory
+from scopemap.io.frame_choice import FrameChoice
+from scopemap.io.sequence import SourceFrame
+from scopemap.trajectory.formats.opening import read_trajectory
 
 FAST = ("--preset", "realtime", "--quiet")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from scopemap.config import SmoothingSettings
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, se3_exp, so3_exp
-from scopemap.odometry.smoothing import NoSmoothing, Wema, create_smoother
+from scopemap.tracking.smoothing import NoSmoothing, Wema, create_smoother
 
 ALPHA, BETA, GAMMA = 0.5, 0.3, 0.2
 

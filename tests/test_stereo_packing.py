@@ -13,7 +13,7 @@ from drawn_clips import circle, inside, tissue
 from drawn_inputs import picture
 from drawn_videos import HEIGHT, WIDTH, above, above_squeezed, beside, beside_squeezed, stereo
 
-from scopemap.pictures.stereo_packing import Packing, packing, squeezed_views, suspected
+from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
 
 NUMBERS = range(0, 40, 5)
 Draw = Callable[[int], np.ndarray]

@@ -8,17 +8,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from scopemap.config import OdometrySettings
+from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.odometry import Tracker
-from scopemap.odometry.pyramid import build_pyramid
-from scopemap.odometry.rtdl import align
 from scopemap.phantom import PhantomSpec, prepare, render_frame
+from scopemap.tracking import Tracker
+from scopemap.tracking.pyramid import build_pyramid
+from scopemap.tracking.rtdl import align
 
 SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
 # By what is seen alone: measured depth of the frames would hide what these tests look at.
-SETTINGS = OdometrySettings(finest_level=0, depth_share=0.0)
+SETTINGS = TrackingSettings(finest_level=0, depth_share=0.0)
 
 
 @cache
@@ -38,7 +38,7 @@ def _errors(T_estimated: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(rotation_angle_rad(difference[:3, :3])))
 
 
-def _track_all(settings: OdometrySettings, frames: list[Frame]) -> list[np.ndarray]:
+def _track_all(settings: TrackingSettings, frames: list[Frame]) -> list[np.ndarray]:
     tracker, poses = Tracker(settings), []
     for frame in frames:
         track = tracker.track(frame)
@@ -173,7 +173,7 @@ def test_a_keyframe_without_depth_is_refused() -> None:
 
 def test_pyramid_sizes_cameras_and_masks() -> None:
     frames, _ = _sequence()
-    views = build_pyramid(frames[0], OdometrySettings(levels=9, finest_level=1, min_side_px=16))
+    views = build_pyramid(frames[0], TrackingSettings(levels=9, finest_level=1, min_side_px=16))
     assert [view.weight.shape for view in views] == [(64, 80), (32, 40), (16, 20)]
     # A ray through a point keeps its direction at every level: x = (u - cx) / fx.
     for view in views:
@@ -207,7 +207,7 @@ def test_lamp_explains_the_dimming_of_a_facing_wall() -> None:
     """A wall of one colour lit by the camera's lamp: with the lamp modelled, moving back leaves no residual."""
     frames, _ = _sequence()
     camera = frames[0].camera
-    from scopemap.odometry.residuals import Loss, residual_images
+    from scopemap.tracking.residuals import Loss, residual_images
 
     def wall(distance_mm: float) -> Frame:
         length = distance_mm * np.linalg.norm(camera.rays, axis=-1)
@@ -218,7 +218,7 @@ def test_lamp_explains_the_dimming_of_a_facing_wall() -> None:
         depth = np.full(grey.shape, distance_mm, np.float32)
         return Frame(0, 0.0, rgb, camera, np.ones(grey.shape, bool), depth)
 
-    settings = OdometrySettings(finest_level=0, channels="grey")
+    settings = TrackingSettings(finest_level=0, channels="grey")
     near, far = (build_pyramid(wall(d), settings, trust_slope=True)[0] for d in (30.0, 36.0))
     back = se3_exp(np.array([0, 0, 0, 0, 0, 6.0]))
     sizes = {}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from training.losses import Weights, loss_parts, total
 
 

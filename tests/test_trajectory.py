@@ -10,7 +10,8 @@ from sample_trajectories import write_c3vd, write_run
 
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory, write_kitti, write_tum
 
 
 @pytest.fixture

@@ -12,16 +12,16 @@ import pytest
 import trimesh
 from tiny_phantom import write_tiny
 
-from scopemap.camera import PinholeCamera
-from scopemap.datasets import open_sequence
-from scopemap.datasets.c3vd import CAMERA
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.evaluation.surface import compare_surfaces, surface_figures
 from scopemap.evaluation.true_surface import SingleView, TrueSurface, measure_surface, read_true_surface
 from scopemap.evaluation.visibility import View, pixels_near, seen_samples, visible_from
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.io.datasets.c3vd import CAMERA
+from scopemap.io.opening import open_sequence
 from scopemap.phantom import PhantomSpec, write_phantom
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)
 

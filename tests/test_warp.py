@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, se3, se3_exp, transform
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 

@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from scopemap import checkpoints, weights
-from scopemap.checkpoints import REGISTRY, Checkpoint, find
 from scopemap.cli import models
-from scopemap.device import choose_device
 from scopemap.errors import SettingsError, WeightsError
+from scopemap.io import checkpoints, weights
+from scopemap.io.checkpoints import REGISTRY, Checkpoint, find
+from scopemap.io.device import choose_device
 
 CONTENT = b"not really a network"
 TOY = Checkpoint(

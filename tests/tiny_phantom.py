@@ -10,7 +10,7 @@ import numpy as np
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse
 from scopemap.phantom import PhantomSpec, parse_events, write_phantom
-from scopemap.trajectory import read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
 
 FRAMES = 9
 SIZE = (160, 128)
@@ -23,7 +23,7 @@ def write_tiny(folder: Path, events: str = "", frames: int = FRAMES) -> Path:
 
 
 def with_true_depth(folder: Path, preset: str = "default", **changes: object) -> Config:
-    """Settings that take the depth of `folder`; `odometry__huber=2` is odometry.huber=2."""
+    """Settings that take the depth of `folder`; `tracking__huber=2` is tracking.huber=2."""
     given = {key.replace("__", "."): value for key, value in changes.items()}
     return Config.load(preset, settings={"depth.backend": f"files:{folder}", **given})  # type: ignore[arg-type]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
 from scopemap.depth.scopenet.planes import input_planes
 from scopemap.frame import Frame
-from scopemap.masking import Masker
+from scopemap.masking.masker import Masker
 from training.buffers import Buffers, Store, thinned
 from training.light import INSTRUMENT, draw_light, shade
 from training.sensor import take_picture

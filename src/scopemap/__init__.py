@@ -16,12 +16,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from scopemap.config import Config
-    from scopemap.datasets import open_sequence
     from scopemap.errors import ScopemapError
     from scopemap.frame import Frame, Truth
+    from scopemap.io.opening import open_sequence
     from scopemap.reconstruction import Reconstruction
     from scopemap.runner import reconstruct
-    from scopemap.trajectory import Trajectory, read_trajectory
+    from scopemap.trajectory.formats.opening import read_trajectory
+    from scopemap.trajectory.trajectory import Trajectory
 
 __version__ = version("scopemap")
 __all__ = [
@@ -42,10 +43,10 @@ _HOMES = {
     "Frame": "frame",
     "Reconstruction": "reconstruction",
     "ScopemapError": "errors",
-    "Trajectory": "trajectory",
+    "Trajectory": "trajectory.trajectory",
     "Truth": "frame",
-    "open_sequence": "datasets",
-    "read_trajectory": "trajectory",
+    "open_sequence": "io.opening",
+    "read_trajectory": "trajectory.formats.opening",
     "reconstruct": "runner",
 }
 

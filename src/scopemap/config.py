@@ -1,6 +1,6 @@
 """Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
 
-Order of precedence: defaults < preset < TOML file < single settings (`--set odometry.huber=2`); the preset itself may
+Order of precedence: defaults < preset < TOML file < single settings (`--set tracking.huber=2`); the preset itself may
 be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282;
 it publishes none of its constants (section "WEMA-RTDL"), so values are ours: those of the tracker were chosen by trial
 on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that
@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from scopemap.errors import SettingsError
-from scopemap.presets import PRESETS
 
 Preset = Literal["paper", "default", "realtime"]
 
@@ -172,7 +171,7 @@ class NetworkSettings(Settings):
     device: str = Field("auto", description="auto | cpu | cuda")
 
 
-class OdometrySettings(Settings):
+class TrackingSettings(Settings):
     """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
 
     keyframe_every: int = Field(
@@ -262,7 +261,7 @@ class SmoothingSettings(Settings):
         return self
 
 
-class BackendSettings(Settings):
+class MappingSettings(Settings):
     """Adjustment of all keyframes together, once the last frame is tracked."""
 
     method: Literal["none", "full"] = Field(
@@ -294,7 +293,7 @@ class BackendSettings(Settings):
 
 
 class FusionSettings(Settings):
-    """Volumetric fusion. Sizes that are not set follow the scene: see `scopemap.fusion.sizes`."""
+    """Volumetric fusion. Sizes that are not set follow the scene: see `scopemap.fusion.tsdf_parameters`."""
 
     enabled: bool = True
     voxel_mm: float | None = Field(None, ge=0.01, description="by default from the clip's median depth")
@@ -309,6 +308,56 @@ class FusionSettings(Settings):
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
 
 
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "input.focal": "assume",
+        "input.skip_duplicates": False,
+        "mask.overlays": False,
+        "depth.backend": "depth-anything",
+        "depth.anchor": "depth-pro",
+        "depth.fit_shift": False,
+        "mapis.order": "refine-first",
+        "mapis.frame_scale": "none",
+        "mapis.blend": "linear",
+        "mapis.recursive": False,
+        "mapis.compare_warped": False,
+        "mapis.perceptual_score": True,
+        "networks.flow": "raft-large",
+        "networks.perceptual": "lpips",
+        "tracking.keyframe_every": 2,
+        "tracking.keyframe_agreement": 0.0,
+        "tracking.finest_level": 0,
+        "tracking.channels": "grey",
+        "tracking.lamp_gamma": 0.0,
+        "tracking.gain_bias": False,
+        "tracking.depth_share": 0.0,
+        "tracking.flow_contradiction": 0.0,
+        "tracking.corner_depth_share": 0.0,
+        "tracking.least_detail": 0.0,
+        "tracking.min_correlation": -1.0,
+        "tracking.remembered_keyframes": 0,
+        "tracking.new_map_after": 0,
+        "tracking.start": "identity",
+        "smoothing.method": "wema",
+        "mapping.method": "none",
+        "fusion.voxel_mm": 1.0,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+    },
+    "realtime": {
+        "networks.flow": "dis",
+        "networks.perceptual": "structure",
+        "tracking.max_iterations": 15,
+        "fusion.voxel_mm": 1.5,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+        "fusion.every": 2,
+        "mapping.method": "none",
+    },
+}
+
+
 class Config(Settings):
     """All settings of a run."""
 
@@ -318,9 +367,9 @@ class Config(Settings):
     depth: DepthSettings = DepthSettings()
     mapis: MapisSettings = MapisSettings()
     networks: NetworkSettings = NetworkSettings()
-    odometry: OdometrySettings = OdometrySettings()
+    tracking: TrackingSettings = TrackingSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
-    backend: BackendSettings = BackendSettings()
+    mapping: MappingSettings = MappingSettings()
     fusion: FusionSettings = FusionSettings()
 
     @classmethod
@@ -329,7 +378,7 @@ class Config(Settings):
     ) -> Config:
         """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
 
-        `settings` maps names such as "odometry.huber" to values or to their text. The preset is the one that they
+        `settings` maps names such as "tracking.huber" to values or to their text. The preset is the one that they
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 
 TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "predicted"]

@@ -17,30 +17,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import trimesh
 
-from scopemap.backend import Backend, Correction, Seat
 from scopemap.config import Config, DepthSettings, FusionSettings
-from scopemap.datasets import Sequence
-from scopemap.depth import (
-    AnchoredDepth,
-    DepthEstimator,
-    DepthKind,
-    create_anchor,
-    create_depth,
-    files_folder,
-    reach_mm,
-)
+from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, files_folder, reach_mm
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
+from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
 from scopemap.flow import CornerFollower, DisFlow, FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Frame, SeenAgain
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
-from scopemap.mask_files import MaskFiles, create_masks
-from scopemap.masking import Masker
-from scopemap.odometry import FrameTracker, Track, Tracker, create_smoother
-from scopemap.perceptual import PerceptualDistance, create_perceptual
-from scopemap.pictures.constant import is_constant
+from scopemap.io.sequence import Sequence
+from scopemap.io.video_format.constant import is_constant
+from scopemap.mapping import Backend, Correction, Seat
+from scopemap.masking.mask_files import MaskFiles, create_masks
+from scopemap.masking.masker import Masker
+from scopemap.tracking import FrameTracker, Track, Tracker, create_smoother
 
 
 @dataclass(frozen=True)
@@ -156,27 +148,27 @@ class Fused:
 class Pipeline:
     """One run over one sequence; frames go through `perceive` and `step` in order, each once.
 
-    `tracker` takes the place of ours, which `config.odometry` describes: for baselines and others' odometry.
+    `tracker` takes the place of ours, which `config.tracking` describes: for baselines and others' odometry.
     """
 
     def __init__(self, config: Config, estimators: Estimators, tracker: FrameTracker | None = None) -> None:
         self.config = config
         self.estimators = estimators
         self._masker = Masker(config.mask, estimators.masks)
-        waits = config.backend.method == "full" or follows_scene(config.fusion) or not config.fusion.enabled
+        waits = config.mapping.method == "full" or follows_scene(config.fusion) or not config.fusion.enabled
         # Frames that are fused as they come cannot be sorted into maps at the end.
-        own = config.odometry if waits else config.odometry.model_copy(update={"new_map_after": 0})
+        own = config.tracking if waits else config.tracking.model_copy(update={"new_map_after": 0})
         self._tracker = tracker or Tracker(own)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self._backend = Backend(config.backend) if config.backend.method == "full" else None
+        self._backend = Backend(config.mapping) if config.mapping.method == "full" else None
         self._volume = None if waits else TsdfVolume(config.fusion)
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
         self._last: Track | None = None
         self._last_mm: np.ndarray | None = None
         self._fusable = 0
-        follows = tracker is None and config.odometry.corner_depth_share > 0 and estimators.flow.name != "none"
+        follows = tracker is None and config.tracking.corner_depth_share > 0 and estimators.flow.name != "none"
         self._corners = CornerFollower(DisFlow(), config.mapis.consistency_px) if follows else None
         self._seats: dict[int, Seat] = {}
         self._losses = 0
@@ -187,7 +179,7 @@ class Pipeline:
         if is_constant(frame.rgb):
             frame = replace(frame, valid=np.zeros_like(frame.valid))
         # A frame that the tracker is going to refuse must not fix the scale of the depth.
-        usable = frame.valid.mean() >= self.config.odometry.min_valid_share
+        usable = frame.valid.mean() >= self.config.tracking.min_valid_share
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
         raw = self.estimators.anchor.metric(estimate, shown)

@@ -20,16 +20,16 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.backend import Correction
-from scopemap.calibration import write_calibration
-from scopemap.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
-from scopemap.datasets import SkippedFrame
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import save_mesh
-from scopemap.odometry import Track
+from scopemap.io.frame_choice import SkippedFrame
+from scopemap.mapping import Correction
 from scopemap.pipeline import Step
-from scopemap.trajectory import SKIPPED, Trajectory, write_tum
+from scopemap.tracking import Track
+from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
 """The finest step of depth/*.png, which reaches 655 mm."""

@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.backend import LARGEST_LOG_FACTOR
+from scopemap.calibration.focal_length import with_focal_from_motion
 from scopemap.config import Config, FusionSettings
-from scopemap.datasets import Sequence
 from scopemap.depth import DepthEstimator
-from scopemap.depth_range import described, fit_exponent, with_exponent
+from scopemap.depth.power_law_fit import described, fit_exponent, with_exponent
 from scopemap.errors import InputError
-from scopemap.focal import with_focal_from_motion
-from scopemap.odometry import FrameTracker
-from scopemap.pictures.constant import is_constant
+from scopemap.io.sequence import Sequence
+from scopemap.io.video_format.constant import is_constant
+from scopemap.mapping import LARGEST_LOG_FACTOR
 from scopemap.pipeline import Estimators, Fused, Percept, Piece, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder
+from scopemap.tracking import FrameTracker
 
 Observer = Callable[[Step], None]
 _VERSIONS = (
@@ -54,8 +54,8 @@ def reconstruct(
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
     observers : called with each `Step` as it is done, its pose and depth as tracked: a back end has not spoken yet.
-    tracker : odometry that takes the place of ours; None: as `config.odometry` says. Its keyframes are adjusted, too,
-        unless `config.backend.method` is "none".
+    tracker : odometry that takes the place of ours; None: as `config.tracking` says. Its keyframes are adjusted, too,
+        unless `config.mapping.method` is "none".
 
     The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there, and so
     is the size of the voxels.
@@ -200,8 +200,8 @@ def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
 
 def _most_depth_mm(config: Config, estimators: Estimators) -> float:
     """How far depth may reach, mm, with room for what a back end may make of it (three deviations of the scale)."""
-    bent = LARGEST_LOG_FACTOR if config.backend.depth_step_sigma > 0 else 0.0
-    room = 1.0 if config.backend.method == "none" else math.exp(3 * config.backend.scale_sigma + bent)
+    bent = LARGEST_LOG_FACTOR if config.mapping.depth_step_sigma > 0 else 0.0
+    room = 1.0 if config.mapping.method == "none" else math.exp(3 * config.mapping.scale_sigma + bent)
     return estimators.reach_mm(config.depth, room)
 
 

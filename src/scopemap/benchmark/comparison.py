@@ -17,10 +17,11 @@ from scopemap.benchmark.result import FILE_NAME, RunResult
 from scopemap.benchmark.scoring import default_protocol, pose_groups, score
 from scopemap.benchmark.truth import open_truth
 from scopemap.benchmark.worker import RUN
-from scopemap.datasets import Sequence as Frames
-from scopemap.datasets.reference import read_reference
 from scopemap.errors import InputError
-from scopemap.trajectory import Trajectory, Unit, read_trajectory
+from scopemap.io.datasets.reference import read_reference
+from scopemap.io.sequence import Sequence as Frames
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory, Unit
 
 
 def compared(

@@ -13,8 +13,9 @@ from pydantic import BaseModel, ConfigDict
 
 from scopemap.benchmark.plan import MethodPlan, Plan, ProtocolPlan, SequencePlan, folder_name, spec_of
 from scopemap.config import Config
-from scopemap.datasets import Sequence, open_sequence
 from scopemap.errors import SettingsError
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
 
 FILE_NAME = "entry.json"
 
@@ -136,7 +137,7 @@ def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out
 
 def render_phantom(entry: Entry) -> None:
     """Render the phantom of an entry, unless an earlier row did so."""
-    from scopemap.demonstration import is_rendered
+    from scopemap.benchmark.demonstration import is_rendered
     from scopemap.phantom import write_phantom
 
     if entry.sequence.phantom is None:

@@ -24,7 +24,7 @@ method_sets = ["odometries"]    # methods that come with scopemap; more can foll
 
 [[method]]
 name = "ours, Gauss-Newton"
-settings = { "odometry.solver" = "gauss-newton" }
+settings = { "tracking.solver" = "gauss-newton" }
 
 [[method]]
 name = "Park"
@@ -44,12 +44,12 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from scopemap.config import Config, Preset, explain
-from scopemap.datasets import DATASETS
 from scopemap.errors import InputError, ScopemapError, SettingsError
 from scopemap.evaluation.depth import DepthScaling
 from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.flow import FLOWS
 from scopemap.geometry.align import AlignMode
+from scopemap.io.opening import DATASETS
 from scopemap.phantom import PhantomSpec, parse_events
 
 _PLANS, _METHOD_SETS = "plans", "method_sets"

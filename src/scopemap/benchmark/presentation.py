@@ -20,15 +20,15 @@ from scopemap.benchmark.result import RunResult
 from scopemap.benchmark.summary import Summary, summarise
 from scopemap.benchmark.tables import write_tables
 from scopemap.config import MaskSettings
-from scopemap.datasets import Sequence as Frames
-from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.image_link import ImageLinker
 from scopemap.evaluation.orb import displacements
 from scopemap.evaluation.poses import MatchedTrajectories, match
 from scopemap.frame import Frame, Truth
 from scopemap.geometry.align import AlignMode
-from scopemap.masking import Masker
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.sequence import Sequence as Frames
+from scopemap.masking.masker import Masker
 from scopemap.reconstruction import DepthReader
 from scopemap.report.benchmark_figures import (
     BarGrid,
@@ -40,7 +40,7 @@ from scopemap.report.benchmark_figures import (
 )
 from scopemap.report.depth_panels import DepthScene, draw_depth_differences
 from scopemap.report.reconstruction_view import draw_reconstruction
-from scopemap.trajectory import read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
 
 _MOST_DEPTHS = 6
 _WORLD = {"reference": "world, true poses", "estimated": "world, own poses"}

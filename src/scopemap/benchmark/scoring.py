@@ -14,8 +14,6 @@ from scopemap.benchmark.flow_store import FlowStore
 from scopemap.benchmark.plan import ProtocolPlan
 from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import MaskSettings
-from scopemap.datasets import Sequence, open_sequence
-from scopemap.datasets.reference import reference_trajectory
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
 from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthScaling
@@ -27,9 +25,13 @@ from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
 from scopemap.flow import create_flow
 from scopemap.geometry.align import AlignMode, Similarity
-from scopemap.masking import Masker
+from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.opening import open_sequence
+from scopemap.io.sequence import Sequence
+from scopemap.masking.masker import Masker
 from scopemap.reconstruction import DepthReader
-from scopemap.trajectory import Trajectory, read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 Figures = dict[str, dict[str, Any]]
 _RAFT_ITERATIONS = 12

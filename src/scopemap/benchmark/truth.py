@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 from scopemap.config import Config, InputSettings
-from scopemap.datasets import Sequence, open_sequence, open_source
-from scopemap.datasets.prepared import OF_UNKNOWN_VIEWS
 from scopemap.errors import CalibrationError, InputError, SettingsError
+from scopemap.io.opening import open_sequence, open_source
+from scopemap.io.prepared import OF_UNKNOWN_VIEWS
+from scopemap.io.sequence import Sequence
 
 _SAME_CAMERA_PX = 0.01
 

@@ -21,8 +21,8 @@ from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.result import RunResult
 from scopemap.benchmark.scoring import score
-from scopemap.datasets import Sequence
 from scopemap.errors import ScopemapError
+from scopemap.io.sequence import Sequence
 
 RUN = "run"
 

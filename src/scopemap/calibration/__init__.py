@@ -1,19 +1,17 @@
-"""Calibration files: whatever form they have, told by their content, one camera comes out; one form is written.
+"""Calibration of a camera with a checkerboard or a ChArUco board: find, select, fit, judge, draw."""
 
-Each form has a file of its own. They raise `ValueError` with what is wrong; `reading` says which file it was.
-"""
-
-from scopemap.calibration.fitting import fitted, fitted_to, rescaled_note
-from scopemap.calibration.reading import read_calibration, stated_calibration
-from scopemap.calibration.stated import Calibration
-from scopemap.calibration.writing import write_calibration
+from scopemap.calibration.calibrating import BoardCalibration, calibrate, save_calibration
+from scopemap.calibration.targets import Board, CharucoBoard, Checkerboard
+from scopemap.calibration.views import Search, find_views, picture_of
 
 __all__ = [
-    "Calibration",
-    "fitted",
-    "fitted_to",
-    "read_calibration",
-    "rescaled_note",
-    "stated_calibration",
-    "write_calibration",
+    "Board",
+    "BoardCalibration",
+    "CharucoBoard",
+    "Checkerboard",
+    "Search",
+    "calibrate",
+    "find_views",
+    "picture_of",
+    "save_calibration",
 ]

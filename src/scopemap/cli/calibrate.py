@@ -21,7 +21,7 @@ from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from scopemap.boards import Board, BoardCalibration
+    from scopemap.calibration import Board, BoardCalibration
     from scopemap.config import InputSettings
 
 _ENDINGS = (".yaml", ".yml")
@@ -80,9 +80,9 @@ def calibrate(
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
     selection, reading = parse_slice(frames) if frames else None, _reading(settings or [])
     # Imported here, so that --help does not wait for it.
-    from scopemap import boards
-    from scopemap.boards.picture import draw_calibration
-    from scopemap.datasets import open_source
+    from scopemap import calibration as boards
+    from scopemap.calibration.picture import draw_calibration
+    from scopemap.io.opening import open_source
 
     silent = quiet or as_json
     pictures = open_source(source, dataset=dataset, settings=reading)
@@ -132,7 +132,7 @@ def _reading(pairs: list[str]) -> InputSettings:
 def _board(
     text: str, square_mm: float, *, charuco: bool, marker_mm: float | None, dictionary: str | None, legacy: bool
 ) -> Board:
-    from scopemap.boards import CharucoBoard, Checkerboard
+    from scopemap.calibration import CharucoBoard, Checkerboard
 
     match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", text)
     if not match:

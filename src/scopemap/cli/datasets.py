@@ -21,7 +21,7 @@ from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
 
 if TYPE_CHECKING:
-    from scopemap.datasets.checking import Finding
+    from scopemap.io.datasets.checking import Finding
 
 app = typer.Typer(help="Data sets: list what is read, check one.", no_args_is_help=True)
 
@@ -32,7 +32,7 @@ _ASKED = "Whether "
 @app.command("list")
 def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the data sets that are read, in the order in which they are recognised."""
-    from scopemap.datasets import DATASETS
+    from scopemap.io.opening import DATASETS
 
     # A reader's module says what the data set is, its `recognises` what it is told by; nothing is kept in two places.
     rows = [
@@ -68,10 +68,10 @@ def check(
 ) -> None:
     """Read a data set once and say what is wrong with its frames, camera, poses and depth; exit code 1 with errors."""
     from scopemap.config import Config
-    from scopemap.datasets import open_sequence
-    from scopemap.datasets.checking import check as findings_of
-    from scopemap.datasets.checking import refusal
-    from scopemap.datasets.survey import survey
+    from scopemap.io.datasets.checking import check as findings_of
+    from scopemap.io.datasets.checking import refusal
+    from scopemap.io.datasets.survey import survey
+    from scopemap.io.opening import open_sequence
 
     figures: dict[str, Any] = {}
     # Pictures that repeat are to be found here, not left out.

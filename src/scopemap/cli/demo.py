@@ -15,7 +15,7 @@ from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress, run_progress
 
 if TYPE_CHECKING:
-    from scopemap.demonstration import Figures
+    from scopemap.benchmark.demonstration import Figures
 
 
 def demo(
@@ -33,7 +33,7 @@ def demo(
     silent = quiet or as_json
     _tell("preparing a phantom colon; the first time kernels are compiled, too", silent)
     # Imported here, so that --help does not wait for the kernels.
-    from scopemap import demonstration
+    from scopemap.benchmark import demonstration
 
     started = time.perf_counter()
     config = demonstration.demo_config(parse_settings(settings or []))

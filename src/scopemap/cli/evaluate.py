@@ -14,9 +14,9 @@ from scopemap.cli.options import AsJson
 from scopemap.errors import CalibrationError, InputError, SettingsError
 
 if TYPE_CHECKING:
-    from scopemap.datasets import Sequence
     from scopemap.evaluation.poses import MatchedTrajectories
-    from scopemap.trajectory import Trajectory
+    from scopemap.io.sequence import Sequence
+    from scopemap.trajectory.trajectory import Trajectory
 
 # Below this ratio of singular values the rotation about the path is hardly fixed by it.
 _WEAK_LINE_RATIO = 1e-3
@@ -109,10 +109,10 @@ def evaluate(
     """
     if as_json and as_csv:
         raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
-    from scopemap.datasets.reference import read_reference
     from scopemap.evaluation.paper import paper_report
     from scopemap.evaluation.poses import match, pose_report
-    from scopemap.trajectory import read_trajectory
+    from scopemap.io.datasets.reference import read_reference
+    from scopemap.trajectory.formats.opening import read_trajectory
 
     form = OutputForm.JSON if as_json else OutputForm.CSV if as_csv else OutputForm.LINE if quiet else OutputForm.TABLE
     estimate = read_trajectory(trajectory, unit=unit.value, kind=kind)
@@ -142,7 +142,7 @@ def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp
         return {}
     from scopemap.benchmark.scoring import surface_figures_of
     from scopemap.benchmark.truth import open_truth
-    from scopemap.datasets import open_sequence
+    from scopemap.io.opening import open_sequence
 
     try:
         place: Sequence | Path = open_sequence(truth)

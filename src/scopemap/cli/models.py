@@ -9,9 +9,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from scopemap import weights
 from scopemap.cli.options import AsJson, Quiet
 from scopemap.errors import WeightsError
+from scopemap.io import weights
 
 app = typer.Typer(help="Weights of the networks: list, pull, verify.", no_args_is_help=True)
 

@@ -13,7 +13,7 @@ from scopemap.errors import SettingsError
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
 SetPairs = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as odometry.huber=2.")
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.huber=2.")
 ]
 
 
@@ -47,7 +47,7 @@ def parse_settings(pairs: list[str]) -> dict[str, Any]:
     for pair in pairs:
         key, found, value = pair.partition("=")
         if not found:
-            raise SettingsError(f"cannot read the setting '{pair}': expected KEY=VALUE such as odometry.huber=2")
+            raise SettingsError(f"cannot read the setting '{pair}': expected KEY=VALUE such as tracking.huber=2")
         try:
             settings[key] = json.loads(value)
         except json.JSONDecodeError:

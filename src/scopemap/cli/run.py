@@ -133,7 +133,7 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
     resolved = Config.load(preset.value if preset else None, config, chosen)
 
-    from scopemap.datasets import open_sequence
+    from scopemap.io.opening import open_sequence
     from scopemap.runner import reconstruct
 
     sequence = open_sequence(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth, reach_mm
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.errors import SettingsError
-from scopemap.rectification import Rectifier
 
 __all__ = [
     "AnchoredDepth",

@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from scopemap.config import DepthSettings
-from scopemap.depth.baseline import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
-from scopemap.depth.exponent import ray_lengths, stretched
+from scopemap.depth.power_law import ray_lengths, stretched
+from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 

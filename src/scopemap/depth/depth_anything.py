@@ -8,8 +8,8 @@ import numpy as np
 
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.pretrained import load_pretrained
-from scopemap.device import choose_device
 from scopemap.frame import Frame
+from scopemap.io.device import choose_device
 
 if TYPE_CHECKING:
     from transformers import DepthAnythingForDepthEstimation, DPTImageProcessor

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.pretrained import load_pretrained
-from scopemap.device import choose_device
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
+from scopemap.io.device import choose_device
 
 if TYPE_CHECKING:
     from transformers import DepthProForDepthEstimation, DepthProImageProcessor

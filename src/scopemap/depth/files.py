@@ -15,12 +15,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
-from scopemap.decoding import read_decoded
 from scopemap.depth.estimate import DepthEstimate, DepthKind
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.rectification import Rectifier
+from scopemap.io.decoding import read_decoded
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MapisSettings
 from scopemap.depth.estimate import DepthKind
 from scopemap.errors import check_shape

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from scopemap import weights
-from scopemap.checkpoints import REGISTRY
 from scopemap.errors import WeightsError
+from scopemap.io import weights
+from scopemap.io.checkpoints import REGISTRY
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel

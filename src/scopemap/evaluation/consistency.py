@@ -22,15 +22,9 @@ from typing import Literal
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError, check_shape
-from scopemap.evaluation.depth_change import (
-    DepthChange,
-    alignment_errors,
-    depth_change,
-    mean_change,
-    seen_from,
-)
+from scopemap.evaluation.depth_change import DepthChange, alignment_errors, depth_change, mean_change, seen_from
 from scopemap.evaluation.depth_sequence import ScaleJitter, depth_scale, scale_jitter
 from scopemap.evaluation.image_link import ImageLink
 from scopemap.evaluation.orb import DisplacementSummary, displacements

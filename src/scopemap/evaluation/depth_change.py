@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import moved_depth, pull

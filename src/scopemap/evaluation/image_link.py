@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.evaluation.depth_change import looks_alike
 from scopemap.evaluation.orb import Matches, OrbFeatures, match_features, orb_features

@@ -23,7 +23,7 @@ from scopemap.evaluation.pose_errors import (
     translation_errors_mm,
 )
 from scopemap.geometry.align import AlignMode, Similarity, align_trajectories
-from scopemap.trajectory import Trajectory, path_length_mm
+from scopemap.trajectory.trajectory import Trajectory, path_length_mm
 
 Association = Literal["auto", "index", "time"]
 MIN_MATCHED = 3

@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scopemap.camera import CameraModel
-from scopemap.decoding import read_decoded
+from scopemap.cameras.camera import CameraModel
 from scopemap.errors import InputError, check_shape
 from scopemap.evaluation.registration import refine
 from scopemap.evaluation.surface import (
@@ -36,6 +35,7 @@ from scopemap.evaluation.surface import (
     surface_points,
 )
 from scopemap.evaluation.visibility import View, pixels_near, seen_samples, visible_from
+from scopemap.io.decoding import read_decoded
 
 _PHANTOM, _PHANTOM_FRAMES = "mesh_truth.ply", "mesh_truth"
 # The second is the name that the data set's page gives.

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.camera import CameraModel
+from scopemap.cameras.camera import CameraModel
 from scopemap.errors import check_shape
 from scopemap.evaluation.surface import Surface, small_triangles
 from scopemap.geometry.se3 import inverse, transform

@@ -1,6 +1,5 @@
 """Image pair to optical flow: a contract, estimators behind it, and what both directions together tell."""
 
-from scopemap import weights
 from scopemap.errors import SettingsError
 from scopemap.flow.consistency import Flow, agree, pair_flow
 from scopemap.flow.dis import DisFlow
@@ -8,6 +7,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.flow.follow import CornerFollower
 from scopemap.flow.none import NoFlow
 from scopemap.flow.raft import CHECKPOINTS, RaftFlow
+from scopemap.io import weights
 
 __all__ = [
     "CornerFollower",

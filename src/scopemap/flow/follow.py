@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scopemap.flow.corners import corners, followed
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, SeenAgain
-from scopemap.geometry.corners import corners, followed
 
 _CELL_PX = 12
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from scopemap import weights
-from scopemap.device import choose_device
 from scopemap.errors import WeightsError, check_shape
 from scopemap.flow.estimator import FlowEstimator
+from scopemap.io import weights
+from scopemap.io.device import choose_device
 
 if TYPE_CHECKING:
     import torch

@@ -10,7 +10,6 @@ import trimesh
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion.blocks import VoxelBlocks
-from scopemap.fusion.sizes import Sizes, choose_sizes
 from scopemap.fusion.surface import extract_surface
 from scopemap.fusion.tsdf import (
     BLOCK,
@@ -22,6 +21,7 @@ from scopemap.fusion.tsdf import (
     touched_blocks,
     unpack,
 )
+from scopemap.fusion.tsdf_parameters import Sizes, choose_sizes
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.uncertainty import depth_trust
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from scopemap.field_of_view import hull_of_largest
 from scopemap.inspection.finding import Finding
 from scopemap.inspection.view import View
-from scopemap.overlays import OverlayFinder
+from scopemap.masking.field_of_view import hull_of_largest
+from scopemap.masking.overlays import OverlayFinder
 
 _MARGIN_SHARE, _NEAR_PX, _BLACK_PX = 0.02, 3, 9
 _JOIN_SHARE = 0.02

@@ -8,9 +8,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from scopemap.field_of_view import hull_of_largest
 from scopemap.inspection.finding import Finding
 from scopemap.inspection.view import View
+from scopemap.masking.field_of_view import hull_of_largest
 
 Shape = Literal["full", "bars", "circle", "cut corners", "rounded corners"]
 

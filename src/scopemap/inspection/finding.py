@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from scopemap.datasets import checking
+from scopemap.io.datasets import checking
 
 _NAMED = 4
 

@@ -12,10 +12,6 @@ from typing import Any
 import numpy as np
 
 from scopemap.config import InputSettings
-from scopemap.datasets import Sequence, Source, open_sequence, open_source
-from scopemap.datasets.prepared import UNKNOWN_MAKE
-from scopemap.datasets.rosbag import RosBag
-from scopemap.datasets.video import VideoFile
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
 from scopemap.inspection.blank import check_blank
@@ -32,7 +28,12 @@ from scopemap.inspection.packed import interlacing_findings, stereo_findings
 from scopemap.inspection.repeats import check_repeats, repeated
 from scopemap.inspection.timing import check_timing
 from scopemap.inspection.view import View, Viewer
-from scopemap.pictures.stereo_packing import Packing, packing
+from scopemap.io.datasets.rosbag import RosBag
+from scopemap.io.opening import open_sequence, open_source
+from scopemap.io.prepared import UNKNOWN_MAKE
+from scopemap.io.sequence import Sequence, Source
+from scopemap.io.video import VideoFile
+from scopemap.io.video_format.stereo_packing import Packing, packing
 
 _KEPT = 8
 # What stereo packing is told from: pictures from all parts of a video, else every tenth of the beginning.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.inspection.finding import Finding
-from scopemap.pictures.interlacing import is_interlaced
-from scopemap.pictures.stereo_packing import Packing
+from scopemap.io.video_format.interlacing import is_interlaced
+from scopemap.io.video_format.stereo_packing import Packing
 
 
 def interlacing_findings(pictures: list[np.ndarray]) -> list[Finding]:

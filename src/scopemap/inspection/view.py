@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
-from scopemap.field_of_view import FieldOfView
 from scopemap.frame import Frame
 from scopemap.inspection.finding import Finding
-from scopemap.masking import Masker, is_lit, specular
-from scopemap.odometry.clarity import detail_of
-from scopemap.pictures.constant import is_constant
-from scopemap.pictures.duplicates import LEAST_DIFFERENCE, difference
+from scopemap.io.video_format.constant import is_constant
+from scopemap.io.video_format.duplicates import LEAST_DIFFERENCE, difference
+from scopemap.masking.field_of_view import FieldOfView
+from scopemap.masking.masker import Masker, is_lit, specular
+from scopemap.tracking.sharpness import detail_of
 
 SMALL_PX = 320
 """Longer side of the small copies."""

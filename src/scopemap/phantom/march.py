@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.phantom.deformation import Displacement
 from scopemap.phantom.spline import inside, spline

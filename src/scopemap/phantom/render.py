@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import lumen_path, sweep_path
 from scopemap.phantom.cavity import laparoscopy_volume
@@ -17,7 +17,7 @@ from scopemap.phantom.shading import Look, develop, disturb, exposure_for, shade
 from scopemap.phantom.spec import DEFAULT_FRAMES, PhantomSpec
 from scopemap.phantom.texture import Appearance
 from scopemap.phantom.volume import Volume
-from scopemap.trajectory import read_poses
+from scopemap.trajectory.formats.text import read_poses
 
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import c3vd_line
 from scopemap.phantom.render import Phantom, prepare, render_surface

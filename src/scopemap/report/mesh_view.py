@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 _SIDE_PX = 480

@@ -16,10 +16,10 @@ only where the image or its overlap with the keyframe is nearly empty, or the re
 
 from __future__ import annotations
 
-from scopemap.config import OdometrySettings
-from scopemap.odometry import FrameTracker, Tracker
+from scopemap.config import TrackingSettings
+from scopemap.tracking import FrameTracker, Tracker
 
-SETTINGS = OdometrySettings(
+SETTINGS = TrackingSettings(
     keyframe_every=2,
     keyframe_agreement=0.0,
     levels=2,

@@ -12,7 +12,8 @@ from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.plan import MethodPlan
 from scopemap.errors import InputError, SettingsError
 from scopemap.evaluation.poses import associate
-from scopemap.trajectory import Trajectory, read_trajectory, write_tum
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory, write_tum
 
 
 class ImportedTrajectory:

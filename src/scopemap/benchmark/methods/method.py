@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from scopemap.datasets import Sequence
+from scopemap.io.sequence import Sequence
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
-from scopemap.odometry import FrameTracker, Track
+from scopemap.tracking import FrameTracker, Track
 
 UNIT_MM = 100.0
 """Length of one of Open3D's units, mm."""

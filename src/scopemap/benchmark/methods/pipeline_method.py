@@ -11,9 +11,9 @@ from typing import Any
 from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.methods.timed import TimedTracker
 from scopemap.config import Config, Preset
-from scopemap.odometry import FrameTracker
 from scopemap.pipeline import Step
 from scopemap.runner import reconstruct
+from scopemap.tracking import FrameTracker
 
 TrackerFactory = Callable[[Config], FrameTracker]
 

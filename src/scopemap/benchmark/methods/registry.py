@@ -13,14 +13,14 @@ from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.benchmark.plan import MethodPlan
 from scopemap.config import Config
 from scopemap.errors import SettingsError
-from scopemap.odometry import FrameTracker, Tracker
+from scopemap.tracking import FrameTracker, Tracker
 
 # Depth as it is and poses as tracked: consistency over time is a part of our method, not of the input that all share.
 PLAIN = {
     "mapis.frame_scale": "none",
     "mapis.blend": "none",
     "smoothing.method": "none",
-    "backend.method": "none",
+    "mapping.method": "none",
 }
 
 
@@ -39,7 +39,7 @@ def create_method(plan: MethodPlan, data: Path | None) -> Method:
 
 
 def _ours(config: Config) -> FrameTracker:
-    return Tracker(config.odometry)
+    return Tracker(config.tracking)
 
 
 def _open3d(title: str) -> TrackerFactory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.frame import Frame
-from scopemap.odometry import Track
+from scopemap.tracking import Track
 
 _LEAST_SHARE = 0.1  # of the image, as our own tracker asks by default
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from scopemap.frame import Frame
-from scopemap.odometry import FrameTracker, Track
+from scopemap.tracking import FrameTracker, Track
 
 
 class TimedTracker:

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from scopemap import weights
-from scopemap.camera import PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.scopenet.network import ScopeNet
 from scopemap.depth.scopenet.planes import input_planes
-from scopemap.device import choose_device
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
+from scopemap.io import weights
+from scopemap.io.device import choose_device
 
 WEIGHTS_NAME = "scopenet.safetensors"
 _AS_THEY_COME = "that come with the package"

@@ -16,7 +16,7 @@ from scopemap.evaluation.protocols.fitted import evo, oneslam, robust_pose_estim
 from scopemap.evaluation.protocols.report import ProtocolReport
 from scopemap.evaluation.protocols.snippets import af, af_from_relative, surgcut3r
 from scopemap.evaluation.protocols.world_to_camera import endogslam, free_surgs
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 Protocol = Callable[[Trajectory, Trajectory], ProtocolReport]
 """Takes estimate and reference."""

@@ -8,7 +8,7 @@ from scopemap.evaluation.pose_errors import frame_pairs, relative_errors, transl
 from scopemap.evaluation.protocols.report import MatchedPoses, ProtocolReport
 from scopemap.evaluation.protocols.snippets import least_squares_scale
 from scopemap.geometry.se3 import inverse
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 
 def simcol(estimate: Trajectory, reference: Trajectory) -> ProtocolReport:

@@ -16,7 +16,7 @@ from scopemap.evaluation.pose_errors import (
 )
 from scopemap.evaluation.protocols.report import MatchedPoses, ProtocolReport
 from scopemap.geometry.align import AlignMode, align_trajectories
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 _EVO_MODES: tuple[AlignMode, ...] = ("none", "se3", "sim3")
 _EVO_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")

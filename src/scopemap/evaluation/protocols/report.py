@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap.evaluation.poses import match
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from scopemap.errors import check_shape
 from scopemap.evaluation.pose_errors import ErrorSummary
 from scopemap.evaluation.protocols.report import MatchedPoses, ProtocolReport
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 _AF_MOTIONS = 4
 _AF_DESCRIPTION = (

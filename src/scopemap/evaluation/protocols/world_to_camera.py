@@ -13,7 +13,7 @@ from scopemap.evaluation.pose_errors import ErrorSummary, frame_pairs, relative_
 from scopemap.evaluation.protocols.report import MatchedPoses, ProtocolReport
 from scopemap.geometry.align import align_trajectories
 from scopemap.geometry.se3 import inverse
-from scopemap.trajectory import Trajectory
+from scopemap.trajectory.trajectory import Trajectory
 
 
 def endogslam(estimate: Trajectory, reference: Trajectory) -> ProtocolReport:

@@ -1,0 +1,101 @@
+"""The picture of a calibration: a view with its corners, all residuals over the picture's area, the error per view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scopemap.calibration.calibrating import BoardCalibration
+from scopemap.calibration.selection import views_per_place
+from scopemap.calibration.views import View
+from scopemap.errors import InputError
+from scopemap.report.canvas import headline, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# The longer residuals are drawn this share of the picture's width long.
+_DRAWN_SHARE = 0.04
+_LONGER_PERCENT = 95
+_MOST_LABELS = 25
+
+
+def draw_calibration(calibration: BoardCalibration, example: np.ndarray, file: Path) -> None:
+    """Draw how well `calibration` explains its views into `file`, a PNG.
+
+    `example` (h, w, 3) uint8 is the frame of `calibration.example`. Raises `InputError` where the file cannot be
+    written.
+    """
+    # Imported here, so that importing the package stays fast.
+    from matplotlib import colormaps
+
+    colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(calibration.views)))
+    figure = new_figure(16, 5)
+    picture, residuals, bars = figure.subplots(1, 3, width_ratios=(1, 1.15, 1))
+    _draw_example(picture, calibration.example, example)
+    _draw_residuals(residuals, calibration, colours)
+    _draw_errors(bars, calibration, colours)
+    central = calibration.fit.camera.central
+    headline(
+        figure,
+        f"{calibration.fit.form.described}: fx {central.fx:.1f}, fy {central.fy:.1f}, cx {central.cx:.1f}, "
+        f"cy {central.cy:.1f} px; reprojection error {calibration.fit.rms_px:.3f} px RMS",
+    )
+    try:
+        figure.savefig(file)
+    except OSError as error:
+        raise InputError(f"drawing the calibration into {file}: {error}") from None
+
+
+def _draw_example(axes: Axes, view: View, frame: np.ndarray) -> None:
+    axes.imshow(frame)
+    axes.plot(*view.found.pixels.T, "x", color="#ff3030", markersize=7)
+    axes.plot(*view.corners.pixels.T, "o", color="#00ff55", markersize=8, fillstyle="none")
+    found, used = len(view.found.pixels), len(view.corners.pixels)
+    axes.set_title(f"frame {view.index}: {found} corners found (crosses), {used} used (circles)", fontsize=10)
+    axes.set_axis_off()
+
+
+def _draw_residuals(axes: Axes, calibration: BoardCalibration, colours: np.ndarray) -> None:
+    width, height = calibration.fit.camera.width, calibration.fit.camera.height
+    count = views_per_place(calibration.views, (width, height))
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    shown = axes.imshow(count, cmap="Greys", vmin=0, vmax=max(2 * int(count.max()), 1), extent=extent)
+    most = int(count.max())
+    bar = axes.figure.colorbar(shown, ax=axes, shrink=0.7, label="views", boundaries=np.arange(most + 2) - 0.5)
+    bar.set_ticks(list(range(0, most + 1, max(1, most // 6))))
+    lengths = np.linalg.norm(np.concatenate(calibration.fit.residuals_px), axis=1)
+    longer = max(float(np.percentile(lengths, _LONGER_PERCENT)), 1e-9)
+    magnified = _DRAWN_SHARE * width / longer
+    for view, residual, colour in zip(calibration.views, calibration.fit.residuals_px, colours, strict=True):
+        axes.quiver(
+            *view.corners.pixels.T,
+            *residual.T * magnified,
+            color=colour,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.0025,
+        )
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_title(
+        f"residuals, {magnified:.0f} times as long; boards cover {100 * calibration.coverage:.0f} %", fontsize=10
+    )
+
+
+def _draw_errors(axes: Axes, calibration: BoardCalibration, colours: np.ndarray) -> None:
+    places = np.arange(len(calibration.views))
+    axes.bar(places, calibration.fit.view_rms_px, color=colours)
+    axes.axhline(calibration.fit.rms_px, color="black", linestyle="--", linewidth=1)
+    step = -(-len(places) // _MOST_LABELS)
+    axes.set_xticks(places[::step], [str(view.index) for view in calibration.views[::step]], rotation=90, fontsize=8)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("reprojection error, px RMS")
+    axes.set_title(
+        f"{len(places)} views used, {calibration.alike} alike, {len(calibration.blurred)} blurred, "
+        f"{len(calibration.left_out)} unfit; dashed: all",
+        fontsize=10,
+    )

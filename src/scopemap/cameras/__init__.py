@@ -1,0 +1,1 @@
+"""Cameras: pinhole and lens models, rectification, and camera file formats."""

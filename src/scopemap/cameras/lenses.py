@@ -1,0 +1,382 @@
+"""Lenses that bend straight lines: OpenCV radial-tangential, Kannala-Brandt fisheye, FOV, Scaramuzza omnidirectional.
+
+All are one increasing radial function, plus a small correction in the plane. The field of a lens ends where its
+radial function stops increasing (there two rays would share a pixel) or where rays no longer point forward; beyond it
+`project` and `unproject` answer NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from scopemap.cameras.camera import PinholeCamera
+
+# Rays are written with z = 1, so a field must end before 90 deg: here at 88.9 deg.
+_WIDEST_RAD = float(np.arctan(50.0))
+_ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)
+_MAX_STEPS = 60
+
+_Radial = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class OpenCvCamera:
+    """OpenCV's radial-tangential lens, `cv2.projectPoints` (Brown 1966).
+
+    Attributes
+    ----------
+    central : focal lengths, principal point and image size, px.
+    distortion : k1 k2 p1 p2 [k3 [k4 k5 k6]] in OpenCV's order.
+    """
+
+    central: PinholeCamera
+    distortion: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) not in (4, 5, 8):
+            raise ValueError(f"OpenCvCamera.distortion: expected 4, 5 or 8 numbers, got {len(self.distortion)}")
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.central.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.central.height
+
+    @cached_property
+    def _coefficients(self) -> tuple[float, ...]:
+        return (*self.distortion, *[0.0] * (8 - len(self.distortion)))
+
+    @cached_property
+    def _fraction(self) -> tuple[Polynomial, Polynomial]:
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
+        return Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
+
+    @cached_property
+    def field_radius(self) -> float:
+        """Largest distance from the axis, on the plane z = 1, that the lens maps one to one."""
+        return float(self._grid[-1])
+
+    @cached_property
+    def _grid(self) -> np.ndarray:
+        return _while_increasing(self._radial, np.tan(_ANGLES_RAD))
+
+    def _radial(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        above, below = self._fraction
+        s, n, d = r * r, above(r * r), below(r * r)
+        return r * n / d, n / d + 2 * s * (above.deriv()(s) * d - n * below.deriv()(s)) / d**2
+
+    def _tangential(self, xy: np.ndarray) -> np.ndarray:
+        p1, p2 = self._coefficients[2:4]
+        x, y = xy[..., 0], xy[..., 1]
+        s = x * x + y * y
+        return np.stack([2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = _on_plane(points)
+        r = np.linalg.norm(xy, axis=-1)
+        r = np.where(r <= self.field_radius, r, np.nan)
+        return _to_pixels(self.central, _with_radius(xy, self._radial(r)[0]) + self._tangential(xy))
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        bent = self.central.unproject(pixels)[..., :2]
+        shift = np.zeros_like(bent)
+        for _ in range(_MAX_STEPS):
+            straight = bent - shift
+            radius = _invert_increasing(self._radial, self._grid, np.linalg.norm(straight, axis=-1))
+            xy = _with_radius(straight, radius)
+            previous, shift = shift, self._tangential(xy)
+            if not np.any(np.abs(shift - previous) > 1e-14):
+                break
+        return _ray(xy)
+
+    def resized(self, width: int, height: int) -> OpenCvCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        return replace(self, central=self.central.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> OpenCvCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, central=self.central.cropped(x, y, width, height))
+
+
+@dataclass(frozen=True)
+class FisheyeCamera:
+    """Kannala-Brandt fisheye lens, `cv2.fisheye` (IEEE PAMI 28(8), 2006, eq. 6 without its odd terms).
+
+    The angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
+
+    Attributes
+    ----------
+    central : focal lengths, principal point and image size, px.
+    distortion : k1 k2 k3 k4.
+    """
+
+    central: PinholeCamera
+    distortion: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) != 4:
+            raise ValueError(f"FisheyeCamera.distortion: expected 4 numbers, got {len(self.distortion)}")
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.central.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.central.height
+
+    @cached_property
+    def _polynomial(self) -> Polynomial:
+        k1, k2, k3, k4 = self.distortion
+        return Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
+
+    @cached_property
+    def field_rad(self) -> float:
+        """Largest angle from the axis, rad, that the lens maps one to one and that still points forward."""
+        return float(self._grid[-1])
+
+    @cached_property
+    def _grid(self) -> np.ndarray:
+        return _while_increasing(self._radial, _ANGLES_RAD)
+
+    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._polynomial(angle), self._polynomial.deriv()(angle)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = _on_plane(points)
+        angle = np.arctan(np.linalg.norm(xy, axis=-1))
+        angle = np.where(angle <= self.field_rad, angle, np.nan)
+        return _to_pixels(self.central, _with_radius(xy, self._polynomial(angle)))
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        bent = self.central.unproject(pixels)[..., :2]
+        angle = _invert_increasing(self._radial, self._grid, np.linalg.norm(bent, axis=-1))
+        return _ray(_with_radius(bent, np.tan(angle)))
+
+    def resized(self, width: int, height: int) -> FisheyeCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        return replace(self, central=self.central.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> FisheyeCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, central=self.central.cropped(x, y, width, height))
+
+
+@dataclass(frozen=True)
+class FovCamera:
+    """Lens of one parameter (Devernay and Faugeras, Machine Vision and Applications 13, 2001, section 3.2).
+
+    The distance r from the axis on the plane z = 1 becomes atan(2 r tan(omega / 2)) / omega.
+
+    Attributes
+    ----------
+    plane : takes the bent plane to pixels: scales (fx, fy), principal point and image size, px.
+    omega : the lens' angle of view in the model, rad, 0 < omega < pi.
+    """
+
+    plane: PinholeCamera
+    omega: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.omega < np.pi:
+            raise ValueError(f"FovCamera.omega: expected an angle between 0 and pi, got {self.omega:g}")
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.plane.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.plane.height
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The pinhole camera that agrees with this one near its principal point."""
+        return replace(self.plane, fx=self.plane.fx * self._slope, fy=self.plane.fy * self._slope)
+
+    @property
+    def _slope(self) -> float:
+        return float(2 * np.tan(self.omega / 2) / self.omega)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = _on_plane(points)
+        r = np.linalg.norm(xy, axis=-1)
+        r = np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)
+        return _to_pixels(self.plane, _with_radius(xy, np.arctan(r * self._slope * self.omega) / self.omega))
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        bent = self.plane.unproject(pixels)[..., :2]
+        angle = np.linalg.norm(bent, axis=-1) * self.omega
+        r = np.tan(np.where(angle < np.pi / 2, angle, np.nan)) / (self._slope * self.omega)
+        return _ray(_with_radius(bent, np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)))
+
+    def resized(self, width: int, height: int) -> FovCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        return replace(self, plane=self.plane.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> FovCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, plane=self.plane.cropped(x, y, width, height))
+
+
+@dataclass(frozen=True)
+class OmnidirectionalCamera:
+    """Scaramuzza's polynomial lens in the form that MATLAB and C3VD use (IROS 2006, eq. 5-8).
+
+    With (u'', v'') = inverse of [[c, d], [e, 1]] times (u - cx, v - cy), and rho the length of that, the ray is
+    (u'', v'', a0 + a1 rho + a2 rho^2 + ...).
+
+    Attributes
+    ----------
+    polynomial : a0 > 0, a1 (0 in practice), a2, ... in px.
+    cx, cy : principal point, px (top-left pixel centre is 0, 0; MATLAB's values are larger by 1).
+    width, height : image size, px.
+    stretch : c, d, e.
+    """
+
+    polynomial: tuple[float, ...]
+    cx: float
+    cy: float
+    width: int
+    height: int
+    stretch: tuple[float, float, float] = (1.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.polynomial or self.polynomial[0] <= 0:
+            raise ValueError(f"OmnidirectionalCamera.polynomial: a0 must be positive, got {self.polynomial}")
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The pinhole camera that agrees with this one near its principal point."""
+        a0, c = self.polynomial[0], self.stretch[0]
+        return PinholeCamera(a0 * c, a0, self.cx, self.cy, self.width, self.height)
+
+    @cached_property
+    def _depth(self) -> Polynomial:
+        return Polynomial(self.polynomial)
+
+    @cached_property
+    def _stretch_matrix(self) -> np.ndarray:
+        c, d, e = self.stretch
+        return np.array([[c, d], [e, 1.0]])
+
+    @cached_property
+    def field_rho_px(self) -> float:
+        """Largest rho, px, up to which the angle from the axis grows and the rays point forward."""
+        return float(self._grid[-1])
+
+    @cached_property
+    def _grid(self) -> np.ndarray:
+        grid = _while_increasing(self._radial, self.polynomial[0] * np.tan(_ANGLES_RAD))
+        sideways = _invert_increasing(self._radial, grid, np.array(_WIDEST_RAD))
+        return np.append(grid[grid < sideways], sideways) if np.isfinite(sideways) else grid
+
+    def _radial(self, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z = self._depth(rho)
+        return np.arctan2(rho, z), (z - rho * self._depth.deriv()(rho)) / (rho**2 + z**2)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = _on_plane(points)
+        rho = _invert_increasing(self._radial, self._grid, np.arctan(np.linalg.norm(xy, axis=-1)))
+        return _with_radius(xy, rho) @ self._stretch_matrix.T + np.array([self.cx, self.cy])
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        offset = np.asarray(pixels, dtype=np.float64) - np.array([self.cx, self.cy])
+        offset = offset @ np.linalg.inv(self._stretch_matrix).T
+        rho = np.linalg.norm(offset, axis=-1)
+        z = np.where(rho <= self.field_rho_px, self._depth(rho), np.nan)
+        return _ray(offset / z[..., None])
+
+    def resized(self, width: int, height: int) -> OmnidirectionalCamera:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        sx, sy = width / self.width, height / self.height
+        c, d, e = self.stretch
+        # rho is measured in rows, so that the matrix keeps its 1 when columns and rows shrink differently.
+        polynomial = tuple(a * sy ** (1 - power) for power, a in enumerate(self.polynomial))
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return OmnidirectionalCamera(polynomial, cx, cy, width, height, (c * sx / sy, d * sx / sy, e))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> OmnidirectionalCamera:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)
+
+
+def _on_plane(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    return points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+
+
+def _ray(xy: np.ndarray) -> np.ndarray:
+    return np.concatenate([xy, np.where(np.isfinite(xy[..., :1]), 1.0, np.nan)], -1)
+
+
+def _to_pixels(camera: PinholeCamera, xy: np.ndarray) -> np.ndarray:
+    return xy * np.array([camera.fx, camera.fy]) + np.array([camera.cx, camera.cy])
+
+
+def _with_radius(xy: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return `xy` (..., 2) moved along its direction to `radius` (...); the origin stays, NaN spreads."""
+    length = np.linalg.norm(xy, axis=-1)
+    scale = np.divide(radius, length, out=np.where(np.isfinite(radius), 1.0, np.nan), where=length > 0)
+    return xy * scale[..., None]
+
+
+def _while_increasing(function: _Radial, grid: np.ndarray) -> np.ndarray:
+    """Return the part of `grid` over which `function` increases, its end moved to where it stops (a turn or a pole)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value, slope = function(grid)
+        stops = np.flatnonzero(~(slope[1:] > 0) | ~(np.diff(value) > 0))
+        if not stops.size:
+            return grid
+        last = int(stops[0])
+        low, high = grid[last], grid[last + 1]
+        for _ in range(_MAX_STEPS):
+            middle = 0.5 * (low + high)
+            value_there, slope_there = function(middle)
+            rises = slope_there > 0 and value[last] < value_there < np.inf
+            low, high = (middle, high) if rises else (low, middle)
+    return np.append(grid[: last + 1], low)
+
+
+def _invert_increasing(function: _Radial, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return x with function(x) = values (any shape), NaN outside the grid's range.
+
+    `function` gives value and slope and increases over `grid` (ascending). A table brackets each root; Newton's step is
+    taken while it stays in the bracket, else the bracket is halved, so that it ends also where the slope vanishes.
+    """
+    table = function(grid)[0]
+    inside = (values >= table[0]) & (values <= table[-1])
+    values = np.where(inside, values, table[0])
+    cell = np.clip(np.searchsorted(table, values, side="right") - 1, 0, len(grid) - 2)
+    low, high = grid[cell], grid[cell + 1]
+    x = np.interp(values, table, grid)
+    for _ in range(_MAX_STEPS):
+        value, slope = function(x)
+        low, high = np.where(value <= values, x, low), np.where(value > values, x, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            newton = x - (value - values) / slope
+        previous, x = x, np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        if not np.any(np.abs(x - previous) > 1e-14 * (1 + np.abs(x))):
+            break
+    return np.where(inside, x, np.nan)

@@ -1,0 +1,168 @@
+"""Rectification: every frame once to a pinhole camera of the working size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
+from scopemap.errors import CalibrationError, check_shape
+
+LONGEST_WORKING_SIDE_PX = 400
+_BLUR_PER_SHRINK = 0.4
+
+
+def working_size(width: int, height: int) -> tuple[int, int]:
+    """Return (width, height) divided, rounding down, by the smallest whole number that brings both sides to 400 px."""
+    divisor = -(-max(width, height) // LONGEST_WORKING_SIDE_PX)
+    return width // divisor, height // divisor
+
+
+def working_camera(source: CameraModel, size: tuple[int, int], zoom: float = 1.0) -> PinholeCamera:
+    """Return the pinhole camera of `size` (width, height) that sees what `source` sees around its principal point.
+
+    The focal length is the source's at its centre, scaled, times `zoom` (smaller: wider view).
+    """
+    camera = source.central.resized(*size)
+    return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+
+
+class Rectifier:
+    """Moves images, depth and labels from a source camera to a pinhole camera with the same centre.
+
+    Raises `CalibrationError` where the two cameras share no view.
+    """
+
+    def __init__(self, source: CameraModel, target: PinholeCamera) -> None:
+        self.source, self.target = source, target
+        u, v = np.meshgrid(np.arange(target.width), np.arange(target.height))
+        x, y = np.moveaxis(self.source_pixel(u, v), -1, 0)
+        # A pixel is an area: its outer half belongs to the image too.
+        self._valid = (np.abs(x - (source.width - 1) / 2) <= source.width / 2) & (
+            np.abs(y - (source.height - 1) / 2) <= source.height / 2
+        )
+        if not self._valid.any():
+            raise CalibrationError(
+                f"rectifying {source.width}x{source.height} px to {target.width}x{target.height} px: no pixel of the "
+                "source is seen; check the calibration"
+            )
+        self._x = np.where(self._valid, x, 0).astype(np.float32)
+        self._y = np.where(self._valid, y, 0).astype(np.float32)
+        self._shrink = source.central.fx / target.fx
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(H, W) bool, a copy: target pixels that have a source pixel."""
+        return self._valid.copy()
+
+    @cached_property
+    def only_resizes(self) -> bool:
+        """Whether source and target are the same view at two sizes."""
+        if not isinstance(self.source, PinholeCamera):
+            return False
+        same = self.source.resized(self.target.width, self.target.height)
+        pairs = [(same.fx, self.target.fx), (same.fy, self.target.fy), (same.cx, self.target.cx)]
+        return all(abs(a - b) < 1e-6 for a, b in [*pairs, (same.cy, self.target.cy)])
+
+    def source_pixel(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return source pixels (..., 2) of target pixels `u`, `v` (...); NaN where the source has none."""
+        return source_pixel(np.stack([u, v], -1), self.target, self.source)
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        """Return the rectified image.
+
+        `image` is (h, w, 3) or (h, w) uint8 of the source's size; the result (H, W, ...) uint8, 0 where not `valid`.
+        A coarser target sees the source blurred first, so that fine texture does not alias.
+        """
+        check_shape("image", image[..., 0] if image.ndim == 3 else image, (self.source.height, self.source.width))
+        if self.only_resizes:
+            return self._resize(image)
+        if self._shrink > 1:
+            image = cv2.GaussianBlur(image, (0, 0), _BLUR_PER_SHRINK * self._shrink)
+        rectified = cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        rectified[~self._valid] = 0
+        return rectified
+
+    def nearest(self, array: np.ndarray) -> np.ndarray:
+        """Return depth or labels taken from the nearest pixel.
+
+        `array` (h, w, ...) shows the source's view at any size. Where not `valid`: NaN for floats, else 0.
+        """
+        x, y = self._maps(array)
+        rows = np.clip(np.rint(y).astype(np.intp), 0, array.shape[0] - 1)
+        columns = np.clip(np.rint(x).astype(np.intp), 0, array.shape[1] - 1)
+        rectified = array[rows, columns]
+        rectified[~self._valid] = np.nan if np.issubdtype(array.dtype, np.floating) else 0
+        return rectified
+
+    def smooth(self, array: np.ndarray) -> np.ndarray:
+        """Return a float32 map (H, W) interpolated linearly, for disparity.
+
+        `array` (h, w) shows the source's view at any size; NaN = unknown. Unknown pixels take no part; the result is
+        NaN where they would hold more than half of the weight, and where not `valid`.
+        """
+        check_shape("array", array, (None, None))
+        x, y = self._maps(array)
+        known = np.isfinite(array)
+        values = np.where(known, array, 0).astype(np.float32)
+        total = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        weight = cv2.remap(known.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(self._valid & (weight >= 0.5), total / np.maximum(weight, 0.5), np.nan).astype(np.float32)
+
+    def _maps(self, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        height, width = array.shape[:2]
+        sx, sy = width / self.source.width, height / self.source.height
+        if abs(sx / sy - 1) > 0.02:
+            raise CalibrationError(
+                f"rectifying an array of {width}x{height} px: its aspect is not that of the "
+                f"{self.source.width}x{self.source.height} px images"
+            )
+        return (self._x + 0.5) * np.float32(sx) - 0.5, (self._y + 0.5) * np.float32(sy) - 0.5
+
+    def _resize(self, image: np.ndarray) -> np.ndarray:
+        size = (self.target.width, self.target.height)
+        if size == (self.source.width, self.source.height):
+            return image.copy()
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA if self._shrink > 1 else cv2.INTER_LINEAR)
+
+
+@dataclass(frozen=True)
+class DepthSensor:
+    """A depth camera beside the camera of the images.
+
+    camera : of the depth files. T_colour_depth : (4, 4), mm, takes its points to the camera of the images.
+    """
+
+    camera: PinholeCamera
+    T_colour_depth: np.ndarray
+
+    def registered(self, depth_mm: np.ndarray, colour: CameraModel) -> np.ndarray:
+        """Return the depth that `colour` sees, (h, w) float32, NaN = unknown; of several in a pixel the nearest.
+
+        depth_mm : as the sensor sees it, at any size, NaN = unknown.
+        """
+        points = self.camera.resized(depth_mm.shape[1], depth_mm.shape[0]).rays * depth_mm[..., None]
+        points = points[np.isfinite(depth_mm)] @ self.T_colour_depth[:3, :3].T + self.T_colour_depth[:3, 3]
+        pixels = colour.project(points)
+        seen = np.isfinite(pixels).all(-1)
+        # Rounding halves to even would leave every second pixel empty.
+        points, pixels = points[seen], np.floor(pixels[seen] + 0.5).astype(int)
+        inside = ((pixels >= 0) & (pixels < [colour.width, colour.height])).all(-1)
+        seen_mm = np.full((colour.height, colour.width), np.inf, dtype=np.float32)
+        np.minimum.at(seen_mm, (pixels[inside, 1], pixels[inside, 0]), points[inside, 2].astype(np.float32))
+        return np.where(np.isfinite(seen_mm), seen_mm, np.float32(np.nan))
+
+
+class SensorRectifier(Rectifier):
+    """Like the rectifier of the images, for depth that a sensor beside them took."""
+
+    def __init__(self, images: Rectifier, sensor: DepthSensor) -> None:
+        super().__init__(images.source, images.target)
+        self._sensor = sensor
+
+    def nearest(self, array: np.ndarray) -> np.ndarray:
+        """Return depth, mm, (h, w) as the sensor sees it, on the working camera's grid, NaN where it is not known."""
+        return super().nearest(self._sensor.registered(array, self.source))

@@ -1,0 +1,79 @@
+"""LPIPS with AlexNet (Zhang et al., CVPR 2018): heads from the `lpips` package, backbone from the weights registry."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.depth.perceptual.distance import PerceptualResult
+from scopemap.errors import WeightsError, check_shape
+from scopemap.io import weights
+from scopemap.io.device import choose_device
+
+CHECKPOINTS = ("alexnet", "alexnet-features")
+
+# lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
+_SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
+
+
+class LpipsAlex:
+    """LPIPS(AlexNet), version 0.1, per pixel.
+
+    `checkpoint` is a file with torchvision's names of AlexNet's parameters (default: the first of `CHECKPOINTS` that is
+    there). Raises `WeightsError` if there is none or if it does not fit.
+    """
+
+    name = "lpips"
+
+    def __init__(self, *, device: str = "auto", checkpoint: Path | None = None) -> None:
+        import lpips
+        import torch
+
+        self._checkpoint = checkpoint or weights.locate(*CHECKPOINTS)
+        self._device = choose_device(device)
+        with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+            # lpips calls torchvision by an argument that torchvision has renamed, and draws weights we replace.
+            warnings.simplefilter("ignore", UserWarning)
+            network = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
+        state = torch.load(self._checkpoint, map_location="cpu", weights_only=True)
+        try:
+            network.net.load_state_dict({_slice_name(name): t for name, t in state.items() if _is_convolution(name)})
+        except RuntimeError as error:
+            raise WeightsError(f"{self._checkpoint} does not hold AlexNet's convolutions: {error}") from None
+        self._network = network.to(self._device).eval()
+
+    def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
+        """Compare two (H, W, 3) uint8 images of one size, 32 px or more on each side.
+
+        The score is the map's mean; it equals the package's own score but for the enlargement of the layers' maps.
+        """
+        import torch
+
+        check_shape("rgb_a", rgb_a, (None, None, 3))
+        check_shape("rgb_b", rgb_b, rgb_a.shape)
+        images = torch.from_numpy(np.stack([rgb_a, rgb_b])).to(self._device)
+        images = images.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        with torch.inference_mode():
+            distance = self._network(images[:1], images[1:])[0, 0].cpu().numpy()
+        return PerceptualResult(distance, float(distance.mean(dtype=np.float64)))
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name, and the backbone's file and SHA-256."""
+        return {
+            "perceptual": self.name,
+            "weights": self._checkpoint.name,
+            "sha256": weights.sha256_of(self._checkpoint),
+        }
+
+
+def _is_convolution(name: str) -> bool:
+    return re.match(r"features\.\d+\.", name) is not None
+
+
+def _slice_name(name: str) -> str:
+    """Return the name of `features.N.weight` among lpips' slices."""
+    layer = name.split(".")[1]
+    return name.replace("features", _SLICE_OF_LAYER.get(layer, "unknown"), 1)

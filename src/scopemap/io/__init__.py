@@ -1,0 +1,1 @@
+"""Input: videos, image folders, data sets, decoding, and network weights."""

@@ -1,0 +1,358 @@
+"""What is wrong with a data set, or looks wrong, by the figures of one pass over it (`survey`).
+
+Each check takes a `Survey` and returns findings. An error makes results wrong or impossible, a warning wants to be
+looked at, an info says what was assumed. Thresholds are for endoscopy: centimetres of depth, steps of a few mm at most.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence as Several
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from scopemap.errors import CalibrationError, ScopemapError
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.io.datasets.pose_depth import OTHERS, Agreement
+from scopemap.io.datasets.survey import RIGID_TOLERANCE, DepthRecord, Survey, deviation, extent_mm, positions_of
+from scopemap.io.images import frame_number
+
+Severity = Literal["error", "warning", "info"]
+
+_NAMED = 3
+_TIME_STAMP = re.compile(r"\d\.\d")
+_BLACK_LEVEL, _LEAST_SPREAD = 16.0, 1.0
+_UNEVEN = 0.5
+_FOCAL_WIDTHS = (0.2, 5.0)
+_MIDDLE = (0.25, 0.75)
+_ASPECT_TOLERANCE = 0.1
+_JUMP, _JUMP_DEG = 10.0, 30.0
+_SMALLEST_JUMP_MM, _AROUND = 0.5, 5
+_LARGEST_STEP_MM, _LARGEST_EXTENT_MM = 50.0, 10_000.0
+_SMALLEST_STEP_MM, _SMALLEST_EXTENT_MM = 0.005, 1.0
+_STILL_MM, _STILL_RAD = 1e-6, 1e-6
+_DEPTH_MM = (1.0, 1000.0)
+_ROOMS, _ROOM_MM = ("7-scenes", "tum"), 10_000.0
+_MOST_UNKNOWN = 0.95
+_COARSE = 256
+_COUNTED_IN = 4 * _COARSE
+_LARGEST_ERROR, _SMALLEST_ERROR, _FAR_BETTER = 0.1, 0.005, 4.0
+_OUTLYING, _OUTLYING_TIMES = 0.05, 8.0
+_OTHER_DEPTH_TIMES = 30.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found: how bad it is, a short code, one sentence."""
+
+    severity: Severity
+    code: str
+    message: str
+
+
+def check(survey: Survey) -> list[Finding]:
+    """Return what every check finds, errors first."""
+    found = [finding for one in CHECKS for finding in one(survey)]
+    return sorted(found, key=lambda finding: ("error", "warning", "info").index(finding.severity))
+
+
+def refusal(error: ScopemapError) -> Finding:
+    """Return the finding that an input could not even be opened."""
+    return Finding("error", "camera-refused" if isinstance(error, CalibrationError) else "refused", str(error))
+
+
+def check_reading(survey: Survey) -> list[Finding]:
+    """Errors while reading, frames that are announced but cannot be read, and the reader's own warnings."""
+    found = []
+    if survey.stopped:
+        found.append(Finding("error", "reading-stopped", survey.stopped))
+    if survey.truth_faults:
+        first, *others = survey.truth_faults
+        more = f" (and {len(others)} more such errors)" if others else ""
+        found.append(Finding("error", "truth-unreadable", first + more))
+    if survey.announced is not None and not survey.stopped:
+        read = {frame.index for frame in survey.frames}
+        missing = [index for index in survey.announced if index not in read]
+        if missing:
+            found.append(Finding("warning", "frame-unreadable", f"cannot be read: {_frames(missing)}"))
+    if len(survey.frames) < 2 and not survey.stopped:
+        found.append(Finding("error", "frame-few", f"{len(survey.frames)} readable frame(s), two are needed"))
+    named = [Finding("warning", "source", warning) for warning in survey.warnings[:_NAMED]]
+    if len(survey.warnings) > _NAMED:
+        named.append(Finding("warning", "source", f"and {len(survey.warnings) - _NAMED} more warnings of the reader"))
+    return found + named
+
+
+def check_numbers(survey: Survey) -> list[Finding]:
+    """Gaps, repetitions and disorder of the frames' numbers, and of those in the names where frames are counted."""
+    numbers = np.array(survey.announced or [frame.index for frame in survey.frames], dtype=np.int64)
+    found = _numbers_in_names(survey, numbers)
+    steps = np.diff(numbers)
+    if not steps.size:
+        return found
+    if (steps < 0).any():
+        found.append(Finding("error", "number-unsorted", f"numbers go back after {_frames(numbers[:-1][steps < 0])}"))
+    repeated = [number for number, times in Counter(numbers.tolist()).items() if times > 1]
+    if repeated:
+        found.append(Finding("error", "number-repeated", f"there more than once: {_frames(repeated)}"))
+    usual = Counter(steps.tolist()).most_common(1)[0][0]
+    before = numbers[:-1][steps > max(usual, 1)]
+    found += _about(before, "number-gap", "numbers are missing after {}")
+    if usual > 1:
+        found.append(Finding("info", "number-step", f"frames are numbered in steps of {usual}"))
+    return found
+
+
+def check_pictures(survey: Survey) -> list[Finding]:
+    """Black frames, frames of one colour, frames that repeat the one before."""
+    black = [f.index for f in survey.frames if f.brightest < _BLACK_LEVEL]
+    even = [f.index for f in survey.frames if f.spread < _LEAST_SPREAD and f.brightest >= _BLACK_LEVEL]
+    again = [f.index for f in survey.frames if f.repeats and f.brightest >= _BLACK_LEVEL]
+    return [
+        *_about(black, "frame-black", "black: {}"),
+        *_about(even, "frame-constant", "of one colour: {}"),
+        *_about(again, "frame-repeated", "the same picture as before: {}"),
+    ]
+
+
+def check_times(survey: Survey) -> list[Finding]:
+    """Time stamps that do not increase, or not evenly."""
+    numbers, times_s = (np.array([getattr(f, key) for f in survey.frames]) for key in ("index", "time_s"))
+    steps_s = np.diff(times_s)
+    if not steps_s.size:
+        return []
+    wrong = ~(steps_s > 0)
+    if wrong.any():
+        return [Finding("error", "time-order", f"time does not increase after {_frames(numbers[:-1][wrong])}")]
+    rates_s = steps_s / np.maximum(np.diff(numbers), 1)
+    median_s = float(np.median(rates_s))
+    uneven = np.abs(rates_s / median_s - 1) > _UNEVEN
+    words = f"time to the next is not half to one and a half of the usual {1000 * median_s:.4g} ms: {{}}"
+    return _about(numbers[:-1][uneven], "time-irregular", words)
+
+
+def check_camera(survey: Survey) -> list[Finding]:
+    """Whether a stated camera can be one of an endoscope."""
+    camera = survey.camera
+    if not survey.calibrated:
+        return [Finding("info", "camera-assumed", "no calibration was found: the focal length is a guess (--camera)")]
+    size = f"images of {camera.width}x{camera.height} px"
+    widths = camera.fx / camera.width
+    found = []
+    if not _FOCAL_WIDTHS[0] <= widths <= _FOCAL_WIDTHS[1]:
+        message = f"a focal length of {camera.fx:.4g} px does not fit {size}: it is {widths:.2g} of their width"
+        found.append(Finding("error", "camera-focal", message))
+    centre = ((camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height)
+    if not all(_MIDDLE[0] <= share <= _MIDDLE[1] for share in centre):
+        message = f"the principal point {camera.cx:.4g}, {camera.cy:.4g} px lies outside the middle half of {size}"
+        found.append(Finding("warning", "camera-centre", message))
+    aspect = camera.fy / camera.fx / survey.pixel_aspect
+    if abs(aspect - 1) > _ASPECT_TOLERANCE:
+        message = (
+            f"focal lengths {camera.fx:.4g} and {camera.fy:.4g} px differ by more than a tenth: are pixels square?"
+        )
+        found.append(Finding("warning", "camera-aspect", message))
+    return found
+
+
+def check_poses(survey: Survey) -> list[Finding]:
+    """Frames without a pose, and poses that are no rigid motions."""
+    posed = [(frame.index, frame.T_world_camera) for frame in survey.frames if frame.T_world_camera is not None]
+    finite = [(index, T) for index, T in posed if np.isfinite(T).all()]
+    left = [index for index, T in finite if np.linalg.det(T[:3, :3]) < 0]
+    bent = [index for index, T in finite if index not in set(left) and deviation(T) > RIGID_TOLERANCE]
+    odd = [index for index, T in posed if not np.isfinite(T).all()]
+    return [
+        *_missing(survey, [index for index, _ in posed], "pose"),
+        *_about(odd, "pose-not-finite", "the pose holds NaN or infinity: {}", "error"),
+        *_about(left, "pose-left-handed", "the pose is left-handed (negative determinant): {}", "error"),
+        *_about(bent, "pose-not-rigid", "the pose is no rigid motion (scaled, sheared, transposed): {}", "error"),
+    ]
+
+
+def check_path(survey: Survey) -> list[Finding]:
+    """Jumps of the camera, and sizes of its path that speak of wrong units."""
+    frames = survey.rigid
+    if len(frames) < 2:
+        return []
+    numbers = np.array([frame.index for frame in frames])
+    positions_mm, extent = positions_of(frames), extent_mm(positions_of(frames))
+    apart = np.maximum(np.diff(numbers), 1)
+    steps_mm = np.linalg.norm(np.diff(positions_mm, axis=0), axis=1) / apart
+    poses = np.stack([frame.T_world_camera for frame in frames if frame.T_world_camera is not None])
+    turns_rad = rotation_angle_rad((inverse(poses[:-1]) @ poses[1:])[:, :3, :3]) / apart
+    if extent < _STILL_MM and turns_rad.max() < _STILL_RAD:
+        return [Finding("warning", "pose-still", "the camera does not move: all poses are the same")]
+    moving_mm = steps_mm[steps_mm > 0]
+    median_mm = float(np.median(moving_mm)) if moving_mm.size else 0.0
+    far = numbers[1:][_jumps(steps_mm, median_mm)].tolist()
+    turned = numbers[1:][turns_rad > np.radians(_JUMP_DEG)].tolist()
+    return [
+        *_path_unit(median_mm, extent),
+        *_about(far, "pose-jump", f"the camera jumps, more than {_JUMP:g} times the usual {median_mm:.3g} mm, to {{}}"),
+        *_about(turned, "pose-turn", f"the camera turns by more than {_JUMP_DEG:g} deg to {{}}"),
+    ]
+
+
+def check_depth(survey: Survey) -> list[Finding]:
+    """Frames without depth, and depth that is empty, flat, coarse, impossible or of another unit."""
+    known = [(frame.index, frame.depth) for frame in survey.frames if frame.depth is not None]
+    full = [(index, depth) for index, depth in known if depth.looked_at]
+    flat = [index for index, depth in full if depth.is_constant]
+    return [
+        *_missing(survey, [index for index, _ in known], "depth"),
+        *_about([i for i, d in known if d.impossible_share > 0], "depth-impossible",
+                "depth is infinite, zero or negative in places: {}", "error"),
+        *_about([i for i, d in known if 1 - d.known_share > _MOST_UNKNOWN], "depth-unknown",
+                f"depth is unknown in more than {_MOST_UNKNOWN:.0%} of the pixels: {{}}"),
+        *_about(flat, "depth-constant", "depth is the same everywhere: {}"),
+        *_about([i for i, d in full if _is_coarse(d)], "depth-coarse",
+                f"depth has fewer than {_COARSE} different values, as of 8 bit or whole units: {{}}"),
+        *_depth_unit([depth.median_mm for _, depth in full], survey.dataset in _ROOMS),
+        *_about(_of_another_depth(full), "depth-jump",
+                f"the median depth is {_OTHER_DEPTH_TIMES:g} times that of the others, or a {_OTHER_DEPTH_TIMES:g}th: "
+                "{}, of another unit?"),
+    ]  # fmt: skip
+
+
+def check_agreement(survey: Survey) -> list[Finding]:
+    """Whether depth fits depth through the poses, and whether it would fit far better by another convention."""
+    if not survey.agreements:
+        return []
+    near = survey.agreements[0]
+    for agreement in survey.agreements:
+        # Frames far apart may well see nothing in common.
+        found = _better(agreement) if agreement is near or np.isfinite(agreement.given) else []
+        if found:
+            return found
+    if not np.isfinite(near.given):
+        return [Finding("warning", "pose-depth-apart", "by the poses, frames close in time show no surface in common")]
+    still = near.given > _SMALLEST_ERROR and near.at_rest < near.given / _FAR_BETTER
+    if still or near.given > _LARGEST_ERROR:
+        rest = f", {near.at_rest:.2%} if nothing moved" if near.at_rest < near.given else ""
+        off = f"depth moved by the poses is off by {near.given:.2%}{rest}"
+        return [Finding("error", "pose-depth-disagree", f"{off}: poses, depth or camera do not belong together")]
+    limit = max(_OUTLYING, _OUTLYING_TIMES * near.given)
+    return _about(
+        [index for index, error in survey.off.items() if error > limit],
+        "pose-depth-frame",
+        f"depth moved by the poses is off by more than {limit:.2%}, usually by {near.given:.2%}: {{}}",
+    )
+
+
+def check_assumptions(survey: Survey) -> list[Finding]:
+    """What the reader assumed."""
+    return [Finding("info", "assumed", note) for note in survey.notes]
+
+
+CHECKS = (
+    check_reading,
+    check_numbers,
+    check_pictures,
+    check_times,
+    check_camera,
+    check_poses,
+    check_path,
+    check_depth,
+    check_agreement,
+    check_assumptions,
+)
+
+
+def _numbers_in_names(survey: Survey, numbers: np.ndarray) -> list[Finding]:
+    """Names whose numbers repeat or go back make a reader count: poses and depth then belong to positions."""
+    names = [frame.name for frame in survey.frames]
+    if not np.array_equal(numbers, np.arange(len(numbers))) or any(_TIME_STAMP.search(name) for name in names):
+        return []
+    own = [number for name in names if (number := frame_number(Path(name))) is not None]
+    if len(own) < len(names):
+        return []
+    counted = "so frames are counted, and a pose or depth by number may belong to another"
+    repeated = [number for number, times in Counter(own).items() if times > 1]
+    if repeated:
+        return [Finding("error", "number-repeated", f"names repeat the number of {_frames(repeated)}, {counted}")]
+    if (np.diff(own) < 0).any():
+        return [Finding("error", "number-unsorted", f"numbers in the names go back, {counted}")]
+    return []
+
+
+def _better(agreement: Agreement) -> list[Finding]:
+    """The convention that fits far better than the poses as given, and than no motion at all."""
+    best = int(np.argmin(agreement.others))
+    error, other = agreement.given, agreement.others[best]
+    limit = min(error / _FAR_BETTER, agreement.at_rest / _FAR_BETTER, _LARGEST_ERROR)
+    if error <= _SMALLEST_ERROR or other >= limit:
+        return []
+    given = f"to {error:.2%}" if np.isfinite(error) else "nowhere"
+    fits = f"so, depth fits depth to {other:.2%}, as given {given}"
+    return [Finding("error", OTHERS[best].code, f"the poses look like {OTHERS[best].looks_like}: {fits}")]
+
+
+def _jumps(steps_mm: np.ndarray, usual_mm: float) -> np.ndarray:
+    """Return where a step (n,) is far longer than is usual, and than those around it.
+
+    A camera at rest trembles by micrometres: when it moves off, all its steps are far longer than is usual.
+    """
+    far = steps_mm > max(_JUMP * usual_mm, _SMALLEST_JUMP_MM)
+    for at in np.flatnonzero(far):
+        around_mm = steps_mm[max(at - _AROUND, 0) : at + _AROUND + 1]
+        far[at] = steps_mm[at] > _JUMP * np.median(around_mm)
+    return far
+
+
+def _path_unit(median_mm: float, extent: float) -> list[Finding]:
+    size = f"steps of {median_mm:.2g} mm, {extent:.2g} mm from end to end"
+    if median_mm > _LARGEST_STEP_MM or extent > _LARGEST_EXTENT_MM:
+        return [Finding("warning", "pose-unit", f"the path is too large ({size}): it looks like micrometres")]
+    if 0 < median_mm < _SMALLEST_STEP_MM and extent < _SMALLEST_EXTENT_MM:
+        return [Finding("warning", "pose-unit", f"the path is too small ({size}): it looks like metres")]
+    return []
+
+
+def _depth_unit(medians_mm: list[float], is_room: bool) -> list[Finding]:
+    median_mm = float(np.median(medians_mm)) if medians_mm else _DEPTH_MM[0]
+    if _DEPTH_MM[0] <= median_mm <= _DEPTH_MM[1]:
+        return []
+    if is_room and _DEPTH_MM[1] < median_mm <= _ROOM_MM:
+        return [Finding("info", "depth-unit", f"a median depth of {median_mm:.4g} mm is that of a room: no endoscopy")]
+    unit = "metres" if median_mm < _DEPTH_MM[0] else "micrometres, or no endoscopy"
+    return [Finding("warning", "depth-unit", f"a median depth of {median_mm:.4g} mm looks like {unit}")]
+
+
+def _of_another_depth(full: list[tuple[int, DepthRecord]]) -> list[int]:
+    """Frames whose depth is of another order of magnitude than that of most."""
+    usual_mm = float(np.median([depth.median_mm for _, depth in full])) if full else 1.0
+    return [i for i, d in full if not 1 / _OTHER_DEPTH_TIMES < d.median_mm / usual_mm < _OTHER_DEPTH_TIMES]
+
+
+def _is_coarse(depth: DepthRecord) -> bool:
+    return not depth.is_constant and depth.distinct < _COARSE and depth.looked_at >= _COUNTED_IN
+
+
+def _missing(survey: Survey, known: list[int], what: str) -> list[Finding]:
+    """A few frames without truth are a fault; truth of a few frames is how the data set is."""
+    without = sorted({frame.index for frame in survey.frames} - set(known))
+    if not known or not without:
+        return []
+    total = len(survey.frames)
+    severity: Severity = "warning" if 2 * len(known) >= total else "info"
+    message = f"{len(without)} of {total} frames have no {what}: {_frames(without)}"
+    return [Finding(severity, f"{what}-missing", message)]
+
+
+def _about(
+    numbers: Several[int] | np.ndarray, code: str, message: str, severity: Severity = "warning"
+) -> list[Finding]:
+    """Return one finding about the frames with these numbers, none where there are none."""
+    return [Finding(severity, code, message.format(_frames(numbers)))] if len(numbers) else []
+
+
+def _frames(numbers: Several[int] | np.ndarray) -> str:
+    if len(numbers) == 1:
+        return f"frame {numbers[0]}"
+    named = ", ".join(str(number) for number in numbers[:_NAMED])
+    return f"{len(numbers)} frames ({named}{', ...' if len(numbers) > _NAMED else ''})"

@@ -1,0 +1,157 @@
+"""EndoNeRF: short clips of robotic surgery with the camera at rest, tissue that is pulled or cut, and stereo depth.
+
+`images/frame-000000.color.png`, `depth/frame-000000.depth.png` (8 or 16 bit, mm, 0 = none), `gt_masks` (instruments)
+and `masks` (instruments, and holes of the depth), `poses_bounds.npy` (LLFF; `pose_bounds.npy` in the README). Depth is
+by stereo matching, instruments were left out of it. Wang et al., "Neural Rendering for Stereo 3D Reconstruction of
+Deformable Tissues in Robotic Surgery", arXiv 2206.15255.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tokenize import TokenError
+
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.fitting import fitted_to, rescaled_note
+from scopemap.errors import CalibrationError, InputError
+from scopemap.io.decoding import read_decoded
+from scopemap.io.images import SUFFIXES, ImageFolder, frame_number, image_files
+from scopemap.trajectory.formats.poses import rigid
+
+_POSES = ("poses_bounds.npy", "pose_bounds.npy")
+_DEPTHS, _MASKS, _MASKS_WITH_HOLES = "depth", "gt_masks", "masks"
+_COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
+_IDENTITY_TOLERANCE = 1e-2
+_REST_TOLERANCE = 1e-6
+# A damaged header is read as Python, and ends in whatever that can end in.
+_DAMAGE = (OSError, ValueError, TypeError, SyntaxError, TokenError, EOFError, MemoryError, OverflowError)
+
+
+class EndoNerfFolder(ImageFolder):
+    """One EndoNeRF scene, or a folder in its layout; a `camera.yaml` beside `images` wins over `poses_bounds.npy`.
+
+    Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
+    camera in it that cannot be is its `camera_fault`.
+    """
+
+    name = "endonerf"
+    quality = "stereo"
+
+    def __init__(self, path: Path) -> None:
+        file, images = _poses_file(path), path / "images"
+        if file is None:
+            raise InputError(f"reading {path}: no EndoNeRF scene, looked for {' and '.join(_POSES)}")
+        super().__init__(path, image_files(images) if images.is_dir() else [])
+        rows = _read_rows(file)
+        if self.camera is None:
+            with self._making_camera():
+                camera = _camera(rows, file)
+                self.camera = fitted_to(camera, (self.width, self.height), str(file))
+                note = rescaled_note(camera, self.camera)
+                self.camera_source = f"focal length in {file.name}, principal point at the centre{note}"
+        self._poses = self._posed(rows, file)
+        self._depths = _numbered_images(path / _DEPTHS)
+        self.masks = path / _MASKS if _numbered_images(path / _MASKS) else None
+        self.notes.append("depth beside the images: stereo matching, no sensor; files are taken as mm")
+        if self.masks is not None:
+            self.notes.append(f"masks of instruments lie beside the images, in {self.masks.name}")
+        elif _numbered_images(path / _MASKS_WITH_HOLES):
+            self.notes.append(f"{_MASKS_WITH_HOLES} (instruments and holes of the depth) is not used unasked")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether `path` holds poses, `images` with images, and `depth` or `gt_masks`: others write LLFF, too."""
+        images = path / "images"
+        known = any((path / name).is_dir() for name in (_DEPTHS, _MASKS))
+        return known and _poses_file(path) is not None and images.is_dir() and bool(image_files(images))
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the pose of the image's row; the identity where the camera is at rest, None where the row has none."""
+        return self._poses.get(index)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        file = self._depths.get(index)
+        if file is None:
+            return None
+        values = read_decoded(file)
+        if values is None or values.ndim != 2 or values.dtype not in (np.uint8, np.uint16):
+            raise InputError(f"reading {file}: expected a depth image of one 8- or 16-bit channel")
+        depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
+        return np.where(values > 0, depth_mm, np.nan).astype(np.float32)
+
+    def _posed(self, rows: np.ndarray, file: Path) -> dict[int, np.ndarray]:
+        """Return the poses by frame number, and note by which convention they were read."""
+        motions = rows[:, :15].reshape(-1, 3, 5)[..., :4]
+        known = np.isfinite(motions).all(axis=(1, 2))
+        poses = np.tile(np.eye(4), (int(known.sum()), 1, 1))
+        poses[:, :3] = motions[known]
+        if not len(poses):
+            self._warn(f"{file} holds no finite pose: none is known")
+            return {}
+        poses = rigid(poses, [f"{file}, row {row}" for row in np.flatnonzero(known)])
+        if np.abs(poses[0, :3, :3] - np.eye(3)).max() > _IDENTITY_TOLERANCE:
+            poses[:, :3, :3] = np.stack([poses[:, :3, 1], poses[:, :3, 0], -poses[:, :3, 2]], axis=-1)
+            self.notes.append(f"poses in {file.name} are taken as LLFF's (columns down, right, back), in mm")
+        else:
+            self.notes.append(f"poses in {file.name} start at the identity: taken as they are, camera to world, in mm")
+        at_rest = np.abs(poses - poses[0]).max() < _REST_TOLERANCE
+        if at_rest:
+            self.notes.append("the camera is at rest while the tissue moves: errors of the path say little here")
+        if len(rows) != len(self.numbers):
+            counts = f"{file} holds {len(rows)} rows for {len(self.numbers)} images"
+            if not (at_rest and known.all()):
+                raise InputError(f"reading {counts}: rows belong to the images in their order; restore the images")
+            self._warn(f"{counts}; its poses are all the same and used for all images")
+            return dict.fromkeys(self.numbers, poses[0])
+        return dict(zip(np.array(self.numbers)[known].tolist(), poses, strict=True))
+
+
+def _poses_file(path: Path) -> Path | None:
+    return next((path / name for name in _POSES if (path / name).is_file()), None)
+
+
+def _numbered_images(folder: Path) -> dict[int, Path]:
+    """Return the images in `folder` by the last number in their names, none where there is no folder."""
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()) if folder.is_dir() else []:
+        number = frame_number(file)
+        if file.suffix.lower() not in SUFFIXES or file.name.startswith(".") or number is None:
+            continue
+        if number in found:
+            raise InputError(f"two images for frame {number} in {folder}: {found[number].name} and {file.name}")
+        found[number] = file
+    return found
+
+
+def _read_rows(file: Path) -> np.ndarray:
+    """Return the rows (N, 17) float64 of an LLFF file."""
+    try:
+        # Mapped, a header that claims more than the file holds is refused before any memory is taken.
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+    except _DAMAGE as error:
+        raise InputError(f"reading {file}: no NumPy array of numbers ({error})") from None
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"reading {file}: no NumPy array of numbers (it is an archive)")
+    if array.ndim != 2 or array.shape[1] != _COLUMNS or array.dtype.kind not in "fiu":
+        found = f"{array.dtype} of shape {array.shape}"
+        raise InputError(f"reading {file}: expected LLFF's numbers of shape (images, {_COLUMNS}), found {found}")
+    return np.array(array, dtype=np.float64)
+
+
+def _camera(rows: np.ndarray, file: Path) -> PinholeCamera:
+    """Return the camera that all rows agree on, at the size that they state."""
+    stated = rows[:, [4, 9, 14]]
+    stated = stated[np.isfinite(stated).all(axis=1)]
+    if not len(stated) or not np.allclose(stated, stated[0]):
+        found = "several cameras" if len(stated) else "none"
+    else:
+        height, width, focal_px = (float(value) for value in stated[0])
+        if min(height, width) >= 1 and 0.3 * width < focal_px < 5 * width:
+            return PinholeCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, round(width), round(height))
+        found = f"height {height:g}, width {width:g}, focal length {focal_px:g}"
+    raise CalibrationError(
+        f"the camera in {file} cannot be used: expected one height, width and focal length, px, in columns 5, 10 and "
+        f"15 of all rows, found {found}; put the calibration beside it as camera.yaml"
+    )

@@ -1,0 +1,64 @@
+"""Frames that are left out unasked or by rate, and why; they keep their numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from scopemap.io.video_format.duplicates import repeats
+
+if TYPE_CHECKING:
+    from scopemap.io.sequence import SourceFrame
+
+# Stamps that are written in milliseconds must not make a frame miss its turn; nor may this be a good part of one.
+_SLACK_S, _SLACK_SHARE = 1e-3, 0.25
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that was read and not used.
+
+    index, time_s, name : the frame's. kind : why, in one word. reason : why, one phrase.
+    """
+
+    index: int
+    time_s: float
+    name: str
+    kind: Literal["repeated", "thinned"]
+    reason: str
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Which of the selected frames are used.
+
+    fps : at most so many frames per second, by the time stamps; None: all. skip_repeated : leave out pictures that
+    repeat the last one used. skipped : by number, what was left out so far; grows while frames are read.
+    """
+
+    fps: float | None = None
+    skip_repeated: bool = False
+    skipped: dict[int, SkippedFrame] = field(default_factory=dict)
+
+    def __call__(self, frames: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
+        """Yield the frames that are used; the first always is."""
+        start_s, turn, last = math.nan, -math.inf, None
+        for frame in frames:
+            start_s = frame.time_s if last is None else start_s
+            due = math.inf if self.fps is None else _slot(frame.time_s - start_s, self.fps)
+            if due <= turn and self.fps is not None:
+                self._skip(frame, "thinned", f"beyond {self.fps:g} frames/s")
+            elif last is not None and self.skip_repeated and repeats(last.rgb, frame.rgb):
+                self._skip(frame, "repeated", f"repeats frame {last.index}")
+            else:
+                turn, last = due, frame
+                yield frame
+
+    def _skip(self, frame: SourceFrame, kind: Literal["repeated", "thinned"], reason: str) -> None:
+        self.skipped[frame.index] = SkippedFrame(frame.index, frame.time_s, frame.name, kind, reason)
+
+
+def _slot(passed_s: float, fps: float) -> int:
+    return math.floor(passed_s * fps + min(_SLACK_S * fps, _SLACK_SHARE))

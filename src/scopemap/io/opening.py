@@ -1,0 +1,272 @@
+"""Opening an input: which data set it is, which camera took it, which size to work at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from scopemap.cameras.formats.fitting import fitted
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.rectification import Rectifier, working_camera, working_size
+from scopemap.config import InputSettings
+from scopemap.errors import CalibrationError, InputError
+from scopemap.io.datasets.c3vd import C3vdFolder
+from scopemap.io.datasets.colmap import ColmapFolder
+from scopemap.io.datasets.dicom import Dicom
+from scopemap.io.datasets.endomapper import EndoMapperSequence
+from scopemap.io.datasets.endomapper_sim import EndoMapperSimFolder
+from scopemap.io.datasets.endonerf import EndoNerfFolder
+from scopemap.io.datasets.endoslam import EndoSlamFolder
+from scopemap.io.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
+from scopemap.io.datasets.oneslam import OneSlamFolder
+from scopemap.io.datasets.rosbag import RosBag
+from scopemap.io.datasets.scared import ScaredKeyframe
+from scopemap.io.datasets.scared_c import ScaredCKeyframe
+from scopemap.io.datasets.servct import ServCtFolder
+from scopemap.io.datasets.sevenscenes import SevenScenesFolder
+from scopemap.io.datasets.simcol import SimColFolder
+from scopemap.io.datasets.stereomis import StereoMisFolder
+from scopemap.io.datasets.tum import TumRgbdFolder
+from scopemap.io.frame_choice import FrameChoice
+from scopemap.io.images import ImageFolder
+from scopemap.io.permissions import hindrances, is_apart, may_enter
+from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
+from scopemap.io.sequence import Sequence, Source, assumed_camera
+from scopemap.io.video import VideoFile
+
+# Data sets of folders of images are ImageFolders.
+Reader: TypeAlias = (
+    ScaredCKeyframe | ScaredKeyframe | EndoMapperSequence | StereoMisFolder | RosBag | Dicom | VideoFile | ImageFolder
+)
+
+_KINDS: tuple[type[Reader], ...] = (
+    ScaredCKeyframe,
+    ScaredKeyframe,
+    HamlynFolder,
+    HamlynTrackingFolder,
+    EndoSlamFolder,
+    SimColFolder,
+    EndoMapperSequence,
+    EndoMapperSimFolder,
+    StereoMisFolder,
+    C3vdFolder,
+    EndoNerfFolder,
+    ServCtFolder,
+    SevenScenesFolder,
+    TumRgbdFolder,
+    OneSlamFolder,
+    ColmapFolder,
+    RosBag,
+    Dicom,
+    VideoFile,
+    ImageFolder,
+)
+DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
+"""The readers by name, in the order in which they are asked whether they recognise an input."""
+
+_OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
+# Those that need nothing of what lies deeper in a folder.
+_WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
+_IMAGES = "images"
+_MOST_NAMED = 3
+_USUAL_FOV_DEG = 70.0
+_SMALLEST_SIDE_PX = 32
+_DEEPEST_NESTING = 3
+_SEARCH_DEPTH = 2
+_LEAVINGS = "__MACOSX"
+
+
+def open_sequence(
+    path: Path | str,
+    *,
+    dataset: str | None = None,
+    camera: Path | str | None = None,
+    fov_deg: float | None = None,
+    size: tuple[int, int] | None = None,
+    frames: slice | None = None,
+    settings: InputSettings | None = None,
+) -> Sequence:
+    """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
+
+    `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` names the topic, too), None: told from what lies there. The
+    camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
+    of view `fov_deg`, None: 70 deg until a run knows better. `size` is the working size (width, height), px; None: the
+    input's, divided by the smallest whole number that brings it to 400 px. `frames` selects positions in the input.
+    `settings` say how it is read. Raises `InputError` and `CalibrationError`.
+    """
+    selection, settings = frames or slice(None), settings or InputSettings()
+    if selection.step is not None and selection.step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
+    with _saying_what_cannot_be_read(path):
+        reader = _reader(Path(path), dataset)
+        source = prepared(reader, settings)
+        calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
+    if size is None:
+        size, size_source = working_size(source.width, source.height), "chosen"
+    else:
+        size_source = "given (--size)"
+    if min(size) < _SMALLEST_SIDE_PX:
+        raise InputError(
+            f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
+        )
+    size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
+    rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
+    sequence = Sequence(
+        source,
+        source.path,
+        rectifier,
+        camera_source=calibration.source,
+        size_source=size_source,
+        calibrated=calibrated,
+        focal_is_stated=fov_deg is not None,
+        selection=selection,
+        depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
+        choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
+    )
+    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
+        raise InputError(f"reading {source.path}: {sequence.count} frame(s) selected, two are needed")
+    return sequence
+
+
+def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
+    """Return the frames of an input as they are in the file, one view and one field of each as `settings` say.
+
+    What is known of their camera is not looked at, right or wrong. Raises `InputError`.
+    """
+    with _saying_what_cannot_be_read(path):
+        return prepared(_reader(Path(path), dataset), settings or InputSettings())
+
+
+@contextmanager
+def _saying_what_cannot_be_read(path: Path | str) -> Iterator[None]:
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(f"reading {error.filename or path}: no permission to look into it") from None
+    except OSError as error:  # names that no file system allows, a share that is gone
+        raise InputError(f"reading {error.filename or path}: {error.strerror or error}") from None
+
+
+def _reader(path: Path, dataset: str | None) -> Reader:
+    dataset, _, part = (dataset or "").partition(":")
+    if dataset and dataset not in DATASETS:
+        raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
+    if not path.exists():
+        raise InputError(f"reading {path}: no such file or folder")
+    within: list[str] = []
+    beside: list[str] = []
+    if path.is_dir():
+        beside = hindrances(path)
+        path = _innermost(path, dataset or None)
+        within = hindrances(path)
+    elif not path.is_file():
+        raise InputError(
+            f"reading {path}: it is a pipe or a device; store what comes out of it as a file, and give that"
+        )
+    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
+    if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
+        raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
+    if part and kind != RosBag.name:
+        raise InputError(
+            f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon, got '{part}'"
+        )
+    if within and DATASETS[kind] not in _WITHOUT_LAYOUT:
+        raise InputError(f"reading {path}: {within[0]}")
+    reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
+    for hindered in list(dict.fromkeys([*within, *beside]))[:_MOST_NAMED]:
+        reader.warnings.append(f"left out: {hindered}")
+    return reader
+
+
+def _innermost(path: Path, dataset: str | None) -> Path:
+    """Return the folder that the reader `dataset` recognises in `path`, `path` where none; None: that any reader does.
+
+    Raises `InputError` where a folder holds several sequences of a data set.
+    """
+    if dataset is None:
+        return _of_any_kind(path)
+    found = _stepped_into(path, [DATASETS[dataset]])
+    return found if DATASETS[dataset].recognises(found) else path
+
+
+def _of_any_kind(path: Path) -> Path:
+    """Return the folder in `path` that is read; a container that lies about does not hide a data set or `images`."""
+    containers = [kind for kind in _KINDS if kind in (RosBag, Dicom)]
+    others = [kind for kind in _KINDS if kind not in containers]
+    found = _stepped_into(path, others)
+    pictures = ImageFolder.recognises(found)
+    layouts = [kind for kind in others if kind not in _WITHOUT_LAYOUT]
+    if (pictures and (found == path or found.name == _IMAGES)) or any(kind.recognises(found) for kind in layouts):
+        return found
+    # Without its package a container cannot be read, the pictures beside it can.
+    able = [kind for kind in containers if not pictures or kind.is_installed()]
+    return _stepped_into(path, [*able, *others])
+
+
+def _stepped_into(path: Path, kinds: list[type[Reader]]) -> Path:
+    """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only."""
+    for _ in range(_DEEPEST_NESTING):
+        if any(kind.recognises(path) for kind in kinds):
+            return path
+        inner = _folders_in(path)
+        images = [folder for folder in inner if folder.name == _IMAGES]
+        if len(images or inner) != 1:
+            return _only_sequence_below(path, kinds) or path
+        path = (images or inner)[0]
+    return path
+
+
+def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
+    """Return the one sequence of a data set in the folders below, or None; several are an error that names them."""
+    kinds = [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
+    level = _folders_in(path)
+    for _ in range(_SEARCH_DEPTH):
+        level = [folder for folder in level if may_enter(folder)]
+        found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
+        if len(found) > 1:
+            names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
+            raise InputError(f"reading {path}: it holds {len(found)} sequences ({names}); give one of them")
+        if found:
+            return found[0]
+        level = [inner for folder in level for inner in _folders_in(folder)]
+    return None
+
+
+def _folders_in(path: Path) -> list[Path]:
+    folders = (folder for folder in path.iterdir() if folder.is_dir())
+    return sorted(folder for folder in folders if not is_apart(folder.name) and folder.name != _LEAVINGS)
+
+
+def _calibration_of(
+    source: Source, file: Path | str | None, fov_deg: float | None, camera_fit: str
+) -> tuple[Calibration, bool]:
+    """Return the calibration, and whether the camera is known by it or only assumed."""
+    size = (source.width, source.height)
+    try:
+        if file is not None:
+            return read_calibration(file, size, camera_fit), True
+        if source.calibration is not None:
+            return fitted(source.calibration, size, camera_fit), True
+    except CalibrationError as fault:
+        raise CalibrationError(f"{fault}{of_one_view(source)}") from None
+    if source.camera_fault is not None:
+        raise source.camera_fault
+    if camera_fit.startswith("crop"):
+        raise CalibrationError(
+            f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit}): give the one "
+            "that was made before they were cut (--camera)"
+        )
+    unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
+    if source.camera is not None:
+        return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True
+    known, fov_deg = ("assumed", _USUAL_FOV_DEG) if fov_deg is None else ("stated", fov_deg)
+    if not 1 <= fov_deg <= 170:
+        raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
+    focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
+    assumed = f"{known}: horizontal field of view {fov_deg:g} deg (--fov){unfitted}"
+    return Calibration(assumed_camera(source, float(focal_px)), None, assumed), False

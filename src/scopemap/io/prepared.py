@@ -1,0 +1,171 @@
+"""Pictures that hold two views or two fields, brought to one: what the settings of the input say, or what is found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice
+from typing import BinaryIO
+
+import numpy as np
+
+from scopemap.cameras.formats.reading import stated_calibration
+from scopemap.config import InputSettings
+from scopemap.errors import CalibrationError, InputError
+from scopemap.io.images import ImageFolder
+from scopemap.io.sequence import KnowsNothing, Source, SourceFrame, SourceTruth
+from scopemap.io.video import VideoFile
+from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
+from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
+
+UNKNOWN_MAKE = ("video", "images", "dicom")
+"""Readers of pictures that nothing more is known of; those of data sets know what a picture holds, and have truth."""
+
+OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag")
+"""Readers that do not know whether their pictures hold two views: `input.stereo` may say it."""
+
+_SAMPLES, _SAMPLED_EVERY = 8, 10
+_FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
+_LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
+
+
+def prepared(source: Source, settings: InputSettings) -> Source:
+    """Return the source with one view and one field per picture, as the settings ask; the source itself where it is so.
+
+    With `stereo` = auto, videos and folders of images that belong to no data set are looked at, and interlaced ones
+    told of. Raises `InputError` where `stereo` names the views of a data set, whose reader knows them.
+    """
+    if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
+        raise InputError(
+            f"reading {source.path}: the reader of the data set '{source.name}' knows which view is meant; leave "
+            f"input.stereo={settings.stereo} (--stereo) out"
+        )
+    samples = _samples(source) if source.name in UNKNOWN_MAKE else []
+    packed, note = _packing(source, settings, samples)
+    if not settings.deinterlace and is_interlaced(samples):
+        source.warnings.append(
+            "the pictures are interlaced: their even and odd rows were taken at two times, and edges that move look "
+            "like combs; --deinterlace (input.deinterlace=true) uses one field of each"
+        )
+    if note:
+        source.notes.append(note)
+    if packed is None and not settings.deinterlace:
+        return source
+    return PreparedSource(source, packed, settings)
+
+
+class PreparedSource(KnowsNothing):
+    """A source of which one view and one field of each picture is used; all else is the source's own.
+
+    packed : how two views lie in a picture, of which the left eye's is used; None: the picture is one view.
+
+    Attributes
+    ----------
+    two_views : whether the pictures hold two.
+    """
+
+    def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
+        self._source, self._packed, self._deinterlace = source, packed, settings.deinterlace
+        self.two_views = packed is not None
+        self.name, self.path = source.name, source.path
+        self.notes, self.warnings = source.notes, source.warnings
+        self.count, self.stamped = source.count, source.stamped
+        self.width, self.height, self.pixel_aspect = source.width, source.height, source.pixel_aspect
+        self.depth_scale_mm, self.depth_sensor, self.masks = source.depth_scale_mm, source.depth_sensor, source.masks
+        if settings.deinterlace:
+            self.notes.append("deinterlaced: the even rows of each picture are used, the odd ones interpolated")
+        if packed is not None:
+            self.width, self.height = packed.view_size(source.width, source.height)
+            self.pixel_aspect *= packed.pixel_aspect
+        self._take_camera()
+
+    def _take_camera(self) -> None:
+        source = self._source
+        if not self.two_views:
+            self.calibration, self.camera, self.camera_source = source.calibration, source.camera, source.camera_source
+            self.camera_fault = source.camera_fault
+        elif source.calibration is not None and source.calibration.file is not None:
+            # Without a size of its own, the file beside the images is for one view; any other camera is of both.
+            try:
+                self._take(stated_calibration(source.calibration.file, (self.width, self.height)))
+            except CalibrationError as fault:
+                self.camera_fault = fault
+        elif isinstance(source, ImageFolder):
+            self.camera_fault = source.camera_fault  # of that file
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames, each with what is used of its picture."""
+        for frame in self._source.frames(selection):
+            rgb = deinterlaced(frame.rgb) if self._deinterlace else frame.rgb
+            yield replace(frame, rgb=rgb if self._packed is None else self._packed.first(rgb))
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return number and time stamp of the selected frames, None where only reading on would tell."""
+        return self._source.stamps(selection)
+
+    def media(self) -> str | BinaryIO | None:
+        """Return what FFmpeg opens, None where there is no video."""
+        return self._source.media()
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the true pose of a frame, or None."""
+        return self._source.pose(index)
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return what is known of a frame, or None."""
+        return self._source.truth(index)
+
+
+def of_one_view(source: Source) -> str:
+    """Return what to add to an error about a camera that does not fit the source, "" where pictures are one view."""
+    if not isinstance(source, PreparedSource) or not source.two_views:
+        return ""
+    return (
+        f"; the pictures hold two views, and the camera must be that of one, {source.width}x{source.height} px "
+        "(--stereo none uses the whole picture)"
+    )
+
+
+def _samples(source: Source) -> list[np.ndarray]:
+    """Return a few pictures from all parts of the input, fewer where they are large: all are held at once."""
+    picture_bytes = max(1, 3 * source.width * source.height)
+    count = max(_FEWEST_SAMPLES, min(_SAMPLES, _SAMPLES_BYTES // picture_bytes))
+    found: list[np.ndarray] = []
+    told = len(source.warnings)
+    # Where reading stops or finds faults, the run says so: it may not reach them.
+    with suppress(InputError):
+        if isinstance(source, VideoFile):
+            found.extend(source.samples(count))
+        else:
+            step = max(1, (source.count or 0) // count) if isinstance(source, ImageFolder) else _SAMPLED_EVERY
+            found.extend(frame.rgb for frame in islice(source.frames(slice(0, None, step)), count))
+    del source.warnings[told:]
+    return found
+
+
+def _packing(source: Source, settings: InputSettings, samples: list[np.ndarray]) -> tuple[Packing | None, str]:
+    """Return how two views lie in a picture, and what is to be said of it."""
+    width, height, aspect = source.width, source.height, source.pixel_aspect
+    if settings.stereo in ("left-right", "top-bottom"):
+        asked = Packing(settings.stereo, squeezed_views(width, height, settings.stereo, aspect), float("nan"))
+        return asked, _described(asked, "as asked")
+    packed = packing(samples, aspect) if settings.stereo == "auto" else None
+    if packed is not None:
+        alike = f"the halves correlate by {packed.correlation:.2f}; --stereo none (input.stereo) uses the whole picture"
+        return packed, _described(packed, alike)
+    layout = suspected(width, height, aspect) if settings.stereo == "auto" and samples else None
+    if layout is None:
+        return None, ""
+    return None, (
+        f"stereo: pictures of {width}x{height} px have the shape of two views, {layout}, but their halves do not show "
+        f"the same; used as one view (--stereo {layout} uses {_LEFT[layout]})"
+    )
+
+
+def _described(packed: Packing, why: str) -> str:
+    squeezed = ", of pixels that are " + ("twice as wide" if packed.layout == "left-right" else "half as wide")
+    return (
+        f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is used"
+        f"{squeezed + ' as the picture has them' if packed.squeezed else ''}: {why}"
+    )

@@ -1,0 +1,256 @@
+"""The contract of a data set, and the sequence of rectified frames that everything above works on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera
+from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.frame import Frame, Truth, TruthQuality
+from scopemap.io.frame_choice import FrameChoice, SkippedFrame
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One image as it is in the file, not rectified.
+
+    Attributes
+    ----------
+    index : number of the frame in the input.
+    time_s : time stamp, s.
+    rgb : (h, w, 3) uint8, sRGB.
+    name : the file's own name, or "".
+    """
+
+    index: int
+    time_s: float
+    rgb: np.ndarray
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class SourceTruth:
+    """What is known to be true of an image, in the geometry of the file.
+
+    Attributes
+    ----------
+    T_world_camera : (4, 4) float64, mm, or None.
+    depth_mm : (h, w) float32 along the optical axis, NaN = unknown, of the image's view or what the source's
+        `depth_sensor` sees, at any size; or None.
+    quality : how the truth came about.
+    """
+
+    T_world_camera: np.ndarray | None
+    depth_mm: np.ndarray | None
+    quality: TruthQuality
+
+
+class Source(Protocol):
+    """Something that holds frames: a video, a folder of one data set's layout.
+
+    Attributes
+    ----------
+    name : the data set's name.
+    path : the file or folder.
+    width, height : size of the images, px.
+    count : number of frames, or None where only reading on would tell.
+    calibration : what the calibration file beside the frames says, of whatever size; None where there is none.
+    camera : the camera of the images, or None where it is unknown; that of `calibration` where there is one.
+    camera_source : how the camera is known, one phrase, or "".
+    camera_fault : why the data set's own camera cannot be used, None where it can.
+    pixel_aspect : width of a pixel over its height.
+    stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
+    depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
+    depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
+    masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
+    notes : what had to be assumed.
+    warnings : what was found wrong so far; grows while frames are read.
+    """
+
+    name: str
+    path: Path
+    width: int
+    height: int
+    count: int | None
+    calibration: Calibration | None
+    camera: CameraModel | None
+    camera_source: str
+    camera_fault: ScopemapError | None
+    pixel_aspect: float
+    stamped: bool
+    depth_scale_mm: float | None
+    depth_sensor: DepthSensor | None
+    masks: Path | None
+    notes: list[str]
+    warnings: list[str]
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
+
+    def media(self) -> str | BinaryIO | None:
+        """Return what FFmpeg opens, a name or a file, where the frames are those of one video; None elsewhere."""
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return what is known of the frame with this `SourceFrame.index`, or None."""
+
+
+class KnowsNothing:
+    """What a source says beside its frames until it has something to say: see `Source`."""
+
+    pixel_aspect = 1.0
+    stamped = False
+    calibration: Calibration | None = None
+    camera: CameraModel | None = None
+    camera_source = ""
+    camera_fault: ScopemapError | None = None
+    depth_scale_mm: float | None = None
+    depth_sensor: DepthSensor | None = None
+    masks: Path | None = None
+
+    def media(self) -> str | BinaryIO | None:
+        """Nothing: no video."""
+        return None
+
+    def _take(self, calibration: Calibration) -> None:
+        """Use the calibration beside the frames, which comes before a data set's own; opening fits it."""
+        self.calibration = replace(calibration, source=f"{calibration.source} beside the frames")
+        self.camera, self.camera_source = calibration.camera, self.calibration.source
+        self.depth_scale_mm = calibration.depth_scale_mm
+
+
+def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:
+    """Return a pinhole camera with horizontal focal length `focal_px` and its axis through the image's centre."""
+    cx, cy = (source.width - 1) / 2, (source.height - 1) / 2
+    return PinholeCamera(focal_px, focal_px * source.pixel_aspect, cx, cy, source.width, source.height)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames of one input, rectified to a pinhole camera of the working size, with their truth where it is known.
+
+    Iterating yields `(Frame, Truth | None)`; frames are decoded one at a time, and it may be iterated again. Raises
+    `InputError` at the end where fewer than two frames could be read.
+
+    Attributes
+    ----------
+    source : where the frames come from.
+    path : the file or folder, as found.
+    rectifier : from the source's camera to the working camera.
+    camera_source : how the camera is known, one phrase.
+    size_source : where the working size comes from, one phrase.
+    calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
+    focal_is_stated : whether the field of view was given, not assumed.
+    selection : slice over the input's frames.
+    depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
+    focal_sigma_px : standard deviation of an estimated focal length at the working size, None where none is known.
+    choice : which of the selected frames are left out.
+    """
+
+    source: Source
+    path: Path
+    rectifier: Rectifier
+    camera_source: str
+    size_source: str
+    calibrated: bool
+    focal_is_stated: bool = False
+    selection: slice = field(default_factory=lambda: slice(None))
+    depth_scale_mm: float | None = None
+    focal_sigma_px: float | None = None
+    choice: FrameChoice = field(default_factory=FrameChoice)
+
+    @property
+    def name(self) -> str:
+        """The input's own name: of its file or folder."""
+        return self.path.stem if self.path.is_file() else self.path.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The working camera, which every frame carries."""
+        return self.rectifier.target
+
+    @cached_property
+    def depth_rectifier(self) -> Rectifier:
+        """From the depth files beside the frames to the working camera."""
+        sensor = self.source.depth_sensor
+        return self.rectifier if sensor is None else SensorRectifier(self.rectifier, sensor)
+
+    @property
+    def count(self) -> int | None:
+        """Number of selected frames, those that will be skipped too, or None where only reading on would tell.
+
+        A video's is its header's claim.
+        """
+        return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
+
+    @property
+    def skipped(self) -> list[SkippedFrame]:
+        """The selected frames that were left out so far, as `choice` has it, in order."""
+        return [frame for _, frame in sorted(self.choice.skipped.items())]
+
+    @property
+    def notes(self) -> list[str]:
+        """What had to be assumed about the input."""
+        return [*self.source.notes, *([] if self.calibrated else [f"camera {self.camera_source}"])]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found wrong while reading, so far."""
+        return list(self.source.warnings)
+
+    def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
+        """Yield each frame, rectified, with its truth."""
+        for frame in self.frames():
+            yield frame, self._truth(frame.index)
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two."""
+        found = 0
+        for item in self.choice(self.source.frames(self.selection)):
+            rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
+            yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
+            found += 1
+        if found < 2:
+            raise InputError(
+                f"reading {self.path}: {found} readable frame(s) in the selection, two are needed{self._why_so_few()}"
+            )
+
+    def with_focal(self, focal_px: float, source: str, sigma_px: float | None = None) -> Sequence:
+        """Return the sequence with another guess of an unknown camera.
+
+        `focal_px` is the horizontal focal length at the working size, `sigma_px` its standard deviation where one is
+        known; `source` says how it is known. Raises `CalibrationError` where the camera is known.
+        """
+        if self.calibrated:
+            raise CalibrationError(f"the focal length of {self.path} is known ({self.camera_source}); it stays")
+        camera = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
+        target = working_camera(camera, (self.camera.width, self.camera.height))
+        return replace(self, rectifier=Rectifier(camera, target), camera_source=source, focal_sigma_px=sigma_px)
+
+    def _why_so_few(self) -> str:
+        if not self.skipped:
+            return ""
+        frame, kinds = self.skipped[-1], {skipped.kind for skipped in self.skipped}
+        remedies = {"thinned": "a higher input.fps", "repeated": "input.skip_duplicates=false"}
+        remedy = " or ".join(text for kind, text in remedies.items() if kind in kinds)
+        return f" ({len(self.skipped)} skipped: frame {frame.index} {frame.reason}; {remedy} uses more)"
+
+    def _truth(self, index: int) -> Truth | None:
+        truth = self.source.truth(index)
+        if truth is None:
+            return None
+        depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
+        return Truth(index, truth.T_world_camera, depth_mm, truth.quality)

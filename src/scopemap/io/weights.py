@@ -1,0 +1,230 @@
+"""Weights on this machine: where they lie, whether they are what they should be, and how to fetch them.
+
+All weights lie in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. Nothing is downloaded
+but by `pull`, on the user's word. What `checkpoints.py` pins by hash is held to it; what was pulled is hashed into the
+folder's `weights.lock.json`, with the revision it came at, and held to that ever after.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+from scopemap.errors import WeightsError
+from scopemap.io.checkpoints import REGISTRY, Checkpoint, find
+
+State = Literal["present", "missing", "damaged"]
+LOCK_NAME = "weights.lock.json"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of `overview`: a checkpoint and the state of its files."""
+
+    name: str
+    purpose: str
+    licence: str
+    size_mb: float
+    state: State
+    path: Path
+
+
+def weights_folder() -> Path:
+    """Return the folder of all weights; it need not exist."""
+    if chosen := os.environ.get("SCOPEMAP_WEIGHTS_DIR"):
+        return Path(chosen).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "scopemap"
+
+
+def is_present(*names: str) -> bool:
+    """Return True if the files of any of `names` are there; their content is not looked at."""
+    return any(_is_there(find(name)) for name in names)
+
+
+def locate(*names: str) -> Path:
+    """Return the checked file or folder of the first of `names` that is there; never downloads.
+
+    Files unchanged since they were recorded are not hashed again (`verify` does that). Raises `WeightsError` that says
+    what to fetch and where it must lie, or which file is damaged.
+    """
+    checkpoints = [find(name) for name in names]
+    for checkpoint in checkpoints:
+        if _is_there(checkpoint):
+            return _checked(checkpoint)
+    raise WeightsError(_advice(checkpoints))
+
+
+def verify(name: str) -> Path:
+    """Hash every file of `name` anew and return its place; raises `WeightsError` if one is missing or damaged."""
+    _hash.cache_clear()
+    checkpoint = find(name)
+    if not _is_there(checkpoint):
+        raise WeightsError(_advice([checkpoint]))
+    return _checked(checkpoint, trust_stamps=False)
+
+
+def overview() -> list[Row]:
+    """Return the state of every registered checkpoint and of every other one that was pulled."""
+    names = [*REGISTRY, *(name for name in _read_lock() if name not in REGISTRY)]
+    rows = []
+    for checkpoint in map(find, names):
+        shown = (checkpoint.name, checkpoint.purpose, checkpoint.licence, checkpoint.size_mb)
+        rows.append(Row(*shown, _state(checkpoint), weights_folder() / checkpoint.place))
+    return rows
+
+
+def pull(name: str, *, progress: bool = False) -> Path:
+    """Download the weights `name`, check and record them, and return their place; what is there is only checked.
+
+    Raises `WeightsError` if they can only be fetched by hand, if `HF_HUB_OFFLINE` forbids the network, if the download
+    fails, or if what came is not what is pinned.
+    """
+    checkpoint = find(name)
+    if _is_there(checkpoint):
+        return verify(name)
+    if checkpoint.source == "hand":
+        raise WeightsError(_advice([checkpoint]))
+    if os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}:
+        raise WeightsError(f"cannot pull '{name}' while HF_HUB_OFFLINE is set: unset it")
+    download = _download_from_hub if checkpoint.source == "hub" else _download_from_torchvision
+    try:
+        weights_folder().mkdir(parents=True, exist_ok=True)
+        revision = download(checkpoint, progress)
+    except Exception as error:  # the clients raise the errors of half a dozen libraries
+        raise WeightsError(f"cannot pull '{name}' from {checkpoint.location}: {error}") from error
+    _record(checkpoint, revision)
+    return _checked(checkpoint)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits; computed once per process for an unchanged file."""
+    stat = path.stat()
+    return _hash(str(path), stat.st_size, stat.st_mtime_ns)
+
+
+def recorded_revision(name: str) -> str:
+    """Return the commit that the weights `name` are pinned to or were pulled at; "" if there is none."""
+    checkpoint = find(name)
+    return _read_lock().get(checkpoint.name, {}).get("revision", "") or checkpoint.revision
+
+
+@lru_cache(maxsize=64)
+def _hash(path: str, size: int, mtime_ns: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _expected(checkpoint: Checkpoint) -> dict[str, list[str]]:
+    """Return file -> the hashes (or leading digits) that it must have: pinned here, recorded at the pull, or both."""
+    recorded = _read_lock().get(checkpoint.name, {}).get("files", {})
+    files = checkpoint.files or recorded
+    return {file: [checkpoint.files.get(file, ""), recorded.get(file, {}).get("sha256", "")] for file in files}
+
+
+def _is_there(checkpoint: Checkpoint) -> bool:
+    expected = _expected(checkpoint)
+    return bool(expected) and all((weights_folder() / file).is_file() for file in expected)
+
+
+def _checked(checkpoint: Checkpoint, *, trust_stamps: bool = True) -> Path:
+    recorded = _read_lock().get(checkpoint.name, {}).get("files", {})
+    for file, hashes in _expected(checkpoint).items():
+        path = weights_folder() / file
+        record = recorded.get(file)
+        unchanged = trust_stamps and record is not None and record == _stamp(path, record["sha256"])
+        found = record["sha256"] if unchanged else sha256_of(path)
+        if not all(found.startswith(wanted) for wanted in hashes):
+            raise WeightsError(
+                f"the weights of '{checkpoint.name}' are damaged or of another version: {path} has SHA-256 {found}, "
+                f"expected {' and '.join(filter(None, hashes))}. Delete the file and {_how_to_fetch(checkpoint)}"
+            )
+    return weights_folder() / checkpoint.place
+
+
+def _state(checkpoint: Checkpoint) -> State:
+    if not _is_there(checkpoint):
+        return "missing"
+    try:
+        _checked(checkpoint)
+    except WeightsError:
+        return "damaged"
+    return "present"
+
+
+def _advice(checkpoints: list[Checkpoint]) -> str:
+    ways = "; or ".join(_how_to_fetch(checkpoint) for checkpoint in checkpoints)
+    return f"the weights of '{checkpoints[0].name}' are not in {weights_folder()}: {ways}"
+
+
+def _how_to_fetch(checkpoint: Checkpoint) -> str:
+    if checkpoint.source == "hand":
+        return f"put {checkpoint.place} there, {checkpoint.licence}, to be found {checkpoint.location}"
+    size = f"{checkpoint.size_mb:.0f} MB, " if checkpoint.size_mb else ""
+    command = f"run `scopemap models pull {checkpoint.name}` ({size}licence: {checkpoint.licence})"
+    return f"{command}, or name a local folder that holds the model" if checkpoint.source == "hub" else command
+
+
+def _download_from_torchvision(checkpoint: Checkpoint, progress: bool) -> str:
+    import torch
+    import torchvision
+
+    url = torchvision.models.get_weight(checkpoint.location).url
+    path = weights_folder() / checkpoint.place
+    torch.hub.download_url_to_file(url, str(path), hash_prefix=checkpoint.files[checkpoint.place], progress=progress)
+    return ""
+
+
+def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
+    """Download a repository's configuration and safetensors and return the commit they came from."""
+    from huggingface_hub import HfApi, snapshot_download
+    from huggingface_hub.utils import disable_progress_bars, enable_progress_bars
+
+    (enable_progress_bars if progress else disable_progress_bars)()
+    commit = checkpoint.revision or HfApi().model_info(checkpoint.location).sha
+    snapshot_download(
+        checkpoint.location,
+        revision=commit,
+        local_dir=weights_folder() / checkpoint.place,
+        allow_patterns=["config.json", "preprocessor_config.json", "*.safetensors", "*.safetensors.index.json"],
+    )
+    return commit or ""
+
+
+def _record(checkpoint: Checkpoint, revision: str) -> None:
+    """Write what was pulled, and its hashes, to the lock file."""
+    folder, place = weights_folder(), weights_folder() / checkpoint.place
+    if place.is_dir():
+        found = [
+            path for path in place.rglob("*") if path.suffix in {".json", ".safetensors"} and ".cache" not in path.parts
+        ]
+    else:
+        found = [place]
+    if checkpoint.source == "hub" and not any(path.suffix == ".safetensors" for path in found):
+        raise WeightsError(
+            f"'{checkpoint.location}' holds no safetensors, and other formats are not loaded: use another"
+        )
+    files = {path.relative_to(folder).as_posix(): _stamp(path, sha256_of(path)) for path in sorted(found)}
+    lock = _read_lock() | {checkpoint.name: {"revision": revision, "files": files}}
+    draft = folder / f"{LOCK_NAME}.part"
+    draft.write_text(json.dumps(lock, indent=2) + "\n", encoding="utf-8")
+    draft.replace(folder / LOCK_NAME)
+
+
+def _stamp(path: Path, sha256: str) -> dict[str, Any]:
+    stat = path.stat()
+    return {"sha256": sha256, "size": stat.st_size, "mtime_ns": stat.st_mtime_ns}
+
+
+def _read_lock() -> dict[str, Any]:
+    path = weights_folder() / LOCK_NAME
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except (OSError, ValueError) as error:
+        raise WeightsError(
+            f"cannot read the record of pulled weights {path}: {error}. Delete it and pull again"
+        ) from None

@@ -1,0 +1,7 @@
+"""The back end: keyframes adjusted together, once the front end has tracked them."""
+
+from scopemap.mapping.backend import Backend
+from scopemap.mapping.depth_correction import LARGEST_LOG_FACTOR
+from scopemap.mapping.pose_interpolation import Correction, Seat
+
+__all__ = ["LARGEST_LOG_FACTOR", "Backend", "Correction", "Seat"]

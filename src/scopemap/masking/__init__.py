@@ -1,0 +1,1 @@
+"""Which pixels show usable tissue: field of view, exposure, highlights, overlays, instruments."""

@@ -1,0 +1,119 @@
+"""Masks from files: what others know to be no tissue, instruments above all, one image per frame or one for all."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.cameras.rectification import Rectifier
+from scopemap.config import MaskSettings
+from scopemap.errors import InputError
+from scopemap.io.decoding import read_decoded
+
+_LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
+_LOSSY = (".jpg", ".jpeg")
+_HALF = 127
+_NO_MASKS = "none"
+
+
+def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None = None) -> MaskFiles | None:
+    """Return the masks that the settings name, where they name none the data set's own, None where there are none.
+
+    own : folder of the data set's masks, or None. Raises as `MaskFiles` does.
+    """
+    folder = Path(settings.files) if settings.files else own
+    if folder is None or settings.files == _NO_MASKS:
+        return None
+    return MaskFiles(folder, rectifier, settings.files_grow_px)
+
+
+class MaskFiles:
+    """Masks in a folder, found by the last whole number in their names, which is the frame's; or one for all frames.
+
+    The one for all frames is the only image of its folder, and has no number in its name.
+
+    folder : holds the images. rectifier : from the camera of the images to the working camera.
+    grow_px : by which masks are widened, at the working size: outlines are drawn a little inside more often than not.
+
+    Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
+    """
+
+    def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
+        self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
+        self._files, self._single = _numbered(self._folder)
+        self._covered_always: np.ndarray | None = None
+        self._asked: set[int] = set()
+
+    def covered(self, index: int) -> np.ndarray | None:
+        """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
+
+        Masked is what is not 0, in a JPEG what is above 127. Raises `InputError` for a file that is no image,
+        `CalibrationError` for one of another aspect than the images.
+        """
+        if self._single is not None:
+            if self._covered_always is None:
+                self._covered_always = self._read(self._single)
+            return self._covered_always
+        self._asked.add(index)
+        file = self._files.get(index)
+        return None if file is None else self._read(file)
+
+    def _read(self, file: Path) -> np.ndarray:
+        image = read_decoded(file)
+        if image is None:
+            raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
+        # An alpha channel is no part of what is drawn.
+        level = image if image.ndim == 2 else image[..., :3].max(-1)
+        masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
+        if self._grow_px > 0:
+            side = 2 * self._grow_px + 1
+            masked = cv2.dilate(masked, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+        return masked > 0
+
+    def provenance(self) -> dict[str, str]:
+        """Return the folder, how many masks it holds, and how many of the frames that were asked for have one."""
+        if self._single is not None:
+            return {"masks": f"{self._single}, for all frames"}
+        found = f"{len(self._files)} files in {self._folder}"
+        if self._asked:
+            found += f"; {len(self._asked & set(self._files))} of {len(self._asked)} frames have one"
+        return {"masks": found}
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to say where most frames have no mask; numbers that do not fit look just like that."""
+        missing = len(self._asked - set(self._files))
+        if 2 * missing <= len(self._asked):
+            return []
+        return [
+            f"masks: {missing} of {len(self._asked)} frames have none in {self._folder}; the last number in a mask's "
+            "name must be the frame's"
+        ]
+
+
+def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:
+    """Return the images by the number in their names, and the only image where that has none."""
+    if not folder.is_dir():
+        raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
+    images = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
+    images = [file for file in images if not file.name.startswith(".")]
+    found: dict[int, Path] = {}
+    for file in images:
+        numbers = re.findall(r"\d+", file.stem)
+        if not numbers:
+            continue
+        number = int(numbers[-1])
+        if number in found:
+            raise InputError(f"two masks for frame {number} in {folder}: {found[number].name} and {file.name}")
+        found[number] = file
+    if found:
+        return found, None
+    if len(images) == 1:
+        return {}, images[0]
+    raise InputError(
+        f"reading masks: {folder} holds no image with a number in its name, which is the frame's, and not one image "
+        "alone, for all frames"
+    )

@@ -1,0 +1,98 @@
+"""Which pixels show usable tissue: field of view, highlights, exposure, overlays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from scopemap.config import MaskSettings
+from scopemap.frame import Frame
+from scopemap.masking.field_of_view import FieldOfView
+from scopemap.masking.mask_files import MaskFiles
+from scopemap.masking.overlays import OverlayFinder
+
+# The local level that a highlight stands out from is taken over this share of the image's longer side.
+_NEIGHBOURHOOD_SHARE = 0.09
+_DARKEST_HIGHLIGHT = 70
+# Width of the mean that leaves little of a sensor's noise.
+_CALM_WIDTH_PX = 5
+
+
+class Masker:
+    """Narrows `Frame.valid` to usable tissue; the field of view is learnt from the frames it has seen so far.
+
+    files : masks of what is known to be no tissue, or None.
+    """
+
+    def __init__(self, settings: MaskSettings, files: MaskFiles | None = None) -> None:
+        self.settings, self._files = settings, files
+        self._field = FieldOfView(settings.border_px)
+        self._overlays = OverlayFinder() if settings.overlays else None
+
+    def __call__(self, frame: Frame) -> Frame:
+        """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.
+
+        Under-exposed is a pixel whose brightest channel is at most `dark_level`, its own or the mean around it: noise
+        lifts single pixels of a black image. Over-exposed is one whose second brightest channel reaches
+        `bright_level`: red alone clips on sound tissue, and leaves two channels to see by.
+        """
+        darkest, middle = _darker_channels(frame.rgb)
+        clipped = middle >= self.settings.bright_level
+        lit = is_lit(frame.rgb, self.settings.dark_level)
+        valid = frame.valid & lit & ~clipped
+        field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
+        if self.settings.highlights:
+            bright = clipped | specular(darkest, field, self.settings.highlight_ratio)
+            valid &= ~_grown(bright, self.settings.highlight_grow_px)
+        overlays = None if self._overlays is None else self._overlays(frame.rgb, field)
+        files = None if self._files is None else self._files.covered(frame.index)
+        for covered in (overlays, files):
+            if covered is not None:
+                valid &= ~covered
+        return replace(frame, valid=valid & field)
+
+
+def specular(darkest: np.ndarray, field: np.ndarray, ratio: float) -> np.ndarray:
+    """Return specular highlights, (H, W) bool.
+
+    Tissue is red, a mirror image of the lamp is white: the darkest channel, (H, W) uint8, stands out from its local
+    median, `ratio` times as bright. What is outside `field`, (H, W) bool, takes no part: it would make a highlight of
+    the rim.
+    """
+    if not field.any():
+        return np.zeros_like(field)
+    surroundings = _local_median(np.where(field, darkest, np.median(darkest[field])).astype(np.uint8))
+    return (darkest > ratio * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
+
+
+def is_lit(rgb: np.ndarray, dark_level: int) -> np.ndarray:
+    """Return which pixels of an image (H, W, 3) uint8 are brighter than `dark_level`, and the mean around them, too."""
+    calm = cv2.blur(rgb, (_CALM_WIDTH_PX, _CALM_WIDTH_PX))
+    return cv2.min(_brightest(rgb), _brightest(calm)) > dark_level
+
+
+def _brightest(rgb: np.ndarray) -> np.ndarray:
+    r, g, b = cv2.split(rgb)
+    return cv2.max(cv2.max(r, g), b)
+
+
+def _darker_channels(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the darkest and the middle channel of each pixel, (H, W) uint8 each."""
+    r, g, b = cv2.split(rgb)
+    low, high = cv2.min(r, g), cv2.max(r, g)
+    return cv2.min(low, b), cv2.max(low, cv2.min(high, b))
+
+
+def _local_median(level: np.ndarray) -> np.ndarray:
+    """Return the median (H, W) uint8 around each pixel of `level` (H, W) uint8, computed at a quarter of the size."""
+    height, width = level.shape
+    small = cv2.resize(level, (max(1, width // 4), max(1, height // 4)), interpolation=cv2.INTER_AREA)
+    side = max(3, round(_NEIGHBOURHOOD_SHARE * max(small.shape)) | 1)
+    return cv2.resize(cv2.medianBlur(small, side), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _grown(mask: np.ndarray, radius_px: int) -> np.ndarray:
+    side = 2 * radius_px + 1
+    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))).astype(bool)

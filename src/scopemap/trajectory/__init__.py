@@ -1,0 +1,1 @@
+"""Stamped camera poses, and the trajectory files of others."""

@@ -1,0 +1,66 @@
+"""Folders of our own runs, and of 7-Scenes (a file of 4 lines per frame, camera-to-world, metres).
+
+7-Scenes: Shotton et al., "Scene coordinate regression forests for camera relocalization in RGB-D images", CVPR 2013.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.errors import InputError
+from scopemap.trajectory.formats.poses import rigid, stamped
+from scopemap.trajectory.formats.text import read_numbers, tum_poses
+from scopemap.trajectory.trajectory import MM_PER_UNIT, SKIPPED, STATUSES, Trajectory, Unit
+
+_SAME_TIME_S = 2e-3
+
+
+def read_run(folder: Path, unit: Unit) -> Trajectory:
+    """Read `trajectory.tum` and `frames.csv` of a run, always mm, with frame numbers and lost frames.
+
+    Frames that the run skipped have no pose, and are not among them.
+    """
+    table = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
+    indices, times_s, status = _read_frames(folder / "frames.csv")
+    same_run = len(indices) == len(table.values) and np.abs(times_s - table.values[:, 0]).max() <= _SAME_TIME_S
+    if not same_run:
+        raise InputError(
+            f"{folder}: trajectory.tum ({len(table.values)} poses) and frames.csv ({len(indices)} frames) are not of "
+            "the same run; run again into an empty folder"
+        )
+    T, words = tum_poses(table, "mm")
+    return replace(stamped(T, indices, times_s, f"run of scopemap, camera-to-world, {words}"), status=status)
+
+
+def _read_frames(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    try:
+        read = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        rows = [row for row in read if row["status"] != SKIPPED]
+        indices = np.array([int(row["index"]) for row in rows], dtype=np.int64)
+        times_s = np.array([float(row["time_s"]) for row in rows])
+        status = np.array([row["status"] for row in rows])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"cannot read {path}: every row needs index, time_s and status ({error})") from None
+    if np.any(np.diff(indices) <= 0) or not set(status.tolist()) <= set(STATUSES):
+        raise InputError(f"cannot read {path}: index must ascend and status be one of {', '.join(STATUSES)}")
+    return indices, times_s, status
+
+
+def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:
+    """Read `frame-NNNNNN.pose.txt` files, always metres; the number in the name is the frame's."""
+    numbered = sorted((int(re.sub(r"\D", "", path.name)), path) for path in folder.glob("frame-*.pose.txt"))
+    if not numbered:
+        raise InputError(f"cannot read a trajectory from {folder}: looked for frame-*.pose.txt")
+    tables = [read_numbers(path) for _, path in numbered]
+    for table in tables:
+        if table.values.shape != (4, 4):
+            raise InputError(f"{table.path}: expected 4 lines of 4 numbers, found {table.values.shape}")
+    T = np.stack([table.values for table in tables])
+    T[:, :3, 3] *= MM_PER_UNIT["m"]
+    T = rigid(T, [str(table.path) for table in tables])
+    return stamped(T, np.array([number for number, _ in numbered]), None, "7-Scenes, camera-to-world, m")

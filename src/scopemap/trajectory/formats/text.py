@@ -1,0 +1,180 @@
+"""Tables of numbers, a pose a line: TUM (8 columns), KITTI (12) and C3VD (16), and the systems that write them.
+
+OneSLAM (github.com/arcadelab/OneSLAM, slam.py, write_tum_poses) writes its keyframes alone to `poses_pred.txt`, as TUM
+rows camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same
+form. Its scale is that of a constant first guess of depth, so arbitrary.
+
+BodySLAM (github.com/GuidoManni/BodySLAM, UTILS/io_utils.py and EVALUATION/MPEM_eval.py, save_poses_as_kitti) writes the
+upper 3x4 of every pose as a KITTI line. It chains T_i = T_(i-1) relative_i, which is right for camera-to-world poses;
+scale and unit are not stated. Its SCARED truth is the JSON's world-to-camera matrix as it stands: read the JSON.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.errors import InputError
+from scopemap.trajectory.formats.poses import are_frame_numbers, file_of, from_quaternions, rigid, stamped
+from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+
+ONESLAM_FILES = ("poses_pred.txt", "poses_gt.txt")
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """The numbers of a text file: values (N, C), the line each row stood on, and the comment lines."""
+
+    path: Path
+    values: np.ndarray
+    line_numbers: list[int]
+    comments: str
+
+    @property
+    def where(self) -> list[str]:
+        """File and line of each row."""
+        return [f"{self.path}, line {line}" for line in self.line_numbers]
+
+    def unit(self, assumed: Unit) -> tuple[float, str]:
+        """Return mm per unit, and the unit in words: what a comment states, else `assumed`."""
+        stated = re.search(r"\bunit:\s*(mm|m)\b", self.comments)
+        if stated is None:
+            return MM_PER_UNIT[assumed], f"{assumed} (assumed)"
+        return MM_PER_UNIT["m" if stated[1] == "m" else "mm"], f"{stated[1]} (stated)"
+
+    def with_columns(self, count: int, form: str) -> NumberTable:
+        """Return the table if its rows hold `count` numbers, as `form` does; raises `InputError`."""
+        if self.values.shape[1] != count:
+            raise InputError(
+                f"{self.where[0]}: found {self.values.shape[1]} numbers where {form} has {count} in every line"
+            )
+        return self
+
+    def sorted_by_stamp(self) -> NumberTable:
+        """Return the table in ascending order of its first column; raises `InputError` where a stamp comes again."""
+        order = np.argsort(self.values[:, 0], kind="stable")
+        repeated = np.flatnonzero(np.diff(self.values[order, 0]) == 0)
+        if repeated.size:
+            where = self.where[order[repeated[0] + 1]]
+            raise InputError(f"{where}: the time stamp of an earlier line comes again; leave one out")
+        return replace(self, values=self.values[order], line_numbers=[self.line_numbers[k] for k in order])
+
+
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a text file; `InputError` where it cannot be read as text."""
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read a trajectory from {path}: {error}") from None
+
+
+def fields_of(line: str) -> list[str]:
+    """Return what stands in a line before a `#`, split at spaces and commas."""
+    return line.partition("#")[0].replace(",", " ").split()
+
+
+def read_numbers(path: Path) -> NumberTable:
+    """Return the table in a text file; `InputError`, with the line, where it is no table of finite numbers."""
+    lines = text_lines(path)
+    rows: list[list[float]] = []
+    line_numbers: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        fields = fields_of(line)
+        if not fields:
+            continue
+        rows.append(parse_row(fields, f"{path}, line {number}"))
+        line_numbers.append(number)
+        if len(rows[-1]) != len(rows[0]):
+            raise InputError(
+                f"{path}, line {number}: found {len(fields)} numbers where earlier lines have {len(rows[0])}"
+            )
+    if not rows:
+        raise InputError(f"cannot read a trajectory from {path}: it holds no pose")
+    comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
+    return NumberTable(path, np.array(rows), line_numbers, comments)
+
+
+def parse_row(fields: list[str], where: str) -> list[float]:
+    """Return the numbers in `fields`; `InputError`, with `where`, at what is no finite number."""
+    try:
+        row = [float(field) for field in fields]
+    except ValueError as error:
+        raise InputError(f"{where}: expected numbers ({error}); mark comments by '#'") from None
+    if not np.all(np.isfinite(row)):
+        raise InputError(f"{where}: a pose holds NaN or infinity; leave out frames without a pose")
+    return row
+
+
+def tum_poses(table: NumberTable, unit: Unit) -> tuple[np.ndarray, str]:
+    """Return the poses (N, 4, 4), mm, of `stamp tx ty tz qx qy qz qw` rows, and their unit in words."""
+    mm_per_unit, words = table.unit(unit)
+    return from_quaternions(table.values[:, 4:], table.values[:, 1:4] * mm_per_unit, table.where), words
+
+
+def read_tum(path: Path, unit: Unit) -> Trajectory:
+    """Read TUM rows; stamps that are all integers are frame numbers, unless a comment says `time: s`."""
+    table = read_numbers(file_of(path, ())).with_columns(8, "TUM").sorted_by_stamp()
+    T, words = tum_poses(table, unit)
+    stamps = table.values[:, 0]
+    source = f"TUM, camera-to-world, {words}"
+    if re.search(r"\btime:\s*s\b", table.comments) or not are_frame_numbers(stamps):
+        return stamped(T, None, stamps, f"{source}, stamps are seconds")
+    return stamped(T, stamps, None, f"{source}, whole stamps taken for frame numbers")
+
+
+def read_oneslam(path: Path, unit: Unit) -> Trajectory:
+    """Read the keyframes of a OneSLAM run, or the `poses_gt.txt` of a data set in its layout."""
+    table = read_numbers(file_of(path, ONESLAM_FILES)).with_columns(8, "OneSLAM").sorted_by_stamp()
+    T, words = tum_poses(table, unit)
+    stamps = table.values[:, 0]
+    if not are_frame_numbers(stamps):
+        raise InputError(
+            f"{table.path}: OneSLAM stamps poses by frame number, found {stamps[0]:g} to {stamps[-1]:g}, not all of "
+            "them whole; files with seconds are of the kind 'tum'"
+        )
+    return stamped(T, stamps, None, f"OneSLAM, TUM rows by frame number, camera-to-world, {words}")
+
+
+def read_kitti(path: Path, unit: Unit) -> Trajectory:
+    """Read KITTI rows, the upper 3x4 of a camera-to-world pose each; row = frame number, from 0."""
+    return _read_kitti(path, unit, "KITTI")
+
+
+def read_bodyslam(path: Path, unit: Unit) -> Trajectory:
+    """Read the KITTI rows that BodySLAM writes."""
+    return _read_kitti(path, unit, "BodySLAM, KITTI rows")
+
+
+def _read_kitti(path: Path, unit: Unit, form: str) -> Trajectory:
+    table = read_numbers(file_of(path, ())).with_columns(12, form)
+    mm_per_unit, words = table.unit(unit)
+    T = np.tile(np.eye(4), (len(table.values), 1, 1))
+    T[:, :3] = table.values.reshape(-1, 3, 4)
+    T[:, :3, 3] *= mm_per_unit
+    return stamped(rigid(T, table.where), np.arange(len(T)), None, f"{form}, camera-to-world, {words}, row = frame")
+
+
+def read_c3vd(path: Path, unit: Unit) -> Trajectory:
+    """Read C3VD's `pose.txt`, always mm; see `scopemap.trajectory.trajectory.read_poses`. `unit` is not asked."""
+    table = read_numbers(file_of(path, ("pose.txt",))).with_columns(16, "C3VD's pose.txt")
+    T = table.values.reshape(-1, 4, 4)
+    if np.allclose(T[:, :3, 3], 0):
+        T, order = np.swapaxes(T, 1, 2), "stored transposed"
+    elif np.allclose(T[:, 3, :3], 0):
+        order = "row-major"
+    else:
+        raise InputError(f"cannot read poses from {table.path}: neither the last row nor the last column is 0 0 0 1")
+    T = rigid(T, table.where)
+    return stamped(T, np.arange(len(T)), None, f"C3VD pose.txt, {order}, camera-to-world, mm, row = frame")
+
+
+def read_poses(path: Path) -> np.ndarray:
+    """Return the camera-to-world poses (N, 4, 4), mm, of a `pose.txt`: 16 numbers a line, by commas or spaces.
+
+    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
+    over all its lines (with no translation at all they look alike: taken as stored). Raises `InputError`.
+    """
+    return read_c3vd(Path(path), "mm").T_world_camera
