@@ -18,8 +18,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from scopemap.errors import SettingsError
+from scopemap.presets import PRESETS
 
 Preset = Literal["paper", "default", "realtime"]
+RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
+RENAMED: dict[str, str] = {}
+"""Settings of earlier versions by what they are called now, with the group's new name on both sides."""
 
 
 class Settings(BaseModel):
@@ -308,56 +312,6 @@ class FusionSettings(Settings):
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
 
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "paper": {
-        "input.focal": "assume",
-        "input.skip_duplicates": False,
-        "mask.overlays": False,
-        "depth.backend": "depth-anything",
-        "depth.anchor": "depth-pro",
-        "depth.fit_shift": False,
-        "mapis.order": "refine-first",
-        "mapis.frame_scale": "none",
-        "mapis.blend": "linear",
-        "mapis.recursive": False,
-        "mapis.compare_warped": False,
-        "mapis.perceptual_score": True,
-        "networks.flow": "raft-large",
-        "networks.perceptual": "lpips",
-        "tracking.keyframe_every": 2,
-        "tracking.keyframe_agreement": 0.0,
-        "tracking.finest_level": 0,
-        "tracking.channels": "grey",
-        "tracking.lamp_gamma": 0.0,
-        "tracking.gain_bias": False,
-        "tracking.depth_share": 0.0,
-        "tracking.flow_contradiction": 0.0,
-        "tracking.corner_depth_share": 0.0,
-        "tracking.least_detail": 0.0,
-        "tracking.min_correlation": -1.0,
-        "tracking.remembered_keyframes": 0,
-        "tracking.new_map_after": 0,
-        "tracking.start": "identity",
-        "smoothing.method": "wema",
-        "mapping.method": "none",
-        "fusion.voxel_mm": 1.0,
-        "fusion.truncation_mm": 5.0,
-        "fusion.max_depth_mm": 100.0,
-    },
-    "realtime": {
-        "networks.flow": "dis",
-        "networks.perceptual": "structure",
-        "tracking.max_iterations": 15,
-        "fusion.voxel_mm": 1.5,
-        "fusion.truncation_mm": 5.0,
-        "fusion.max_depth_mm": 100.0,
-        "fusion.every": 2,
-        "mapping.method": "none",
-    },
-}
-
-
 class Config(Settings):
     """All settings of a run."""
 
@@ -382,7 +336,8 @@ class Config(Settings):
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}
-        in_file = {} if file is None else _flatten(_read_toml(file))
+        # A result folder of an earlier version is still a valid settings file.
+        in_file = {} if file is None else {new_name(key): value for key, value in _flatten(_read_toml(file)).items()}
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
@@ -420,8 +375,17 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def new_name(setting: str) -> str:
+    """Return what a setting of an earlier version is called now; other names as they are."""
+    group, dot, name = setting.partition(".")
+    setting = RENAMED_GROUPS.get(group, group) + dot + name
+    return RENAMED.get(setting, setting)
+
+
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
     names = setting_names()
+    if new_name(dotted) != dotted:
+        raise SettingsError(f"setting '{dotted}' is now called '{new_name(dotted)}'")
     if dotted not in names:
         near = difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)
         raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{near[0]}'?" if near else ""))

@@ -1,0 +1,54 @@
+"""Presets: what differs from the defaults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "input.focal": "assume",
+        "input.skip_duplicates": False,
+        "mask.overlays": False,
+        "depth.backend": "depth-anything",
+        "depth.anchor": "depth-pro",
+        "depth.fit_shift": False,
+        "mapis.order": "refine-first",
+        "mapis.frame_scale": "none",
+        "mapis.blend": "linear",
+        "mapis.recursive": False,
+        "mapis.compare_warped": False,
+        "mapis.perceptual_score": True,
+        "networks.flow": "raft-large",
+        "networks.perceptual": "lpips",
+        "tracking.keyframe_every": 2,
+        "tracking.keyframe_agreement": 0.0,
+        "tracking.finest_level": 0,
+        "tracking.channels": "grey",
+        "tracking.lamp_gamma": 0.0,
+        "tracking.gain_bias": False,
+        "tracking.depth_share": 0.0,
+        "tracking.flow_contradiction": 0.0,
+        "tracking.corner_depth_share": 0.0,
+        "tracking.least_detail": 0.0,
+        "tracking.min_correlation": -1.0,
+        "tracking.remembered_keyframes": 0,
+        "tracking.new_map_after": 0,
+        "tracking.start": "identity",
+        "smoothing.method": "wema",
+        "mapping.method": "none",
+        "fusion.voxel_mm": 1.0,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+    },
+    "realtime": {
+        "networks.flow": "dis",
+        "networks.perceptual": "structure",
+        "tracking.max_iterations": 15,
+        "fusion.voxel_mm": 1.5,
+        "fusion.truncation_mm": 5.0,
+        "fusion.max_depth_mm": 100.0,
+        "fusion.every": 2,
+        "mapping.method": "none",
+    },
+}
