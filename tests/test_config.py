@@ -14,7 +14,7 @@ import scopemap.config
 from scopemap.config import PRESETS, Config, setting_names
 from scopemap.errors import SettingsError
 
-SOURCE = Path(scopemap.config.__file__).parent
+SOURCE = Path(scopemap.config.__file__).parents[1]
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner.py"],
@@ -205,7 +205,7 @@ def test_settings_of_earlier_versions_are_read_from_files_and_named_on_the_comma
     file = _write(tmp_path, "[odometry]\nkeyframe_every = 7\n[backend]\nmethod = 'none'\n")
     loaded = Config.load(file=file)
     assert (loaded.tracking.keyframe_every, loaded.mapping.method) == (7, "none")
-    with pytest.raises(SettingsError, match="'odometry.keyframe_every' is now called 'tracking.keyframe_every'"):
+    with pytest.raises(SettingsError, match=r"'odometry\.keyframe_every' is now called 'tracking\.keyframe_every'"):
         Config.load(settings={"odometry.keyframe_every": 7})
 
 

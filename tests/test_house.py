@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
 # A package may import those before it, and none after it.
 LAYERS = (
-    *("errors", "presets", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
+    *("errors", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
     *("masking", "flow", "depth", "tracking", "mapping", "fusion", "calibration"),
     *("pipeline", "reconstruction", "runner", "phantom", "evaluation", "inspection", "benchmark", "cli"),
 )

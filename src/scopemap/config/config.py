@@ -1,0 +1,127 @@
+"""Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
+
+Order of precedence: defaults < preset < TOML file < single settings (`--set tracking.huber=2`); the preset itself may
+be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282;
+it publishes none of its constants (section "WEMA-RTDL"), so values are ours: those of the tracker were chosen by trial
+on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that
+were not searched.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ValidationError
+
+from scopemap.config.depth import DepthSettings, MapisSettings, NetworkSettings
+from scopemap.config.input import InputSettings, MaskSettings
+from scopemap.config.mapping import FusionSettings, MappingSettings
+from scopemap.config.presets import PRESETS
+from scopemap.config.settings import Settings
+from scopemap.config.tracking import SmoothingSettings, TrackingSettings
+from scopemap.errors import SettingsError
+
+Preset = Literal["paper", "default", "realtime"]
+RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
+RENAMED: dict[str, str] = {}
+"""Settings of earlier versions by what they are called now, with the group's new name on both sides."""
+
+
+class Config(Settings):
+    """All settings of a run."""
+
+    preset: Preset = "default"
+    input: InputSettings = InputSettings()
+    mask: MaskSettings = MaskSettings()
+    depth: DepthSettings = DepthSettings()
+    mapis: MapisSettings = MapisSettings()
+    networks: NetworkSettings = NetworkSettings()
+    tracking: TrackingSettings = TrackingSettings()
+    smoothing: SmoothingSettings = SmoothingSettings()
+    mapping: MappingSettings = MappingSettings()
+    fusion: FusionSettings = FusionSettings()
+
+    @classmethod
+    def load(
+        cls, preset: Preset | None = None, file: Path | None = None, settings: dict[str, Any] | None = None
+    ) -> Config:
+        """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
+
+        `settings` maps names such as "tracking.huber" to values or to their text. The preset is the one that they
+        name, else `preset`, else the one that the file names. Raises `SettingsError`.
+        """
+        settings = settings or {}
+        # A result folder of an earlier version is still a valid settings file.
+        in_file = {} if file is None else {new_name(key): value for key, value in _flatten(_read_toml(file)).items()}
+        chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
+        if chosen not in PRESETS:
+            raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
+        tree: dict[str, Any] = {}
+        for key, value in (PRESETS[chosen] | in_file | settings | {"preset": chosen}).items():
+            _insert(tree, key, value)
+        try:
+            return cls.model_validate(tree)
+        except ValidationError as error:
+            raise SettingsError("; ".join(explain(item) for item in error.errors())) from None
+
+    def toml(self) -> str:
+        """Return all settings as TOML text that `load` reads back; what is None is left out."""
+        flat = _flatten(self.model_dump())
+        return "".join(f"{key} = {_toml_value(value)}\n" for key, value in flat.items() if value is not None)
+
+
+def setting_names() -> list[str]:
+    """Return the dotted names of all settings."""
+    return list(_flatten(Config().model_dump()))
+
+
+def _toml_value(value: Any) -> str:
+    # JSON's numbers, booleans, arrays and strings are TOML's too, but for surrogate pairs and a raw DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def new_name(setting: str) -> str:
+    """Return what a setting of an earlier version is called now; other names as they are."""
+    group, dot, name = setting.partition(".")
+    setting = RENAMED_GROUPS.get(group, group) + dot + name
+    return RENAMED.get(setting, setting)
+
+
+def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
+    names = setting_names()
+    if new_name(dotted) != dotted:
+        raise SettingsError(f"setting '{dotted}' is now called '{new_name(dotted)}'")
+    if dotted not in names:
+        near = difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)
+        raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{near[0]}'?" if near else ""))
+    *groups, name = dotted.split(".")
+    for group in groups:
+        tree = tree.setdefault(group, {})
+    tree[name] = value
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(Path(file).read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"cannot read the settings in {file}: {error}") from None
+
+
+def explain(error: Any) -> str:
+    """Return one phrase for an error that pydantic found: which setting, what is wrong, what was given."""
+    where = ".".join(str(part) for part in error["loc"])
+    return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {error['input']!r})"

@@ -1,0 +1,51 @@
+"""Settings of reading and masking."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from scopemap.config.settings import Settings
+
+
+class InputSettings(Settings):
+    """How the input is read."""
+
+    camera_fit: str = Field(
+        "exact",
+        pattern=r"^(exact|scale|crop:\d+,\d+)$",
+        description="what a calibration of another size means, exact: refused; scale: the images were resized from its "
+        "size; crop:X,Y: they were cut out of it, X px from the left, Y px from the top",
+    )
+    focal: Literal["auto", "assume", "flow"] = Field(
+        "auto",
+        description="focal length of an unknown camera, assume: by the assumed field of view; flow: from the motion "
+        "of the first frames; auto: flow where that tells it, Depth Pro's where that is in use",
+    )
+    stereo: Literal["auto", "none", "left-right", "top-bottom"] = Field(
+        "auto",
+        description="two views in one picture, of which the left or upper is used; auto: told from a video's pictures",
+    )
+    deinterlace: bool = Field(False, description="one field of each picture only, its missing rows interpolated")
+    fps: float | None = Field(None, gt=0, description="at most so many frames per second, by the time stamps")
+    skip_duplicates: bool = Field(True, description="leave out pictures of a video that repeat the one before")
+
+
+class MaskSettings(Settings):
+    """Which pixels count as usable tissue."""
+
+    field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
+    dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
+    bright_level: int = Field(240, ge=0, le=255, description="level at which the second-brightest channel is saturated")
+    highlights: bool = Field(True, description="find specular highlights and leave them out")
+    highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median in a highlight")
+    highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
+    border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
+    overlays: bool = Field(True, description="find burned-in text and logos, which stay while all else moves")
+    files: str = Field(
+        "",
+        description="folder of masks, one image per frame, found by the number in its name: what is not 0 is left out "
+        "(instruments, overlays); empty: the data set's own where it has some; none: without",
+    )
+    files_grow_px: int = Field(3, ge=0, description="px by which these masks are widened")
