@@ -12,10 +12,10 @@ from scopemap.calibration.selection import LeftOut
 from scopemap.calibration.targets import Corners
 from scopemap.calibration.views import View
 from scopemap.cameras.camera import CameraModel
+from scopemap.geometry.least_squares import robust_sigma
 
 # A view that is farther off than the median, and than the usual spread about it, by so much does not fit.
 _OFF, _OFF_SPREADS, _OFF_PX = 3.0, 6.0, 0.1
-_PER_SIGMA = 1.4826
 _MOST_OUTLIERS = 1 / 3
 # Lengths of residuals with the same spread both ways exceed so many medians (5 sigma) once in 300,000.
 _STRAY_MEDIANS, _STRAY_PX = 4.25, 0.25
@@ -36,7 +36,7 @@ def agreeing(views: list[View], size: tuple[int, int], form: LensForm) -> tuple[
         usual = float(np.median(error))
         if not np.isfinite(usual) or len(out) >= _MOST_OUTLIERS * len(views):
             break
-        spread = _PER_SIGMA * float(np.median(np.abs(error - usual)))
+        spread = robust_sigma(error - usual)
         limit = max(_OFF * usual, usual + _OFF_SPREADS * spread, usual + _OFF_PX)
         worst = int(np.argmax(error))
         if error[worst] <= limit:

@@ -17,6 +17,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
+from scopemap.geometry.least_squares import robust_sigma
 from scopemap.geometry.se3 import se3, so3_exp, transform
 
 EXPONENT_RANGE = (0.5, 2.0)
@@ -45,7 +46,7 @@ _NEAREST = 1e-3  # of the median distance: a point behind the camera is kept in 
 _LEAST_PAIRS = 4
 _LARGEST_SPREAD = 0.25  # of ln exponent over the pairs: more is a contradiction
 _LEAST_LOG_DEVIATION = 0.02
-_MAD_TO_SIGMA, _MEDIAN_TO_MEAN = 1.4826, 1.2533
+_MEDIAN_TO_MEAN = 1.2533
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,7 @@ def sequence_exponent(fits: list[PairFit]) -> ExponentFit:
     logs = np.log([fit.exponent for fit in fits])
     claimed = np.array([max(fit.deviation / fit.exponent, _LEAST_LOG_DEVIATION) for fit in fits])
     # What the pairs differ by beyond their claims is an error too, the same for all.
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(logs - np.median(logs))))
+    spread = robust_sigma(logs - np.median(logs))
     weight = 1 / (claimed**2 + spread**2)
     centre = _weighted_median(logs, weight)
     if spread > _LARGEST_SPREAD:

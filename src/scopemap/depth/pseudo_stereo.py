@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from scopemap.errors import InputError
+from scopemap.geometry.least_squares import huber_weight, robust_sigma
 
 # A pixel below this share of the largest disparity is left out: depth f B / d of d near 0 would own the whole sum.
 _FLOOR_SHARE = 0.1
@@ -121,8 +122,8 @@ def _robust_least_squares(design: np.ndarray, target: np.ndarray) -> np.ndarray:
     x: np.ndarray = np.linalg.lstsq(design, target, rcond=None)[0]
     for _ in range(_ITERATIONS):
         residual = np.abs(design @ x - target)
-        sigma = 1.4826 * float(np.median(residual)) + 1e-12 * float(np.abs(target).max())
-        root = np.sqrt(np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(residual, 1e-300)))
+        sigma = robust_sigma(residual) + 1e-12 * float(np.abs(target).max())
+        root = np.sqrt(huber_weight(residual, _HUBER_SIGMAS * sigma))
         before, x = x, np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0]
         if np.allclose(x, before, rtol=1e-10, atol=0):
             break

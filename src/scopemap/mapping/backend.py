@@ -16,8 +16,9 @@ from scopemap.config import MappingSettings
 from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
+from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import MEDIAN_TO_SIGMA_2D, Points, Priors, Problem, Solution, adjust, errors_px
+from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Solution, adjust, errors_px
 from scopemap.mapping.depth_correction import DepthGrid, fit_grid
 from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop, LoopFinder
@@ -216,7 +217,7 @@ class Backend:
 
 def _sigma_px(off_px: np.ndarray) -> float:
     """Robust standard deviation of distances in the plane; NaN of none."""
-    return MEDIAN_TO_SIGMA_2D * float(np.median(off_px)) if len(off_px) else float("nan")
+    return robust_sigma_2d(off_px) if len(off_px) else float("nan")
 
 
 def _depth_change(points: Points, found: Solution) -> np.ndarray:

@@ -22,14 +22,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 
 _OWN = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _CAUCHY = 2.0  # residuals of that many standard deviations count half
 _LEAST_SIGMA_PX = 0.1
-MEDIAN_TO_SIGMA_2D = 1 / 1.1774
-"""Standard deviation over the median length of a normal vector in the plane."""
-
 _LEAST_Z = 1e-3
 
 
@@ -187,7 +185,7 @@ def _errors(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def _sigma_px(problem: Problem, state: _State) -> float:
     error, ahead = _errors(problem, _seen(problem, state)[0])
-    return max(float(MEDIAN_TO_SIGMA_2D * np.median(np.linalg.norm(error[ahead], axis=1))), _LEAST_SIGMA_PX)
+    return robust_sigma_2d(np.linalg.norm(error[ahead], axis=1), _LEAST_SIGMA_PX)
 
 
 def _cauchy(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

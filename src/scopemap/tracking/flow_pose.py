@@ -16,12 +16,12 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.frame import SeenAgain
+from scopemap.geometry.least_squares import RAYLEIGH_TO_SIGMA
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 
 _LEAST_POINTS = 50
 _STEPS = 30
 _SMALL_STEP = 1e-5
-_MEDIAN_TO_SIGMA_2D = 1 / 1.1774  # of the length of a normal vector in the plane
 _LEAST_SIGMA_PX = 0.1
 _CORNER_SIGMA_PX = 0.5
 _LEAST_SPREAD = 0.01
@@ -85,7 +85,7 @@ def refined_by_corners(
         covariance = _CORNER_SIGMA_PX**2 * np.eye(2) + depth_share**2 * along[:, :, None] * along[:, None, :]
         information = np.linalg.inv(covariance)
         square = np.einsum("ni,nij,nj->n", errors, information, errors)
-        spread = max(_MEDIAN_TO_SIGMA_2D**2 * float(np.median(square[ahead])), _LEAST_SPREAD)
+        spread = max(RAYLEIGH_TO_SIGMA**2 * float(np.median(square[ahead])), _LEAST_SPREAD)
         weight = np.where(ahead, 1 / (1 + square / (4 * spread)), 0.0)
         weighted = np.einsum("n,nij,njk->nik", weight, information, jacobians)
         T, length = _moved(T, jacobians, weighted, errors, unit_mm)
@@ -112,7 +112,7 @@ def _moved(
 
 
 def _sigma_px(square: np.ndarray) -> float:
-    return max(_MEDIAN_TO_SIGMA_2D * float(np.sqrt(np.median(square))), _LEAST_SIGMA_PX)
+    return max(RAYLEIGH_TO_SIGMA * float(np.sqrt(np.median(square))), _LEAST_SIGMA_PX)
 
 
 def _linearised(

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.config import TrackingSettings
+from scopemap.geometry.least_squares import DenseModel, Options, Problem, minimise, robust_sigma
 from scopemap.geometry.se3 import orthonormalised, se3_exp
-from scopemap.tracking.dogleg import Options, Problem, Quadratic, minimise
 from scopemap.tracking.residuals import PARAMETERS, Loss, View, depth_residuals, normal_equations, residual_images
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
-_MAD_TO_SIGMA = 1.4826
 _INLIER = 0.5
+_LEAST_SIGMA = 1e-3  # keeps flat images from dividing by zero
 
 
 class Motion(NamedTuple):
@@ -78,7 +78,7 @@ def judged(
     compared = np.isfinite(residuals[-1])
     used, shown = residuals[-1][compared], reference[0].channels[-1][compared]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
-    sigma = _robust_sigma(used)
+    sigma = robust_sigma(used, _LEAST_SIGMA)
     if not used.size:
         return Alignment(motion, sigma, 0.0, 0.0, 0.0, 0.0, iterations)
     inliers, found = float(np.mean(np.abs(used) < _INLIER)), shown + used
@@ -102,23 +102,23 @@ def _align_level(
     reference: View, current: View, motion: Motion, settings: TrackingSettings, rotation_only: bool, unit_mm: float
 ) -> tuple[Motion, int]:
     start = _residuals(reference, current, motion, settings)
-    loss = _loss(np.array([_robust_sigma(r[np.isfinite(r)]) for r in start]), settings)
+    loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _LEAST_SIGMA) for r in start]), settings)
     if settings.depth_share > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
         gaps = gaps[np.isfinite(gaps)]
         if gaps.size:
-            sigma = max(_robust_sigma(gaps, least=0.0), settings.least_depth_sigma)
+            sigma = robust_sigma(gaps, settings.least_depth_sigma)
             loss = loss._replace(depth_sigma=sigma, depth_share=settings.depth_share)
     least_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
         [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
     )
 
-    def linearise(state: Motion) -> Quadratic:
+    def linearise(state: Motion) -> DenseModel:
         equations = normal_equations(reference, current, *state, loss, unit_mm)
         # A mean over few pixels can be small: a step that walks out of the overlap is no improvement.
         cost = equations.cost if equations.weight > least_weight else np.inf
-        return Quadratic(cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
+        return DenseModel(cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
 
     def retract(state: Motion, step: np.ndarray) -> Motion:
         full = np.zeros(PARAMETERS)
@@ -129,10 +129,3 @@ def _align_level(
     options = Options(settings.radius, settings.max_iterations, gauss_newton=settings.solver == "gauss-newton")
     solution = minimise(Problem(linearise, retract), motion, options)
     return solution.state, solution.iterations
-
-
-def _robust_sigma(residuals: np.ndarray, least: float = 1e-3) -> float:
-    """Standard deviation from the median absolute value; a small floor keeps flat images from dividing by zero."""
-    if residuals.size == 0:
-        return least
-    return max(float(_MAD_TO_SIGMA * np.median(np.abs(residuals))), least)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.calibration.focal_length.windows import Window
+from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import so3_exp
 
 _CAUCHY = 2.0
@@ -34,7 +35,6 @@ _STRAIGHT_SIGMA = 1e-4  # of the bend, where the lens is held straight
 _START_FOV_DEG = (60.0, 105.0)
 _BLOCKS = 4  # columns and rows of the picture whose corners are taken to err alike
 _LEAST_SIGMA_PX = 0.03
-_MEDIAN_TO_SIGMA_2D = 1 / 1.1774
 _LEAST_Z, _LEAST_SLOPE = 1e-2, 0.1
 _UNBENDING_STEPS = 6
 # In half widths: a trial step may put a point beside the camera, where Newton's method would run away.
@@ -178,7 +178,7 @@ def _bent(straight: np.ndarray, bend: float, half_width_px: float) -> np.ndarray
 
 def _sigma_px(problem: _Problem, state: _State) -> float:
     error = _sight(problem, state).error[problem.found]
-    return max(float(_MEDIAN_TO_SIGMA_2D * np.median(np.linalg.norm(error, axis=1))), _LEAST_SIGMA_PX)
+    return robust_sigma_2d(np.linalg.norm(error, axis=1), _LEAST_SIGMA_PX)
 
 
 def _cost(problem: _Problem, state: _State, sigma_px: float) -> float:

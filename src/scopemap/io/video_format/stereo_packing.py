@@ -17,6 +17,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from scopemap.geometry.least_squares import robust_sigma
+
 Layout = Literal["left-right", "top-bottom"]
 
 LEAST_CORRELATION = 0.6
@@ -215,6 +217,6 @@ def _detail(grey: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, float]:
     mean = cv2.GaussianBlur(grey * used, (0, 0), sigma_px) / np.maximum(weight, 1e-6)
     detail = (grey - mean) * used
     # By the median: few bright pixels must not widen what they are clipped to.
-    deviation = 1.4826 * float(np.median(np.abs(detail[used > 0]))) if used.any() else 0.0
+    deviation = robust_sigma(detail[used > 0])
     most = _MOST_DEVIATIONS * max(deviation, 1.0)
     return np.clip(detail, -most, most), float(used.mean())

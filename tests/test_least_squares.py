@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from scopemap.tracking.dogleg import Options, Problem, Quadratic, dogleg_step, gauss_newton_step, minimise
+from scopemap.geometry.least_squares import DenseModel, Options, Problem, dogleg_step, minimise
 
 
-def _model(seed: int, size: int = 6) -> Quadratic:
+def _model(seed: int, size: int = 6) -> DenseModel:
     random = np.random.default_rng(seed)
     J = random.normal(size=(20, size)) * np.exp(random.normal(size=size))
     r = random.normal(size=20)
-    return Quadratic(0.5 * r @ r, J.T @ r, J.T @ J)
+    return DenseModel(0.5 * r @ r, J.T @ r, J.T @ J)
 
 
-def _value(model: Quadratic, step: np.ndarray) -> float:
+def _value(model: DenseModel, step: np.ndarray) -> float:
     return model.cost + model.gradient @ step + 0.5 * step @ model.hessian @ step
 
 
@@ -26,9 +26,9 @@ def _rosenbrock() -> Problem[np.ndarray]:
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
 
-    def linearise(x: np.ndarray) -> Quadratic:
+    def linearise(x: np.ndarray) -> DenseModel:
         J, r = np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]), residuals(x)
-        return Quadratic(0.5 * float(r @ r), J.T @ r, J.T @ J)
+        return DenseModel(0.5 * float(r @ r), J.T @ r, J.T @ J)
 
     return Problem(linearise, lambda x, step: x + step)
 
@@ -45,7 +45,7 @@ def test_step_stays_in_the_ball_and_lowers_the_model(seed: int, radius: float) -
 @pytest.mark.parametrize("seed", range(5))
 def test_three_cases(seed: int) -> None:
     model = _model(seed)
-    newton = gauss_newton_step(model)
+    newton = model.gauss_newton_step()
     np.testing.assert_allclose(model.hessian @ newton, -model.gradient, rtol=1e-8, atol=1e-8)
     length = np.linalg.norm(newton)
     np.testing.assert_allclose(dogleg_step(model, 1.01 * length), newton)
@@ -71,7 +71,7 @@ def test_unseen_direction_stays_at_zero() -> None:
     model = _model(1)
     hessian, gradient = model.hessian.copy(), model.gradient.copy()
     hessian[2, :] = hessian[:, 2] = gradient[2] = 0.0
-    assert gauss_newton_step(Quadratic(1.0, gradient, hessian))[2] == pytest.approx(0.0, abs=1e-12)
+    assert DenseModel(1.0, gradient, hessian).gauss_newton_step()[2] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_rosenbrock_from_afar() -> None:
