@@ -99,7 +99,10 @@ def real_runs(data: Path) -> Iterator[Run]:
     yield Run("cecum_t1_a, shading, DIS, structural similarity", cecum, "sim3", SHADING | LIGHT)
     yield Run("the same, no back end", cecum, "sim3", SHADING | LIGHT | TRACKED)
     yield Run(
-        "trans_t1_a, true depth", trans, "se3", {"depth.backend": f"files:{trans}", "fusion.min_weight": 0.5} | LIGHT
+        "trans_t1_a, true depth",
+        trans,
+        "se3",
+        {"depth.backend": f"files:{trans}", "fusion.advanced.min_weight": 0.5} | LIGHT,
     )
     room = {"fusion.voxel_mm": 10, "fusion.truncation_mm": 40, "fusion.max_depth_mm": 4000}
     yield Run(

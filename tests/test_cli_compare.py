@@ -91,7 +91,12 @@ def test_refusals_of_compare(places: tuple[Path, Path, Path], tmp_path: Path) ->
 
 def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -> None:
     truth = write_tiny(tmp_path / "phantom", frames=6)
-    light = {"networks.flow": "dis", "networks.perceptual": "structure", "fusion.voxel_mm": 2.0, "fusion.min_weight": 0}
+    light = {
+        "networks.flow": "dis",
+        "networks.perceptual": "structure",
+        "fusion.voxel_mm": 2.0,
+        "fusion.advanced.min_weight": 0,
+    }
     for name, changes in {"mapis": {}, "plain": {"mapis.frame_scale": "none", "mapis.blend": "none"}}.items():
         config = Config.load(settings=light | changes)
         reconstruct(open_sequence(truth), config, out=tmp_path / name)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -12,16 +14,19 @@ from hypothesis import strategies as st
 
 import scopemap.config
 from scopemap.config import PRESETS, Config, setting_names
+from scopemap.config.config import REMOVED, RENAMED
+from scopemap.config.page import settings_page
 from scopemap.errors import SettingsError
 
 SOURCE = Path(scopemap.config.__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner.py"],
     "mask": ["masking/*.py"],
     "depth": ["depth/*.py"],
     "mapis": ["depth/mapis.py", "pipeline.py"],
-    "networks": ["pipeline.py"],
+    "networks": ["pipeline.py", "runner.py"],
     "tracking": ["tracking/*.py"],
     "smoothing": ["tracking/smoothing.py"],
     "mapping": ["mapping/backend.py", "mapping/feature_tracks.py", "pipeline.py"],
@@ -57,21 +62,25 @@ def test_presets_hold_and_name_only_what_exists(preset: str) -> None:
     config = Config.load(preset)  # type: ignore[arg-type]
     assert set(PRESETS[preset]) <= set(setting_names())
     for dotted, value in PRESETS[preset].items():
-        group, name = dotted.split(".")
-        assert getattr(getattr(config, group), name) == value
+        assert attrgetter(dotted)(config) == value
 
 
 def test_every_preset_changes_something_but_the_default() -> None:
-    plain = Config().model_dump()
     for preset, changes in PRESETS.items():
-        same = [key for key, value in changes.items() if plain[key.split(".")[0]][key.split(".")[1]] == value]
+        same = [key for key, value in changes.items() if attrgetter(key)(Config()) == value]
         assert (preset == "default") == (not changes)
         assert len(same) < max(len(changes), 1)
 
 
 @pytest.mark.parametrize(
     ("wrong", "near"),
-    [("tracking.hubber", "tracking.huber"), ("fusion.voxel", "fusion.voxel_mm"), ("trackin", "tracking")],
+    [
+        ("tracking.keyframes_every", "tracking.keyframe_every"),
+        ("fusion.voxel", "fusion.voxel_mm"),
+        ("fusion.advanced.voxel_mm", "fusion.voxel_mm"),
+        ("fusion.paper.min_weight", "fusion.advanced.min_weight"),
+        ("trackin", "tracking"),
+    ],
 )
 def test_an_unknown_key_names_the_nearest(wrong: str, near: str) -> None:
     with pytest.raises(SettingsError, match=rf"unknown setting '{wrong}': did you mean '{near}"):
@@ -94,7 +103,7 @@ def test_an_unknown_key_like_nothing_is_still_refused() -> None:
         ("tracking.huber", 0, "greater than 0"),
         ("tracking.huber", "wide", "valid number"),
         ("mapis.blend", "mixed", "'exponential'"),
-        ("mask.dark_level", 300, "less than or equal to 255"),
+        ("mask.advanced.dark_level", 300, "less than or equal to 255"),
         ("depth.near_far_mm", [1, 2, 3], "at most 2"),
         ("smoothing.alpha", 0.9, "alpha \\+ beta \\+ gamma must be 1, got 1.3"),
     ],
@@ -202,11 +211,34 @@ def test_what_is_no_number_is_refused(key: str, value: object) -> None:
 
 
 def test_settings_of_earlier_versions_are_read_from_files_and_named_on_the_command_line(tmp_path: Path) -> None:
-    file = _write(tmp_path, "[odometry]\nkeyframe_every = 7\n[backend]\nmethod = 'none'\n")
+    file = _write(tmp_path, "[odometry]\nkeyframe_every = 7\n[backend]\nmethod = 'none'\n[fusion]\nmin_weight = 0.5\n")
     loaded = Config.load(file=file)
     assert (loaded.tracking.keyframe_every, loaded.mapping.method) == (7, "none")
-    with pytest.raises(SettingsError, match=r"'odometry\.keyframe_every' is now called 'tracking\.keyframe_every'"):
-        Config.load(settings={"odometry.keyframe_every": 7})
+    assert loaded.fusion.advanced.min_weight == 0.5
+    for old, new in (
+        ("odometry.keyframe_every", "tracking.keyframe_every"),
+        ("fusion.min_weight", "fusion.advanced.min_weight"),
+    ):
+        with pytest.raises(SettingsError, match=rf"'{re.escape(old)}' is now called '{re.escape(new)}'"):
+            Config.load(settings={old: 7})
+
+
+def test_removed_settings_are_skipped_in_files_and_refused_on_the_command_line(tmp_path: Path) -> None:
+    assert Config.load(file=_write(tmp_path, "[networks]\nflow_iterations = 7\n")) == Config()
+    with pytest.raises(SettingsError, match=r"'networks\.flow_iterations' no longer exists"):
+        Config.load(settings={"networks.flow_iterations": 7})
+
+
+def test_renamed_settings_exist_and_removed_ones_do_not() -> None:
+    names = set(setting_names())
+    assert set(RENAMED.values()) <= names
+    assert not (set(RENAMED) | REMOVED) & names
+
+
+def test_the_page_of_settings_is_the_generated_one() -> None:
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    assert page == settings_page(), "docs/settings.md is out of date: the command in scopemap/config/page.py writes it"
+    assert all(f"`{name}`" in page for name in setting_names() if "." in name)
 
 
 def test_setting_names_are_all_leaves() -> None:
@@ -228,6 +260,6 @@ def _reads(file: Path, group: str, key: str) -> bool:
         if isinstance(node, ast.Attribute) and node.attr == key:
             owner = node.value
             name = owner.attr if isinstance(owner, ast.Attribute) else getattr(owner, "id", "")
-            if name.strip("_") in ("settings", group):
+            if name.strip("_") in ("settings", "advanced", "paper", group):
                 return True
     return False

@@ -13,7 +13,8 @@ from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.config import Config
+from scopemap.config import MaskSettings
+from scopemap.config.input import MaskAdvanced
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import se3_exp
 from scopemap.io.datasets.reference import reference_trajectory
@@ -193,7 +194,7 @@ def test_the_camera_of_larger_images_is_rescaled(tmp_path: Path) -> None:
 
 def test_instruments_are_masked_unasked(tmp_path: Path) -> None:
     sequence = open_sequence(write_scene(tmp_path / "a"))
-    settings = Config().mask.model_copy(update={"files_grow_px": 0})
+    settings = MaskSettings(advanced=MaskAdvanced(files_grow_px=0))
     masks = create_masks(settings, sequence.rectifier, sequence.source.masks)
     np.testing.assert_array_equal(masks.covered(9), mask_image(10) > 0)
 
@@ -355,7 +356,7 @@ def test_real_scene(real_data: Path) -> None:
     sequence = open_sequence(folder, size=(640, 512))
     assert (sequence.source.name, sequence.count, sequence.source.masks) == ("endonerf", 63, folder / "gt_masks")
     np.testing.assert_allclose(sequence.camera.matrix, [[569.468, 0, 319.5], [0, 569.468, 255.5], [0, 0, 1]], atol=1e-3)
-    masks = create_masks(Config().mask.model_copy(update={"files_grow_px": 0}), sequence.rectifier, folder / "gt_masks")
+    masks = create_masks(MaskSettings(advanced=MaskAdvanced(files_grow_px=0)), sequence.rectifier, folder / "gt_masks")
     types = set()
     for frame, truth in sequence:
         stored_depth = cv2.imread(str(folder / "depth" / f"frame-{frame.index:06d}.depth.png"), cv2.IMREAD_UNCHANGED)

@@ -15,6 +15,7 @@ from tiny_phantom import only_images, write_tiny
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
+from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth import AnchoredDepth, DepthEstimate
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
@@ -289,7 +290,9 @@ def _wall(sigma_mm: np.ndarray | None = None, depth_mm: np.ndarray | None = None
 
 
 def _field(*frames: Frame, **changes: Any) -> Any:
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, min_weight=0.2, **changes))
+    volume = TsdfVolume(
+        FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, advanced=FusionAdvanced(min_weight=0.2, **changes))
+    )
     for frame in frames:
         volume.integrate(frame)
     return volume._blocks.dense(np.array([-1, 0, 6]), 2)

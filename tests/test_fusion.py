@@ -14,6 +14,7 @@ from skimage.measure import marching_cubes
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
+from scopemap.config.mapping import FusionAdvanced
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.fusion.tsdf import _sample, pack, unpack
@@ -21,8 +22,12 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
-LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, min_weight=0.2)
+LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, advanced=FusionAdvanced(min_weight=0.2))
 GREY = (120, 110, 100)
+
+
+def _lenient(**advanced: float) -> FusionSettings:
+    return LENIENT.model_copy(update={"advanced": LENIENT.advanced.model_copy(update=advanced)})
 
 
 def rays_of(camera: PinholeCamera, T: np.ndarray) -> np.ndarray:
@@ -86,7 +91,7 @@ def test_sphere_from_inside_is_accurate_closed_and_faces_the_cameras(sphere: Tsd
 def test_welded_chunks_equal_one_dense_marching_cubes(sphere: TsdfVolume) -> None:
     # The sphere crosses chunk borders at 0 in all three axes; 8 blocks from -4 on hold it whole.
     dense = sphere._blocks.dense(np.full(3, -4), 8)
-    known = dense.weight >= LENIENT.min_weight
+    known = dense.weight >= LENIENT.advanced.min_weight
     corners = np.stack([known[i : 63 + i, j : 63 + j, k : 63 + k] for i, j, k in np.ndindex(2, 2, 2)])
     mask = np.zeros(known.shape, bool)
     mask[1:, 1:, 1:] = corners.all(axis=0)
@@ -174,7 +179,7 @@ def test_weight_follows_its_formula() -> None:
 
 
 def test_min_weight_needs_a_second_look() -> None:
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, min_weight=1.0))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, advanced=FusionAdvanced(min_weight=1.0)))
     frame = plane_frame(np.array([0.0, 0.0, 1.0]), 40.0)
     volume.integrate(frame)
     assert len(volume.extract_mesh().faces) == 0
@@ -237,12 +242,12 @@ def test_floaters_go_and_the_largest_part_stays() -> None:
     depth = np.full((VIEW.height, VIEW.width), np.nan)
     depth[:, :100] = 40.0
     depth[50:70, 120:140] = 60.0
-    volume = TsdfVolume(LENIENT.model_copy(update={"min_component_share": 0.2}))
+    volume = TsdfVolume(_lenient(min_component_share=0.2))
     volume.integrate(frame_of(VIEW, np.eye(4), depth))
     assert np.allclose(volume.extract_mesh().vertices[:, 2], 40.0, atol=0.01)
-    volume.settings = LENIENT.model_copy(update={"min_component_share": 0.0})
+    volume.settings = _lenient(min_component_share=0.0)
     assert (volume.extract_mesh().vertices[:, 2] > 50).any()
-    volume.settings = LENIENT.model_copy(update={"min_component_share": 1.0})
+    volume.settings = _lenient(min_component_share=1.0)
     assert len(volume.extract_mesh().faces) > 100
 
 
@@ -261,7 +266,7 @@ def test_pixels_that_must_not_count_do_not() -> None:
         volume.integrate(frame)
     assert volume.block_count == 0
     assert volume.extract_mesh().vertices.shape == (0, 3)
-    strict = TsdfVolume(LENIENT.model_copy(update={"min_incidence": 0.5}))
+    strict = TsdfVolume(_lenient(min_incidence=0.5))
     strict.integrate(grazing)
     assert strict.block_count == 0
 

@@ -10,15 +10,13 @@ import pytest
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
+from scopemap.config.input import MaskAdvanced
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.io.video_format.constant import is_constant
 from scopemap.masking.masker import Masker
 
-SETTINGS = MaskSettings(
-    dark_level=12, bright_level=240, highlight_ratio=1.5, highlight_grow_px=2, border_px=3, field_of_view=True,
-    highlights=True,
-)  # fmt: skip
+SETTINGS = MaskSettings()
 CAMERA = PinholeCamera(200.0, 200.0, 159.5, 119.5, 320, 240)
 CENTRE, RADIUS = (160, 120), 105
 
@@ -116,7 +114,7 @@ def test_clipped_pixels_go_but_red_alone_may_clip() -> None:
 
 
 def test_each_part_can_be_switched_off() -> None:
-    settings = SETTINGS.model_copy(update={"field_of_view": False, "highlights": False, "dark_level": 0})
+    settings = MaskSettings(field_of_view=False, highlights=False, advanced=MaskAdvanced(dark_level=0))
     image = np.maximum(in_circle(), 1)
     assert Masker(settings)(frame(image)).valid.all()
 

@@ -126,7 +126,7 @@ def test_the_run_says_what_the_back_end_did(run: _Run) -> None:
 
 
 def test_what_waited_is_fused_though_no_keyframe_ever_came(run: _Run) -> None:
-    config = with_true_depth(run.phantom, fusion__min_weight=0.0, **SETTINGS)
+    config = with_true_depth(run.phantom, fusion__advanced__min_weight=0.0, **SETTINGS)
     pipeline = Pipeline(config, Estimators.create(config, open_sequence(run.phantom)))
     pipeline._waiting.put(run.steps[0].frame)
     assert pipeline.pieces() == []

@@ -22,7 +22,7 @@ from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anch
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
-from scopemap.flow import CornerFollower, DisFlow, FlowEstimator, create_flow, pair_flow
+from scopemap.flow import CornerFollower, FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Frame, SeenAgain
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
@@ -72,6 +72,7 @@ class Estimators:
     depth: DepthEstimator
     anchor: AnchoredDepth
     flow: FlowEstimator
+    keyframe_flow: FlowEstimator
     perceptual: PerceptualDistance
     masks: MaskFiles | None = None
 
@@ -89,7 +90,8 @@ class Estimators:
                 calibrated=sequence.calibrated,
             ),
             create_anchor(config.depth, networks.device),
-            create_flow(networks.flow, networks.flow_iterations, networks.device),
+            create_flow(networks.flow, networks.device),
+            create_flow(networks.keyframe_flow, networks.device),
             create_perceptual(networks.perceptual, networks.device),
             create_masks(config.mask, sequence.rectifier, sequence.source.masks),
         )
@@ -104,6 +106,7 @@ class Estimators:
         parts = self.depth.provenance()
         others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance] = {
             "flow": self.flow,
+            "keyframe_flow": self.keyframe_flow,
             "perceptual": self.perceptual,
         }
         if self.anchor.reference.name == "depth-pro":
@@ -168,8 +171,8 @@ class Pipeline:
         self._last: Track | None = None
         self._last_mm: np.ndarray | None = None
         self._fusable = 0
-        follows = tracker is None and config.tracking.corner_depth_share > 0 and estimators.flow.name != "none"
-        self._corners = CornerFollower(DisFlow(), config.mapis.consistency_px) if follows else None
+        follows = tracker is None and config.tracking.corner_depth_share > 0 and estimators.keyframe_flow.name != "none"
+        self._corners = CornerFollower(estimators.keyframe_flow, config.mapis.consistency_px) if follows else None
         self._seats: dict[int, Seat] = {}
         self._losses = 0
 

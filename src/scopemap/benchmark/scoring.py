@@ -34,7 +34,6 @@ from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 
 Figures = dict[str, dict[str, Any]]
-_RAFT_ITERATIONS = 12
 _MOST_VIEWS = 40
 
 
@@ -210,7 +209,7 @@ def _consistency(
     scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     linker, meter = ImageLinker(camera), ConsistencyMeter(camera, scale)
-    estimator, masker = create_flow(protocol.flow, _RAFT_ITERATIONS, "auto"), Masker(MaskSettings())
+    estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
     flow = FlowStore(estimator, None if flows is None else flows / estimator.name)
     poses = dict(zip(estimate.indices.tolist(), range(len(estimate)), strict=True))
     before: np.ndarray | None = None

@@ -27,8 +27,20 @@ from scopemap.errors import SettingsError
 
 Preset = Literal["paper", "default", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
-RENAMED: dict[str, str] = {}
-"""Settings of earlier versions by what they are called now, with the group's new name on both sides."""
+RENAMED: dict[str, str] = {
+    "fusion.depth_sigma_share": "fusion.advanced.depth_sigma_share",
+    "fusion.min_component_share": "fusion.advanced.min_component_share",
+    "fusion.min_incidence": "fusion.advanced.min_incidence",
+    "fusion.min_weight": "fusion.advanced.min_weight",
+    "mask.dark_level": "mask.advanced.dark_level",
+    "mask.files_grow_px": "mask.advanced.files_grow_px",
+}
+"""Settings of earlier versions by their present name, with the group's new name on both sides."""
+REMOVED = {
+    *("mask.border_px", "mask.bright_level", "mask.highlight_grow_px", "mask.highlight_ratio"),
+    "networks.flow_iterations",
+}
+"""Settings of earlier versions that are constants now: a file may still name them, the command line may not."""
 
 
 class Config(Settings):
@@ -55,8 +67,7 @@ class Config(Settings):
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}
-        # A result folder of an earlier version is still a valid settings file.
-        in_file = {} if file is None else {new_name(key): value for key, value in _flatten(_read_toml(file)).items()}
+        in_file = {} if file is None else _of_earlier_versions(_flatten(_read_toml(file)))
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
@@ -101,17 +112,32 @@ def new_name(setting: str) -> str:
     return RENAMED.get(setting, setting)
 
 
+def _of_earlier_versions(flat: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a file by their present names, without removed ones: an old config.toml stays valid."""
+    renamed = {new_name(key): value for key, value in flat.items()}
+    return {key: value for key, value in renamed.items() if key not in REMOVED}
+
+
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    names = setting_names()
-    if new_name(dotted) != dotted:
-        raise SettingsError(f"setting '{dotted}' is now called '{new_name(dotted)}'")
+    names, present = setting_names(), new_name(dotted)
     if dotted not in names:
-        near = difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)
-        raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{near[0]}'?" if near else ""))
+        if present in REMOVED:
+            raise SettingsError(f"setting '{dotted}' no longer exists: it is a constant now")
+        if present != dotted:
+            raise SettingsError(f"setting '{dotted}' is now called '{present}'")
+        nearest = _nearest(dotted, names)
+        raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{nearest}'?" if nearest else ""))
     *groups, name = dotted.split(".")
     for group in groups:
         tree = tree.setdefault(group, {})
     tree[name] = value
+
+
+def _nearest(dotted: str, names: list[str]) -> str | None:
+    """Return the setting with the same group and last part ("tracking.advanced.huber"), else the most similar one."""
+    parts = dotted.split(".")
+    same = [name for name in names if (name.split(".")[0], name.split(".")[-1]) == (parts[0], parts[-1])]
+    return next(iter(same or difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)), None)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -97,14 +97,21 @@ class MapisSettings(Settings):
 
 
 class NetworkSettings(Settings):
-    """Flow and perceptual networks."""
+    """Optical flow and perceptual distance."""
 
     flow: str = Field(
         "auto",
-        description="raft-small | raft-large | dis | none | auto: raft-small if at hand, else dis",
+        description="flow from frame to frame: raft-small | raft-large | dis | none | auto: raft-small where its "
+        "weights are present, else dis",
     )
-    flow_iterations: int = Field(12, ge=1, description="RAFT's refinement steps")
+    keyframe_flow: str = Field(
+        "dis",
+        description="flow between keyframes (back end) and from the keyframe to the frame (corners), the same names; "
+        "none: no corners, and a back end without observations",
+    )
     perceptual: Literal["auto", "lpips", "structure"] = Field(
-        "auto", description="lpips: AlexNet; structure: local structural similarity, no weights; auto: what is at hand"
+        "auto",
+        description="perceptual distance, lpips: AlexNet; structure: local structural similarity, no weights; auto: "
+        "lpips where its weights are present, else structure",
     )
-    device: str = Field("auto", description="auto | cpu | cuda")
+    device: str = Field("auto", description="where networks run: auto | cpu | cuda")

@@ -32,20 +32,22 @@ class InputSettings(Settings):
     skip_duplicates: bool = Field(True, description="leave out pictures of a video that repeat the one before")
 
 
+class MaskAdvanced(Settings):
+    """Constants of masking."""
+
+    dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
+    files_grow_px: int = Field(3, ge=0, description="px by which masks from files are widened")
+
+
 class MaskSettings(Settings):
     """Which pixels count as usable tissue."""
 
     field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
-    dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
-    bright_level: int = Field(240, ge=0, le=255, description="level at which the second-brightest channel is saturated")
-    highlights: bool = Field(True, description="find specular highlights and leave them out")
-    highlight_ratio: float = Field(1.5, gt=1, description="darkest channel over its local median in a highlight")
-    highlight_grow_px: int = Field(2, ge=0, description="px by which a highlight is widened")
-    border_px: int = Field(3, ge=0, description="px by which the field of view is shrunk")
-    overlays: bool = Field(True, description="find burned-in text and logos, which stay while all else moves")
+    highlights: bool = Field(True, description="find specular highlights and mask them")
+    overlays: bool = Field(True, description="find burned-in text and logos, which stay while the rest moves")
     files: str = Field(
         "",
-        description="folder of masks, one image per frame, found by the number in its name: what is not 0 is left out "
-        "(instruments, overlays); empty: the data set's own where it has some; none: without",
+        description="folder of masks, one image per frame, found by the number in its name: what is not 0 is masked "
+        "(instruments, overlays); empty: the data set's own where it has some; none: no masks from files",
     )
-    files_grow_px: int = Field(3, ge=0, description="px by which these masks are widened")
+    advanced: MaskAdvanced = MaskAdvanced()

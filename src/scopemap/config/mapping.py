@@ -40,17 +40,29 @@ class MappingSettings(Settings):
     )
 
 
-class FusionSettings(Settings):
-    """Volumetric fusion. Sizes that are not set follow the scene: see `scopemap.fusion.tsdf_parameters`."""
+class FusionAdvanced(Settings):
+    """Constants of fusion."""
 
-    enabled: bool = True
-    voxel_mm: float | None = Field(None, ge=0.01, description="by default from the clip's median depth")
-    truncation_mm: float | None = Field(None, ge=0.05, description="by default 5 voxels")
-    max_depth_mm: float | None = Field(None, gt=0, description="depth beyond this is not fused; by default 200 voxels")
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     depth_sigma_share: float = Field(
-        0.2, gt=0, description="as odometry's; no pixel counts more than without an uncertainty; large: off"
+        0.2, gt=0, description="relative error that all depth has; more uncertain pixels weigh less; large: off"
     )
     min_weight: float = Field(1.5, ge=0, description="voxels with less weight give no surface")
-    min_component_share: float = Field(0.02, ge=0, le=1, description="floaters below this share of the faces go")
+    min_component_share: float = Field(
+        0.02, ge=0, le=1, description="components with less than this share of the faces are removed"
+    )
+
+
+class FusionSettings(Settings):
+    """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.tsdf_parameters`."""
+
+    enabled: bool = Field(True, description="false: no mesh")
+    voxel_mm: float | None = Field(
+        None, ge=0.01, description="voxel size, mm; default: 1/60 of the clip's median depth"
+    )
+    truncation_mm: float | None = Field(None, ge=0.05, description="truncation of the TSDF, mm; default: 5 voxels")
+    max_depth_mm: float | None = Field(
+        None, gt=0, description="depth beyond this is not fused, mm; default: 200 voxels"
+    )
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
+    advanced: FusionAdvanced = FusionAdvanced()

@@ -24,8 +24,8 @@ __all__ = [
 FLOWS = ("auto", "raft-small", "raft-large", "dis", "none")
 
 
-def create_flow(name: str, iterations: int = 12, device: str = "auto") -> FlowEstimator:
-    """Return the estimator `name` (one of `FLOWS`); iterations and device matter to RAFT only.
+def create_flow(name: str, device: str = "auto") -> FlowEstimator:
+    """Return the estimator `name` (one of `FLOWS`); device matters to RAFT only.
 
     "auto" is RAFT small where its weights are at hand, else DIS. Raises `SettingsError` for an unknown name and
     `WeightsError` where RAFT is named and its weights are not at hand.
@@ -34,9 +34,9 @@ def create_flow(name: str, iterations: int = 12, device: str = "auto") -> FlowEs
         name = "raft-small" if weights.is_present(*CHECKPOINTS["small"]) else "dis"
     match name:
         case "raft-small":
-            return RaftFlow("small", iterations=iterations, device=device)
+            return RaftFlow("small", device=device)
         case "raft-large":
-            return RaftFlow("large", iterations=iterations, device=device)
+            return RaftFlow("large", device=device)
         case "dis":
             return DisFlow()
         case "none":

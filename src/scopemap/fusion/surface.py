@@ -46,9 +46,11 @@ def extract_surface(blocks: VoxelBlocks, settings: FusionSettings, voxel_mm: flo
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
-    pieces = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
+    pieces = [
+        _extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.advanced.min_weight) for corner in corners
+    ]
     mesh = _weld([piece for piece in pieces if piece is not None])
-    vertices, faces, colours = _without_floaters(*mesh, settings.min_component_share)
+    vertices, faces, colours = _without_floaters(*mesh, settings.advanced.min_component_share)
     return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False)
 
 

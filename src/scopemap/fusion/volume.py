@@ -58,14 +58,16 @@ class TsdfVolume:
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         view = View(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        steepest = max(settings.min_incidence, _LEAST_INCIDENCE)
+        steepest = max(settings.advanced.min_incidence, _LEAST_INCIDENCE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
         grid = Grid(self.sizes.voxel_mm, self.sizes.truncation_mm, step)
         with np.errstate(invalid="ignore"):
             usable = frame.valid & (depth_mm > 0) & (depth_mm <= reach_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, view, step, settings.min_incidence, reach_mm)
-        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
+        surface = measure_surface(inverse_depth, view, step, settings.advanced.min_incidence, reach_mm)
+        trust = depth_trust(
+            np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.advanced.depth_sigma_share
+        )
         surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
         keys = np.unique(touched_blocks(surface.inverse_depth, view, grid))
         slots = self._blocks.slots(keys)

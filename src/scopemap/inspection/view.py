@@ -14,7 +14,7 @@ from scopemap.inspection.finding import Finding
 from scopemap.io.video_format.constant import is_constant
 from scopemap.io.video_format.duplicates import LEAST_DIFFERENCE, difference
 from scopemap.masking.field_of_view import FieldOfView
-from scopemap.masking.masker import Masker, is_lit, specular
+from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, Masker, is_lit, specular
 from scopemap.tracking.sharpness import detail_of
 
 SMALL_PX = 320
@@ -89,7 +89,7 @@ class Viewer:
     """Makes views of pictures in their order; keeps the last one that was no repetition."""
 
     def __init__(self) -> None:
-        self._field, self._masker = FieldOfView(_MASK.border_px), Masker(_MASK)
+        self._field, self._masker = FieldOfView(BORDER_PX), Masker(_MASK)
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
@@ -97,7 +97,7 @@ class Viewer:
     def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> View:
         """Return the view of the picture (H, W, 3) uint8 at a position, and of the frame that a run makes of it."""
         small = smaller(rgb, SMALL_PX)
-        lit = is_lit(small, _MASK.dark_level)
+        lit = is_lit(small, _MASK.advanced.dark_level)
         field = self._field(lit, np.ones_like(lit))
         masked = self._masker(frame)
         figures = self._figures(position, rgb, (small, lit, field), masked)
@@ -112,10 +112,10 @@ class Viewer:
         red, green, blue = cv2.split(small)
         low, high = cv2.min(red, green), cv2.max(red, green)
         middle = cv2.max(low, cv2.min(high, blue))
-        clipped = (middle >= _MASK.bright_level) & inside
+        clipped = (middle >= BRIGHT_LEVEL) & inside
         means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
         lit_share = np.count_nonzero(lit & inside) / count
-        highlights = specular(cv2.min(low, blue), inside, _MASK.highlight_ratio) & inside
+        highlights = specular(cv2.min(low, blue), inside, HIGHLIGHT_RATIO) & inside
         return Figures(
             position=position,
             index=masked.index,

@@ -27,7 +27,7 @@ def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None 
     folder = Path(settings.files) if settings.files else own
     if folder is None or settings.files == _NO_MASKS:
         return None
-    return MaskFiles(folder, rectifier, settings.files_grow_px)
+    return MaskFiles(folder, rectifier, settings.advanced.files_grow_px)
 
 
 class MaskFiles:

@@ -16,6 +16,12 @@ from scopemap.masking.overlays import OverlayFinder
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
 _NEIGHBOURHOOD_SHARE = 0.09
 _DARKEST_HIGHLIGHT = 70
+# Level at which the second-brightest channel is saturated, and how far a highlight's darkest channel stands out.
+BRIGHT_LEVEL = 240
+HIGHLIGHT_RATIO = 1.5
+# A highlight is widened, and the field of view shrunk, by so much: their rims are blurred.
+_HIGHLIGHT_GROW_PX = 2
+BORDER_PX = 3
 # Width of the mean that leaves little of a sensor's noise.
 _CALM_WIDTH_PX = 5
 
@@ -28,7 +34,7 @@ class Masker:
 
     def __init__(self, settings: MaskSettings, files: MaskFiles | None = None) -> None:
         self.settings, self._files = settings, files
-        self._field = FieldOfView(settings.border_px)
+        self._field = FieldOfView(BORDER_PX)
         self._overlays = OverlayFinder() if settings.overlays else None
 
     def __call__(self, frame: Frame) -> Frame:
@@ -36,16 +42,16 @@ class Masker:
 
         Under-exposed is a pixel whose brightest channel is at most `dark_level`, its own or the mean around it: noise
         lifts single pixels of a black image. Over-exposed is one whose second brightest channel reaches
-        `bright_level`: red alone clips on sound tissue, and leaves two channels to see by.
+        `BRIGHT_LEVEL`: red alone clips on sound tissue, and leaves two channels to see by.
         """
         darkest, middle = _darker_channels(frame.rgb)
-        clipped = middle >= self.settings.bright_level
-        lit = is_lit(frame.rgb, self.settings.dark_level)
+        clipped = middle >= BRIGHT_LEVEL
+        lit = is_lit(frame.rgb, self.settings.advanced.dark_level)
         valid = frame.valid & lit & ~clipped
         field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         if self.settings.highlights:
-            bright = clipped | specular(darkest, field, self.settings.highlight_ratio)
-            valid &= ~_grown(bright, self.settings.highlight_grow_px)
+            bright = clipped | specular(darkest, field, HIGHLIGHT_RATIO)
+            valid &= ~_grown(bright, _HIGHLIGHT_GROW_PX)
         overlays = None if self._overlays is None else self._overlays(frame.rgb, field)
         files = None if self._files is None else self._files.covered(frame.index)
         for covered in (overlays, files):
