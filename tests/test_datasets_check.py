@@ -22,7 +22,8 @@ from scopemap.io.datasets.checking import Finding, check, check_path, refusal
 from scopemap.io.datasets.pose_depth import PoseDepthTest
 from scopemap.io.datasets.survey import FrameRecord, Survey, survey
 from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence, SourceFrame, SourceTruth
+from scopemap.io.sequence import Sequence
+from scopemap.io.source import SourceFrame, SourceTruth
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.trajectory.formats.text import read_poses
 

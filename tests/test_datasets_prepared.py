@@ -17,8 +17,8 @@ from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io import prepared
 from scopemap.io.opening import open_sequence
-from scopemap.io.video_format.duplicates import difference, repeats
 from scopemap.io.video_format.interlacing import combing
+from scopemap.io.video_format.redundant_frames import is_repeat, mean_difference
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]
@@ -193,23 +193,23 @@ def test_pictures_that_repeat_are_skipped(tmp_path: Path) -> None:
 def test_a_camera_at_rest_repeats_nothing() -> None:
     still, rng = tissue(0).astype(float), np.random.default_rng(0)
     noisy = [np.clip(still + rng.normal(0, 1.5, still.shape), 0, 255).astype(np.uint8) for _ in range(3)]
-    assert not repeats(noisy[0], noisy[1])
-    assert repeats(noisy[0], noisy[0])
+    assert not is_repeat(noisy[0], noisy[1])
+    assert is_repeat(noisy[0], noisy[0])
 
 
 def test_black_borders_do_not_dilute_a_difference() -> None:
     one, other = (tissue(number) for number in (0, 0))
     other = np.clip(one + 1, 0, 255).astype(np.uint8)
-    assert difference(one, other) == pytest.approx(1, abs=0.01)
+    assert mean_difference(one, other) == pytest.approx(1, abs=0.01)
     for view in (one, other):
         view[:, 40:] = 0
-    assert difference(one, other) == pytest.approx(1, abs=0.01)
+    assert mean_difference(one, other) == pytest.approx(1, abs=0.01)
 
 
 def test_pictures_that_show_nothing_repeat_nothing() -> None:
     black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    assert not repeats(black, black)
-    assert not repeats(black + 90, black + 90)
+    assert not is_repeat(black, black)
+    assert not is_repeat(black + 90, black + 90)
 
 
 def test_what_creeps_adds_up(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cli import main
 from scopemap.config import Config
 from scopemap.io.frame_choice import FrameChoice
-from scopemap.io.sequence import SourceFrame
+from scopemap.io.source import SourceFrame
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FAST = ("--preset", "realtime", "--quiet")

@@ -28,7 +28,7 @@ from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, fol
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.constant import is_constant
+from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.mapping import Backend, Correction, Seat
 from scopemap.masking.mask_files import MaskFiles, create_masks
 from scopemap.masking.masker import Masker

@@ -24,7 +24,7 @@ from scopemap.depth import DepthEstimator
 from scopemap.depth.power_law_fit import described, fit_exponent, with_exponent
 from scopemap.errors import InputError
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.constant import is_constant
+from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.mapping import LARGEST_LOG_FACTOR
 from scopemap.pipeline import Estimators, Fused, Percept, Piece, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder

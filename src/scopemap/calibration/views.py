@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.calibration.targets import Board, Corners, nearest_px
 from scopemap.errors import InputError
-from scopemap.io.sequence import Source
+from scopemap.io.source import Source
 
 _FRAMES_LOOKED_AT = 300
 _FARTHEST_EDGE_PX = 20

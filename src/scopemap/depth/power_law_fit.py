@@ -28,7 +28,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
 from scopemap.geometry.warp import pull
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.constant import is_constant
+from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 

@@ -31,7 +31,8 @@ from scopemap.inspection.view import View, Viewer
 from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import UNKNOWN_MAKE
-from scopemap.io.sequence import Sequence, Source
+from scopemap.io.sequence import Sequence
+from scopemap.io.source import Source
 from scopemap.io.video import VideoFile
 from scopemap.io.video_format.stereo_packing import Packing, packing
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from scopemap.inspection.clip import Clip, frames_of
 from scopemap.inspection.finding import Finding, covered, stretches_of
-from scopemap.io.video_format.duplicates import LEAST_DIFFERENCE
+from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE
 
 _FREEZE_S, _FREEZE_FRAMES = 0.3, 4
 

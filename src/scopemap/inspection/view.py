@@ -11,8 +11,7 @@ import numpy as np
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame
 from scopemap.inspection.finding import Finding
-from scopemap.io.video_format.constant import is_constant
-from scopemap.io.video_format.duplicates import LEAST_DIFFERENCE, difference
+from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, is_constant, mean_difference
 from scopemap.masking.field_of_view import FieldOfView
 from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, Masker, is_lit, specular
 from scopemap.tracking.sharpness import detail_of
@@ -137,9 +136,9 @@ class Viewer:
             self._kept = rgb, small
             return np.inf
         # Means of pixels differ less than the pixels do: only where they agree, all pixels must be asked.
-        change = difference(small, self._kept[1])
+        change = mean_difference(small, self._kept[1])
         if change < LEAST_DIFFERENCE:
-            change = difference(rgb, self._kept[0])
+            change = mean_difference(rgb, self._kept[0])
         if change >= LEAST_DIFFERENCE:
             self._kept = rgb, small
         return change

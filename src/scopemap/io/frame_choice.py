@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from scopemap.io.video_format.duplicates import repeats
-
-if TYPE_CHECKING:
-    from scopemap.io.sequence import SourceFrame
+from scopemap.io.source import SourceFrame
+from scopemap.io.video_format.redundant_frames import is_repeat
 
 # Stamps that are written in milliseconds must not make a frame miss its turn; nor may this be a good part of one.
 _SLACK_S, _SLACK_SHARE = 1e-3, 0.25
@@ -50,7 +48,7 @@ class FrameChoice:
             due = math.inf if self.fps is None else _slot(frame.time_s - start_s, self.fps)
             if due <= turn and self.fps is not None:
                 self._skip(frame, "thinned", f"beyond {self.fps:g} frames/s")
-            elif last is not None and self.skip_repeated and repeats(last.rgb, frame.rgb):
+            elif last is not None and self.skip_repeated and is_repeat(last.rgb, frame.rgb):
                 self._skip(frame, "repeated", f"repeats frame {last.index}")
             else:
                 turn, last = due, frame

@@ -15,7 +15,7 @@ from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.decoding import decoded, read_decoded
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FOLDER_RATE_HZ = 30.0
@@ -64,7 +64,7 @@ def read_depth16(file: Path) -> np.ndarray | None:
     return values
 
 
-class ImageFolder(KnowsNothing):
+class ImageFolder(SourceDefaults):
     """A folder of images; the layouts of data sets build on it.
 
     The calibration is `camera.yaml` in the folder, else beside the images, where it is there; one that cannot be
@@ -86,7 +86,7 @@ class ImageFolder(KnowsNothing):
         calibration_file = next((file for file in own if file.is_file()), None)
         if calibration_file is not None:
             with self._making_camera():
-                self._take(stated_calibration(calibration_file, (self.width, self.height)))
+                self._use_calibration(stated_calibration(calibration_file, (self.width, self.height)))
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -36,7 +36,8 @@ from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.images import ImageFolder
 from scopemap.io.permissions import hindrances, is_apart, may_enter
 from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
-from scopemap.io.sequence import Sequence, Source, assumed_camera
+from scopemap.io.sequence import Sequence
+from scopemap.io.source import Source, assumed_camera
 from scopemap.io.video import VideoFile
 
 # Data sets of folders of images are ImageFolders.

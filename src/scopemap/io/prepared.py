@@ -14,7 +14,7 @@ from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.images import ImageFolder
-from scopemap.io.sequence import KnowsNothing, Source, SourceFrame, SourceTruth
+from scopemap.io.source import Source, SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
 from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
@@ -55,7 +55,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
     return PreparedSource(source, packed, settings)
 
 
-class PreparedSource(KnowsNothing):
+class PreparedSource(SourceDefaults):
     """A source of which one view and one field of each picture is used; all else is the source's own.
 
     packed : how two views lie in a picture, of which the left eye's is used; None: the picture is one view.
@@ -88,7 +88,7 @@ class PreparedSource(KnowsNothing):
         elif source.calibration is not None and source.calibration.file is not None:
             # Without a size of its own, the file beside the images is for one view; any other camera is of both.
             try:
-                self._take(stated_calibration(source.calibration.file, (self.width, self.height)))
+                self._use_calibration(stated_calibration(source.calibration.file, (self.width, self.height)))
             except CalibrationError as fault:
                 self.camera_fault = fault
         elif isinstance(source, ImageFolder):

@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 
 from scopemap.errors import InputError
 from scopemap.io.decoding import limit_in_words, most_pixels
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.time_stamps import TimeStamps
 from scopemap.io.video_format.orientation import turns_sideways, upright
 
@@ -33,7 +33,7 @@ _SAMPLED_EVERY = 10
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 
 
-class VideoFile(KnowsNothing):
+class VideoFile(SourceDefaults):
     """A video; frame number = order of decoding, time stamps from the stream, pictures turned as they are to be shown.
 
     Colours come as 8-bit sRGB by what the stream says of its matrix and range; where it is silent, BT.601, limited. A

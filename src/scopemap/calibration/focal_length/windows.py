@@ -14,7 +14,7 @@ from scopemap.flow.corners import corners, followed
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.constant import is_constant
+from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 

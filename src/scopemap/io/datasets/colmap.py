@@ -19,7 +19,7 @@ from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse
 from scopemap.io.datasets.colmap_files import image_path, model_files, read_images
 from scopemap.io.images import ImageFolder, image_files
-from scopemap.io.sequence import SourceTruth
+from scopemap.io.source import SourceTruth
 from scopemap.trajectory.formats.colmap import ModelImage, poses_of
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")

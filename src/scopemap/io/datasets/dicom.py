@@ -19,12 +19,12 @@ from scopemap.io.datasets.dicom_files import Header, is_dicom, is_index, is_inst
 from scopemap.io.datasets.dicom_pictures import pictures
 from scopemap.io.datasets.dicom_video import EncapsulatedVideo
 from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
 _COMPARED, _CLOCKS_APART = 25, 0.005
 
 
-class Dicom(KnowsNothing):
+class Dicom(SourceDefaults):
     """The pictures of one DICOM file, or of one series in a folder.
 
     Time stamps are a video's own, else those that the file states (FrameTimeVector, FrameTime, CineRate,

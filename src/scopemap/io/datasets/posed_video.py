@@ -12,7 +12,7 @@ from scopemap.cameras.camera import CameraModel
 from scopemap.cameras.formats.fitting import check_plausible, fitted_to, rescaled_note
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.frame import TruthQuality
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
 
 _OWN_CALIBRATION = "camera.yaml"
@@ -20,7 +20,7 @@ _OWN_CALIBRATION = "camera.yaml"
 _SMALLEST_FRAME_BYTES = 16
 
 
-class PosedVideo(KnowsNothing):
+class PosedVideo(SourceDefaults):
     """One view of a folder's video, with the poses that a data set fills in; no depth.
 
     path : the folder. video : the file. aspect : width over height of one view, of which the video may hold two, above
@@ -44,7 +44,7 @@ class PosedVideo(KnowsNothing):
         self.poses: dict[int, np.ndarray] = {}
         own = path / _OWN_CALIBRATION
         if own.is_file():
-            self._take(stated_calibration(own, (self.width, self.height)))
+            self._use_calibration(stated_calibration(own, (self.width, self.height)))
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames of the view, decoded in order."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from scopemap.errors import InputError, ScopemapError
 from scopemap.io.opening import DATASETS, open_source
-from scopemap.io.sequence import Sequence, Source
+from scopemap.io.sequence import Sequence
+from scopemap.io.source import Source
 from scopemap.trajectory.formats.opening import KINDS, holds_trajectory, read_trajectory
 from scopemap.trajectory.trajectory import Trajectory, Unit
 

@@ -34,7 +34,7 @@ from scopemap.io.datasets.rosbag_files import (
     is_recording,
 )
 from scopemap.io.datasets.rosbag_pictures import bare, bits_of, depth_of, eight_bit, encoding_of, is_depth, picture_of
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
 _ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)")
@@ -45,7 +45,7 @@ _LARGEST_GAP_S = 0.02
 _NS_PER_S = 1e9
 
 
-class RosBag(KnowsNothing):
+class RosBag(SourceDefaults):
     """The images of one topic of a recording.
 
     path : the bag. topic : the topic of the images; None: one with a `camera_info`, in colour, of the left camera and

@@ -19,7 +19,7 @@ from scopemap.cameras.formats.reading import read_calibration, stated_calibratio
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.scared_files import KeyframeTruth, calibration_camera, read_frame_data
 from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, image_files
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
 
 OWN_CALIBRATION = "camera.yaml"
@@ -34,7 +34,7 @@ _STACKED_ASPECT = 1.4
 _MOST_OFF_CENTRE = 0.25
 
 
-class ScaredKeyframe(KnowsNothing):
+class ScaredKeyframe(SourceDefaults):
     """The left view of one keyframe's video, with its true poses and depth where they lie beside it.
 
     Raises `InputError` for a keyframe that is a single picture, and `CalibrationError` for one that does not fit.
@@ -135,7 +135,7 @@ class ScaredKeyframe(KnowsNothing):
         size = (self.width, self.height)
         file = next((self.path / n for n in (OWN_CALIBRATION, *_CALIBRATIONS) if (self.path / n).is_file()), None)
         if file is not None and file.name == OWN_CALIBRATION:
-            self._take(stated_calibration(file, size))
+            self._use_calibration(stated_calibration(file, size))
         elif file is not None:
             calibration = read_calibration(file, size)
             self.camera, self.depth_scale_mm = calibration.camera, calibration.depth_scale_mm

@@ -20,7 +20,7 @@ from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.io.datasets.scared import OWN_CALIBRATION
 from scopemap.io.datasets.scared_files import KeyframeTruth, read_frame_data
 from scopemap.io.images import FOLDER_RATE_HZ, decoded_image
-from scopemap.io.sequence import KnowsNothing, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
 _INTRINSICS = "intrinsics_colmap.yaml"
 _LOG = "frame_log.json"
@@ -28,7 +28,7 @@ _LOG = "frame_log.json"
 _COLMAP_CENTRE_PX = 0.5
 
 
-class ScaredCKeyframe(KnowsNothing):
+class ScaredCKeyframe(SourceDefaults):
     """The frames of one keyframe that COLMAP registered, read out of their archive one at a time.
 
     Raises `InputError` where there are no frames, and `CalibrationError` for intrinsics that do not fit.
@@ -117,7 +117,7 @@ class ScaredCKeyframe(KnowsNothing):
         size = (self.width, self.height)
         own = self.path / OWN_CALIBRATION
         if own.is_file():
-            self._take(stated_calibration(own, size))
+            self._use_calibration(stated_calibration(own, size))
             return
         if not (self.path / _INTRINSICS).is_file():
             missing = f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)"

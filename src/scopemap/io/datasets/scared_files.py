@@ -22,7 +22,7 @@ from scopemap.frame import TruthQuality
 from scopemap.geometry.se3 import inverse, orthonormalised
 from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.io.decoding import decoded
-from scopemap.io.sequence import SourceTruth
+from scopemap.io.source import SourceTruth
 
 # The last place are files that lie loose in `data`; an archive of that name is not meant.
 _FRAME_DATA = ("data/frame_data", "frame_data", "image_02/data/frame_data", "data/.")

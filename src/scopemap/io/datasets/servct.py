@@ -19,7 +19,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.images import ImageFolder, image_files, read_depth16, read_image
-from scopemap.io.sequence import SourceFrame, SourceTruth
+from scopemap.io.source import SourceFrame, SourceTruth
 
 _LEFT = "Left_rectified"
 _CALIBRATION = "Rectified_calibration"

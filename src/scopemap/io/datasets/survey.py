@@ -13,7 +13,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.io.datasets.pose_depth import Agreement, PoseDepthTest
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.duplicates import repeats
+from scopemap.io.video_format.redundant_frames import is_repeat
 from scopemap.trajectory.trajectory import path_length_mm
 
 RIGID_TOLERANCE = 1e-2
@@ -207,7 +207,7 @@ def _records(
             frame.name,
             brightest=float(np.percentile(sample, 99)),
             spread=float(sample.std(axis=(0, 1)).max()),
-            repeats=before is not None and before.shape == sample.shape and repeats(sample, before),
+            repeats=before is not None and before.shape == sample.shape and is_repeat(sample, before),
             T_world_camera=T_world_camera,
             depth=depth,
         )
