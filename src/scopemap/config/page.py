@@ -18,7 +18,7 @@ _HEAD = """# Settings
 
 Every setting can be set on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by
 a preset. The order is defaults < preset < file < command line. A result's `config.toml` holds all settings and is a
-valid file. A cell "presets" names what `paper` and `realtime` change. The page is generated from the code (`scopemap.config.page`).
+valid file. A cell "presets" names what `paper` and `realtime` change. `scopemap.config.page` writes this page.
 """
 _SECTIONS = (
     ("", "User settings", "What one may want to choose."),
