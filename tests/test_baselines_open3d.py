@@ -30,7 +30,7 @@ from scopemap.trajectory.formats.opening import read_trajectory
 COLOUR = ["Steinbruecker (Open3D)", "Park (Open3D)"]
 CLOUDS = ["Point-to-point ICP (Open3D)", "Point-to-plane ICP (Open3D)"]
 PLAIN = {
-    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
+    **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},
     **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(140.0, 140.0, 79.5, 63.5, 160, 128)

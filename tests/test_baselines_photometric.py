@@ -27,7 +27,7 @@ from scopemap.tracking.pyramid import build_pyramid
 from scopemap.trajectory.formats.opening import read_trajectory
 
 PLAIN = {
-    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
+    **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},
     **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(40.0, 40.0, 31.5, 23.5, 64, 48)

@@ -97,7 +97,10 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
         "fusion.voxel_mm": 2.0,
         "fusion.advanced.min_weight": 0,
     }
-    for name, changes in {"mapis": {}, "plain": {"mapis.frame_scale": "none", "mapis.blend": "none"}}.items():
+    for name, changes in {
+        "mapis": {},
+        "plain": {"mapis.advanced.frame_scale": "none", "mapis.paper.blend": "none"},
+    }.items():
         config = Config.load(settings=light | changes)
         reconstruct(open_sequence(truth), config, out=tmp_path / name)
     out = tmp_path / "out"

@@ -49,7 +49,7 @@ def test_precedence(tmp_path: Path) -> None:
     assert Config.load("paper", file).smoothing.method == "none"
     assert Config.load("paper", file).tracking.huber == 2.5
     loaded = Config.load("paper", file, names)
-    assert (loaded.tracking.huber, loaded.tracking.keyframe_every, loaded.mapis.order) == (3.5, 7, "refine-first")
+    assert (loaded.tracking.huber, loaded.tracking.keyframe_every, loaded.mapis.paper.order) == (3.5, 7, "refine-first")
     assert loaded.preset == "paper"
 
 
@@ -88,7 +88,7 @@ def test_an_unknown_key_names_the_nearest(wrong: str, near: str) -> None:
 
 
 def test_an_unknown_key_in_a_file_names_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"did you mean 'mapis\.tau'"):
+    with pytest.raises(SettingsError, match=r"did you mean 'mapis\.paper\.tau'"):
         Config.load(file=_write(tmp_path, "[mapis]\ntaw = 0.2\n"))
 
 
@@ -102,7 +102,7 @@ def test_an_unknown_key_like_nothing_is_still_refused() -> None:
     [
         ("tracking.huber", 0, "greater than 0"),
         ("tracking.huber", "wide", "valid number"),
-        ("mapis.blend", "mixed", "'exponential'"),
+        ("mapis.paper.blend", "mixed", "'exponential'"),
         ("mask.advanced.dark_level", 300, "less than or equal to 255"),
         ("depth.near_far_mm", [1, 2, 3], "at most 2"),
         ("smoothing.alpha", 0.9, "alpha \\+ beta \\+ gamma must be 1, got 1.3"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +47,7 @@ class Metric:
 
 
 def anchored(reference: Metric | None = None, **values: Any) -> AnchoredDepth:
-    return AnchoredDepth(DepthSettings(**({"backend": "depth-anything"} | values)), reference or Metric())
+    return AnchoredDepth(chosen(DepthSettings, **({"backend": "depth-anything"} | values)), reference or Metric())
 
 
 def disparity(scale: float = 0.07, shift: float = 0.006) -> DepthEstimate:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_phantom import only_images, with_true_depth, write_tiny
@@ -16,12 +17,18 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.options import parse_settings
 from scopemap.cli.run import summary_lines
 from scopemap.config import Config, DepthSettings
-from scopemap.depth import create_depth
-from scopemap.depth import power_law_fit as depth_range
+from scopemap.depth import create_depth, power_law
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.power_law import PairFit, modelled_flow, pair_exponent, ray_lengths, sequence_exponent, stretched
-from scopemap.depth.power_law_fit import described, fit_exponent, with_exponent
+from scopemap.depth.power_law import (
+    PairFit,
+    apply_power_law,
+    fit_exponent,
+    modelled_flow,
+    pair_exponent,
+    ray_lengths,
+    sequence_exponent,
+)
 from scopemap.depth.shading import ShadingDepth
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
@@ -65,19 +72,19 @@ def fitted(depth_mm: np.ndarray, flow: np.ndarray, usable: np.ndarray = EVERYWHE
 
 
 def test_an_exponent_of_one_changes_nothing() -> None:
-    np.testing.assert_allclose(stretched(TRUE_MM, CAMERA, 1.0, 30.0), TRUE_MM, rtol=1e-6)
+    np.testing.assert_allclose(apply_power_law(TRUE_MM, CAMERA, 1.0, 30.0), TRUE_MM, rtol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
 @given(exponent=st.floats(0.5, 2.0), pivot_mm=st.floats(10.0, 80.0))
 def test_the_reciprocal_exponent_undoes_it(exponent: float, pivot_mm: float) -> None:
-    there = stretched(TRUE_MM, CAMERA, exponent, pivot_mm)
-    np.testing.assert_allclose(stretched(there, CAMERA, 1 / exponent, pivot_mm), TRUE_MM, rtol=1e-5)
+    there = apply_power_law(TRUE_MM, CAMERA, exponent, pivot_mm)
+    np.testing.assert_allclose(apply_power_law(there, CAMERA, 1 / exponent, pivot_mm), TRUE_MM, rtol=1e-5)
 
 
 def test_the_pivot_stays_and_ratios_of_distance_are_raised_to_the_power() -> None:
     depth_mm = (np.where(np.arange(SIZE[1]) < 80, 30.0, 60.0) / ALONG).astype(np.float32)
-    distance = stretched(depth_mm, CAMERA, 1.5, 30.0) * ALONG
+    distance = apply_power_law(depth_mm, CAMERA, 1.5, 30.0) * ALONG
     np.testing.assert_allclose(distance[:, :80], 30.0, rtol=1e-5)
     np.testing.assert_allclose(distance[:, 80:], 30.0 * 2**1.5, rtol=1e-5)
 
@@ -85,7 +92,7 @@ def test_the_pivot_stays_and_ratios_of_distance_are_raised_to_the_power() -> Non
 def test_what_is_unknown_or_not_positive_is_unknown() -> None:
     depth_mm = np.full(SIZE, 20.0, np.float32)
     depth_mm[0, :3] = (np.nan, 0.0, -5.0)
-    assert np.flatnonzero(np.isnan(stretched(depth_mm, CAMERA, 1.2, 20.0))).tolist() == [0, 1, 2]
+    assert np.flatnonzero(np.isnan(apply_power_law(depth_mm, CAMERA, 1.2, 20.0))).tolist() == [0, 1, 2]
 
 
 # ---- one pair
@@ -163,7 +170,7 @@ def test_a_camera_that_only_turns_tells_nothing() -> None:
     assert pair_exponent(squeezed(), moved((0.0, 0.0, 0.0), (0.05, -0.1, 0.1)), EVERYWHERE, CAMERA) is None
 
 
-def test_a_sphere_has_no_range_that_could_be_stretched() -> None:
+def test_a_sphere_has_no_range_that_could_be_apply_power_law() -> None:
     flat = (30.0 + np.sin(np.arange(SIZE[1]) / 7)) / ALONG
     points = transform(se3(np.eye(3), np.array([1.5, 0.5, 0.3])), CAMERA.rays * flat[..., None])
     rng = np.random.default_rng(2)
@@ -215,7 +222,7 @@ def test_the_exponent_is_clipped(found: float, clipped: float) -> None:
 def test_few_or_contradictory_pairs_leave_it_at_one_and_say_why() -> None:
     few = sequence_exponent(fits(1.3, 1.3))
     assert (few.exponent, few.pairs) == (1.0, 2)
-    assert described(few, 80) == "depth exponent: left at 1, 2 pair(s) of frames could be fitted, 4 needed"
+    assert few.describe(80) == "depth exponent: left at 1, 2 pair(s) of frames could be fitted, 4 needed"
     torn = sequence_exponent(fits(0.6, 0.7, 1.0, 1.6, 1.9, 2.2))
     assert torn.exponent == 1.0
     assert "contradict" in torn.reason
@@ -230,8 +237,8 @@ def frame(valid: bool = True) -> Frame:
 
 
 def anchored(**changes: object) -> AnchoredDepth:
-    chosen = DepthSettings(**{"backend": "scopenet", "exponent": 1.3} | changes)  # type: ignore[arg-type]
-    return AnchoredDepth(chosen, ShadingDepth(chosen))
+    settings = chosen(DepthSettings, **{"backend": "scopenet", "exponent": 1.3} | changes)
+    return AnchoredDepth(settings, ShadingDepth(settings))
 
 
 def test_the_median_distance_of_the_first_usable_frame_is_held_as_pivot() -> None:
@@ -241,7 +248,7 @@ def test_the_median_distance_of_the_first_usable_frame_is_held_as_pivot() -> Non
     assert np.isnan(anchor.depth_mm(DepthEstimate(later, "depth"), frame(valid=False))).all()
     for values in (first, later):
         depth_mm = anchor.depth_mm(DepthEstimate(values, "depth"), frame())
-        np.testing.assert_allclose(depth_mm, stretched(values, CAMERA, 1.3, pivot), rtol=1e-5)
+        np.testing.assert_allclose(depth_mm, apply_power_law(values, CAMERA, 1.3, pivot), rtol=1e-5)
 
 
 def test_sigma_as_a_share_grows_with_the_exponent() -> None:
@@ -259,7 +266,7 @@ def test_a_stated_range_still_fixes_the_scale_of_stretched_depth() -> None:
 
 
 @pytest.mark.parametrize("kind", ["disparity", "measured"])
-def test_what_is_not_predicted_depth_is_not_stretched(kind: str) -> None:
+def test_what_is_not_predicted_depth_is_not_apply_power_law(kind: str) -> None:
     values = squeezed().astype(np.float32)
     with pytest.raises(SettingsError, match=rf"depth.exponent=1.3 is for predicted depth; .* gives {kind}"):
         anchored().metric(DepthEstimate(values, kind), frame())  # type: ignore[arg-type]
@@ -268,7 +275,7 @@ def test_what_is_not_predicted_depth_is_not_stretched(kind: str) -> None:
 
 
 def test_an_exponent_that_is_still_to_be_fitted_is_refused() -> None:
-    with pytest.raises(SettingsError, match="only a whole run can fit it"):
+    with pytest.raises(SettingsError, match="is resolved by a run before it starts"):
         anchored(exponent="fit").metric(DepthEstimate(squeezed(), "depth"), frame())
 
 
@@ -290,9 +297,9 @@ def test_an_impossible_exponent_is_refused(value: object) -> None:
 
 
 def test_the_fit_takes_the_place_of_the_word_and_of_nothing_else() -> None:
-    given = {"tracking.huber": 2.0, "depth.shading_exponent": 0.5}
+    given = {"tracking.huber": 2.0, "depth.advanced.shading_exponent": 0.5}
     config = Config.load(settings={"depth.exponent": "fit", **given})
-    found = with_exponent(config, sequence_exponent(fits(*[1.25] * 6)))
+    found = sequence_exponent(fits(*[1.25] * 6)).applied(config)
     assert found == Config.load(settings={"depth.exponent": 1.25, **given})
 
 
@@ -338,7 +345,7 @@ def test_measured_depth_is_left_as_it_is(phantom: Path) -> None:
     config = with_true_depth(phantom, depth__exponent="fit", fusion__enabled=False)
     result = reconstruct(open_sequence(phantom), config)
     assert result.config.depth.exponent == 1.0
-    assert "depth exponent: left at 1, measured is not stretched" in result.provenance["notes"]
+    assert "depth exponent: left at 1, measured needs no power law" in result.provenance["notes"]
 
 
 def test_a_number_is_refused_where_depth_is_measured(phantom: Path) -> None:
@@ -354,7 +361,7 @@ def test_the_bias_of_smooth_flow_is_taken_out(phantom: Path, tmp_path: Path, mon
     config = with_true_depth(depth, depth__files_kind="depth", depth__files_scale_mm=0.01)
     estimator = create_depth(config.depth, sequence.rectifier, "cpu")
     realigned = fit_exponent(sequence, config, estimator).exponent
-    monkeypatch.setattr(depth_range, "_REALIGNMENTS", 0)
+    monkeypatch.setattr(power_law, "_REALIGNMENTS", 0)
     plain = fit_exponent(sequence, config, estimator).exponent
     assert abs(realigned - 1.2) < 0.12
     assert abs(realigned - 1.2) < 0.5 * abs(plain - 1.2)

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
@@ -32,7 +33,7 @@ def frame(index: int = 0, camera: PinholeCamera = TARGET) -> Frame:
 
 
 def files(folder: Path, scale_mm: float | None = None, rectifier: Rectifier = SAME, **settings: Any) -> FilesDepth:
-    return FilesDepth(folder, rectifier, DepthSettings(**settings), scale_mm)
+    return FilesDepth(folder, rectifier, chosen(DepthSettings, **settings), scale_mm)
 
 
 def write(folder: Path, name: str, array: np.ndarray) -> None:
@@ -193,11 +194,11 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
 def test_the_registry_knows_its_names(tmp_path: Path) -> None:
     write(tmp_path, "0.png", ramp(np.uint8, 255))
     assert create_depth(DepthSettings(), SAME, "cpu").name == "scopenet"
-    assert create_depth(DepthSettings(backend="shading"), SAME, "cpu").name == "shading"
-    assert isinstance(create_depth(DepthSettings(backend=f"files:{tmp_path}"), SAME, "cpu"), FilesDepth)
+    assert create_depth(chosen(DepthSettings, backend="shading"), SAME, "cpu").name == "shading"
+    assert isinstance(create_depth(chosen(DepthSettings, backend=f"files:{tmp_path}"), SAME, "cpu"), FilesDepth)
     assert isinstance(create_anchor(DepthSettings(), "cpu"), AnchoredDepth)
     with pytest.raises(SettingsError, match="shading, depth-anything, depth-pro or files:FOLDER"):
-        create_depth(DepthSettings(backend="midas"), SAME, "cpu")
+        create_depth(chosen(DepthSettings, backend="midas"), SAME, "cpu")
 
 
 @pytest.mark.real
@@ -207,7 +208,7 @@ def test_real_disparity_files_of_a_fisheye_video(real_data: Path) -> None:
     source = C3vdFolder(folder / "cecum_t1_a")
     assert source.camera is not None
     rectifier = Rectifier(source.camera, working_camera(source.camera, (337, 270)))
-    settings = DepthSettings(backend=f"files:{folder / 'cecum_t1_a_depth_anything'}", near_far_mm=(13.5, 100.0))
+    settings = chosen(DepthSettings, backend=f"files:{folder / 'cecum_t1_a_depth_anything'}", near_far_mm=(13.5, 100.0))
     first = frame(0, rectifier.target)
     estimate = create_depth(settings, rectifier, "cpu").estimate(first)
     depth_mm = create_anchor(settings, "cpu").depth_mm(estimate, first)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chosen_settings import chosen
 from safetensors.torch import save_file
 from torch import nn
 
@@ -138,7 +139,7 @@ def test_float16_weights_of_a_file_are_used_in_float32(frame: Frame, file: Path)
     rounded = _whole()
     rounded.load_state_dict({name: value.half() for name, value in rounded.state_dict().items()})
     expected = ScopeNetDepth(rounded, device="cpu").estimate(frame).values
-    estimator = create_depth(DepthSettings(backend="scopenet", model=str(file)), SAME, "cpu")
+    estimator = create_depth(chosen(DepthSettings, backend="scopenet", model=str(file)), SAME, "cpu")
     np.testing.assert_array_equal(estimator.estimate(frame).values, expected)
 
 
@@ -147,7 +148,7 @@ def test_the_weights_of_the_package_are_the_default(
 ) -> None:
     (tmp_path / WEIGHTS_NAME).write_bytes(file.read_bytes())
     monkeypatch.setattr(module.resources, "files", lambda package: tmp_path)
-    estimator = create_depth(DepthSettings(backend="scopenet"), SAME, "cpu")
+    estimator = create_depth(chosen(DepthSettings, backend="scopenet"), SAME, "cpu")
     origin = estimator.provenance()
     assert origin["model"] == "that come with the package"
     assert origin[f"sha256 {WEIGHTS_NAME}"] == weights.sha256_of(file)
@@ -176,7 +177,7 @@ def test_the_package_lists_its_weights() -> None:
 
 @pytest.mark.parametrize(("calibrated", "rays"), [(True, "known"), (False, "assumed")])
 def test_provenance_says_whose_weights_and_whether_the_rays_were_known(file: Path, calibrated: bool, rays: str) -> None:
-    settings = DepthSettings(backend="scopenet", model=str(file))
+    settings = chosen(DepthSettings, backend="scopenet", model=str(file))
     origin = create_depth(settings, SAME, "cpu", calibrated=calibrated).provenance()
     assert origin == {
         "depth": "scopenet",
@@ -228,10 +229,10 @@ def test_training_s_counters_may_be_left_out(tmp_path: Path) -> None:
 def test_its_millimetres_are_its_anchor_unless_another_is_asked_for(frame: Frame) -> None:
     estimate = ScopeNetDepth(_small(), device="cpu").estimate(frame)
     lit = replace(frame, rgb=np.full_like(frame.rgb, 120))
-    own = create_anchor(DepthSettings(backend="scopenet"), "cpu")
+    own = create_anchor(chosen(DepthSettings, backend="scopenet"), "cpu")
     np.testing.assert_array_equal(own.depth_mm(estimate, lit), estimate.values)
     assert own.description == "millimetres as scopenet gives them"
-    shaded = create_anchor(DepthSettings(backend="scopenet", anchor="shading", shading_median_mm=50.0), "cpu")
+    shaded = create_anchor(chosen(DepthSettings, backend="scopenet", anchor="shading", shading_median_mm=50.0), "cpu")
     metric = shaded.metric(estimate, lit)
     assert shaded.description == "shading prior, median distance 50 mm"
     factor = np.nanmedian(metric.depth_mm / estimate.values)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_phantom import only_images, write_tiny
@@ -116,8 +117,8 @@ def test_frames_and_estimates_refuse_a_sigma_of_another_size() -> None:
         DepthEstimate(DEPTH, "depth", sigma=DEPTH[1:])
 
 
-def _anchored(estimate: DepthEstimate, **chosen: Any) -> Any:
-    values = DepthSettings(**({"backend": "depth-anything", "anchor": "factor", "factor": 25.0} | chosen))
+def _anchored(estimate: DepthEstimate, **changes: Any) -> Any:
+    values = chosen(DepthSettings, **({"backend": "depth-anything", "anchor": "factor", "factor": 25.0} | changes))
     frame = Frame(0, 0.0, np.full((*SHAPE, 3), 90, np.uint8), CAMERA, np.ones(SHAPE, bool))
     return AnchoredDepth(values, ShadingDepth(values)).metric(estimate, frame)
 
@@ -148,7 +149,7 @@ def _link() -> Correspondence:
 
 
 def _refined(sigmas: tuple[Any, Any], motion: np.ndarray | None = None, **changes: Any) -> list[RefinedDepth]:
-    mapis = Mapis(MapisSettings(**({"filter_sigma_px": 0.0, "frame_scale": "none"} | changes)))
+    mapis = Mapis(chosen(MapisSettings, **({"filter_sigma_px": 0.0, "frame_scale": "none"} | changes)))
     results = [mapis.refine(DEPTH, "depth", CAMERA, None, None, sigma_mm=sigmas[0])]
     for raw in (OTHER, DEPTH):
         sigma = sigmas[1] if raw is OTHER else sigmas[0]
@@ -204,7 +205,7 @@ def test_sigma_may_be_said_of_one_frame_and_not_of_the_next() -> None:
 
 
 def test_the_scale_of_a_frame_is_that_of_its_sigma() -> None:
-    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
+    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
     mapis.refine(DEPTH, "depth", CAMERA, None, None, sigma_mm=SHARE * DEPTH)
     link = replace(_link(), distance=np.ones(SHAPE, np.float32))
     refined = mapis.refine(2 * DEPTH, "depth", CAMERA, link, None, sigma_mm=SHARE * 2 * DEPTH)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from drawn_inputs import frames_of, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
@@ -145,7 +146,7 @@ def test_the_data_sets_own_masks_are_used_unless_others_or_none_are_asked_for(tm
     own, others = (write_masks(tmp_path / name, {"0.png": left_half()}) for name in ("own", "others"))
 
     def used(files: str) -> str:
-        masks = create_masks(MaskSettings(files=files), RECTIFIER, own)
+        masks = create_masks(chosen(MaskSettings, files=files), RECTIFIER, own)
         return "" if masks is None else masks.provenance()["masks"]
 
     assert used("").endswith("own")

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from drawn_clips import SIZE, Change, black, clip, during, inside, octagon, text, tissue
 
 from scopemap.cameras.camera import PinholeCamera
@@ -74,8 +75,8 @@ def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
 
 
 def test_the_rim_of_the_field_is_no_overlay() -> None:
-    masker, changes = Masker(MaskSettings(highlights=False)), (inside(octagon),)
-    without = Masker(MaskSettings(highlights=False, overlays=False))
+    masker, changes = Masker(chosen(MaskSettings, highlights=False)), (inside(octagon),)
+    without = Masker(chosen(MaskSettings, highlights=False, overlays=False))
     for number, picture in enumerate(clip(40, *changes)):
         frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
         np.testing.assert_array_equal(masker(frame).valid, without(frame).valid)
@@ -189,7 +190,7 @@ def test_odd_sizes(size: tuple[int, int]) -> None:
 
 
 def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
-    maskers = [Masker(MaskSettings(highlights=False, overlays=on)) for on in (True, False)]
+    maskers = [Masker(chosen(MaskSettings, highlights=False, overlays=on)) for on in (True, False)]
     for number, picture in enumerate(clip(40, text())):
         frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
         masked, plain = (masker(frame).valid for masker in maskers)
@@ -212,7 +213,7 @@ def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
      ("endoscopy/endonerf/pulling_soft_tissues", 0.006)],
 )  # fmt: skip
 def test_real_tissue_is_no_overlay(real_data: Path, path: str, largest_share: float) -> None:
-    on, off = (Masker(MaskSettings(highlights=False, overlays=which)) for which in (True, False))
+    on, off = (Masker(chosen(MaskSettings, highlights=False, overlays=which)) for which in (True, False))
     largest = 0.0
     for frame in open_sequence(real_data / path).frames():
         left_out = off(frame).valid & ~on(frame).valid

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from chosen_settings import chosen
 from scipy.spatial import KDTree
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
 
@@ -67,7 +68,7 @@ def _spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any
         parts = create(config, sequence)
         if anchor_too:
             spies.append(_SpyDepth(parts.anchor.reference, **spy))
-            return replace(parts, anchor=AnchoredDepth(DepthSettings(anchor="depth-pro"), spies[-1]))
+            return replace(parts, anchor=AnchoredDepth(chosen(DepthSettings, anchor="depth-pro"), spies[-1]))
         spies.append(_SpyDepth(parts.depth, **spy))
         return replace(parts, depth=spies[-1])
 
@@ -166,7 +167,7 @@ def test_a_black_frame_is_lost_and_tracking_resumes(interrupted: Path, monkeypat
     links: list[Any] = []
     steps: list[Step] = []
     _called(monkeypatch, Mapis, "refine", lambda *arguments: links.append(arguments[3]))
-    config = with_true_depth(interrupted, mapis__frame_scale="robust")  # measured depth alone needs no link
+    config = with_true_depth(interrupted, mapis__advanced__frame_scale="robust")  # measured depth alone needs no link
     result = reconstruct(open_sequence(interrupted), config, observers=(steps.append,))
     assert [record.index for record in result.lost] == [4]
     assert result.lost[0].track.reason.startswith("only ")

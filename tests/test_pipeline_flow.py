@@ -84,6 +84,6 @@ def test_depth_that_mapis_changed_is_not_compared_with_what_is_measured(
         return real(self, frame, measured=measured)
 
     monkeypatch.setattr(Tracker, "adopt", adopt)
-    _tracked_frames(phantom, monkeypatch, depth__files_kind="measured", mapis__frame_scale=scaled)
+    _tracked_frames(phantom, monkeypatch, depth__files_kind="measured", mapis__advanced__frame_scale=scaled)
     assert adopted
     assert set(adopted) == {speaks}

@@ -10,7 +10,7 @@ import pytest
 from tiny_phantom import FRAMES, with_true_depth
 
 from scopemap.config import Config
-from scopemap.depth.anchor import reach_mm
+from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
 from scopemap.io.opening import open_sequence
@@ -98,8 +98,8 @@ def test_frames_are_read_without_their_truth(folder: Path, monkeypatch: pytest.M
 
 
 def test_a_stated_farthest_tissue_is_believed() -> None:
-    assert reach_mm(Config.load().depth) == 300.0
-    assert reach_mm(Config.load(settings={"depth.near_far_mm": (50, 400)}).depth) == 400.0
+    assert max_depth_mm(Config.load().depth) == 300.0
+    assert max_depth_mm(Config.load(settings={"depth.near_far_mm": (50, 400)}).depth) == 400.0
 
 
 def test_a_voxel_too_small_to_store_is_refused() -> None:

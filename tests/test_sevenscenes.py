@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from drawn_inputs import number_in, poses, write_sevenscenes
 
 from scopemap.config import DepthSettings
@@ -22,7 +23,7 @@ def test_sevenscenes_bring_depth_and_poses_to_the_colour_camera(tmp_path: Path) 
     assert sequence.source.name == "7-scenes"
     assert sequence.camera.fx == pytest.approx(525 / 2)
     assert any("depth camera" in note for note in sequence.notes)
-    files = create_depth(DepthSettings(backend=f"files:{folder}"), sequence.depth_rectifier, "cpu")
+    files = create_depth(chosen(DepthSettings, backend=f"files:{folder}"), sequence.depth_rectifier, "cpu")
     for (frame, truth), T_world_depth in zip(sequence, poses(3), strict=True):
         assert number_in(frame.rgb) == frame.index
         # The colour camera sits 25 mm to the depth camera's right.

@@ -18,7 +18,15 @@ import numpy as np
 import trimesh
 
 from scopemap.config import Config, DepthSettings, FusionSettings
-from scopemap.depth import AnchoredDepth, DepthEstimator, DepthKind, create_anchor, create_depth, files_folder, reach_mm
+from scopemap.depth import (
+    AnchoredDepth,
+    DepthEstimator,
+    DepthKind,
+    create_anchor,
+    create_depth,
+    files_folder,
+    max_depth_mm,
+)
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
@@ -28,7 +36,6 @@ from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, fol
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.mapping import Backend, Correction, Seat
 from scopemap.masking.mask_files import MaskFiles, create_masks
 from scopemap.masking.masker import Masker
@@ -98,8 +105,8 @@ class Estimators:
 
     def reach_mm(self, settings: DepthSettings, room: float = 1.0) -> float:
         """Return how far depth may reach, mm: `room` times the settings' word, or what files hold of measured depth."""
-        measured_mm = self.depth.measured_reach_mm if isinstance(self.depth, FilesDepth) else None
-        return measured_mm or room * reach_mm(settings)
+        measured_mm = self.depth.measured_max_mm if isinstance(self.depth, FilesDepth) else None
+        return measured_mm or room * max_depth_mm(settings)
 
     def provenance(self) -> dict[str, str]:
         """Return names, versions and hashes of the parts, and what fixed the scale."""
@@ -172,15 +179,15 @@ class Pipeline:
         self._last_mm: np.ndarray | None = None
         self._fusable = 0
         follows = tracker is None and config.tracking.corner_depth_share > 0 and estimators.keyframe_flow.name != "none"
-        self._corners = CornerFollower(estimators.keyframe_flow, config.mapis.consistency_px) if follows else None
+        self._corners = (
+            CornerFollower(estimators.keyframe_flow, config.mapis.advanced.consistency_px) if follows else None
+        )
         self._seats: dict[int, Seat] = {}
         self._losses = 0
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the frame before it."""
         frame = self._masker(frame)
-        if is_constant(frame.rgb):
-            frame = replace(frame, valid=np.zeros_like(frame.valid))
         # A frame that the tracker is going to refuse must not fix the scale of the depth.
         usable = frame.valid.mean() >= self.config.tracking.min_valid_share
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
@@ -196,7 +203,7 @@ class Pipeline:
         if percept.kind == "measured":
             # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
             self._backend = None
-        refined = self._refine(percept, None) if self.config.mapis.order == "refine-first" else None
+        refined = self._refine(percept, None) if self.config.mapis.paper.order == "refine-first" else None
         raw = replace(
             percept.frame,
             depth_mm=percept.raw_mm,
@@ -301,12 +308,12 @@ class Pipeline:
         past, settings = self._previous, self.config.mapis
         if past is None or not self._mapis.links(kind):
             return None
-        flow = pair_flow(self.estimators.flow, past.rgb, frame.rgb, settings.consistency_px)
+        flow = pair_flow(self.estimators.flow, past.rgb, frame.rgb, settings.advanced.consistency_px)
         # What is masked in either frame shows no tissue that could be carried over.
         seen = pull(past.valid.astype(np.float32), flow.to_previous) > 0.5
-        rgb = pull(past.rgb, flow.to_previous) if settings.compare_warped else past.rgb
+        rgb = pull(past.rgb, flow.to_previous) if settings.paper.compare_warped else past.rgb
         distance = self.estimators.perceptual.compare(rgb, frame.rgb)
-        values = np.full_like(distance.map, distance.score) if settings.perceptual_score else distance.map
+        values = np.full_like(distance.map, distance.score) if settings.paper.perceptual_score else distance.map
         return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values, float(frame.valid.mean()))
 
     def _seen_again(self, percept: Percept) -> SeenAgain | None:

@@ -21,7 +21,7 @@ import numpy as np
 from scopemap.calibration.focal_length import with_focal_from_motion
 from scopemap.config import Config, FusionSettings
 from scopemap.depth import DepthEstimator
-from scopemap.depth.power_law_fit import described, fit_exponent, with_exponent
+from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
 from scopemap.io.sequence import Sequence
 from scopemap.io.video_format.redundant_frames import is_constant
@@ -235,7 +235,7 @@ def _with_exponent(
     if config.depth.exponent != "fit":
         return config, []
     fit = clock.timed("depth exponent", fit_exponent, sequence, config, estimators.depth)
-    return with_exponent(config, fit), [described(fit, config.depth.exponent_frames)]
+    return fit.applied(config), [fit.describe(config.depth.advanced.exponent_frames)]
 
 
 def _provenance(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
@@ -27,15 +28,9 @@ from scopemap.errors import SettingsError
 
 Preset = Literal["paper", "default", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
-RENAMED: dict[str, str] = {
-    "fusion.depth_sigma_share": "fusion.advanced.depth_sigma_share",
-    "fusion.min_component_share": "fusion.advanced.min_component_share",
-    "fusion.min_incidence": "fusion.advanced.min_incidence",
-    "fusion.min_weight": "fusion.advanced.min_weight",
-    "mask.dark_level": "mask.advanced.dark_level",
-    "mask.files_grow_px": "mask.advanced.files_grow_px",
-}
-"""Settings of earlier versions by their present name, with the group's new name on both sides."""
+RENAMED: dict[str, str] = {}
+"""Settings of earlier versions by their present name, with the group's new name on both sides. A setting that only
+moved within its stage (to `advanced` or `paper`) needs no entry."""
 REMOVED = {
     *("mask.border_px", "mask.bright_level", "mask.highlight_grow_px", "mask.highlight_ratio"),
     "networks.flow_iterations",
@@ -106,10 +101,14 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def new_name(setting: str) -> str:
-    """Return what a setting of an earlier version is called now; other names as they are."""
+    """Return the current name of a setting of an earlier version: renamed, or moved into a group of its stage."""
     group, dot, name = setting.partition(".")
     setting = RENAMED_GROUPS.get(group, group) + dot + name
-    return RENAMED.get(setting, setting)
+    setting = RENAMED.get(setting, setting)
+    stage, *middle = setting.split(".")
+    names = setting_names()
+    moved = [other for other in names if len(middle) == 1 and re.fullmatch(rf"{stage}\.\w+\.{middle[0]}", other)]
+    return moved[0] if setting not in names and len(moved) == 1 else setting
 
 
 def _of_earlier_versions(flat: dict[str, Any]) -> dict[str, Any]:

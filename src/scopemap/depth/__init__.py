@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth, reach_mm
+from scopemap.depth.anchor import AnchoredDepth, max_depth_mm
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.shading import ShadingDepth
@@ -20,7 +20,7 @@ __all__ = [
     "create_anchor",
     "create_depth",
     "files_folder",
-    "reach_mm",
+    "max_depth_mm",
 ]
 
 _FILES = "files:"

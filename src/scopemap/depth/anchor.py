@@ -1,7 +1,7 @@
-"""The metric anchor: what turns a depth estimate of any kind into millimetres, fixed on the first frame and then held.
+"""The metric anchor: converts a depth estimate of any kind to millimetres, fitted on the first frame and then fixed.
 
-METHOD section MAPIS-Depth, steps 1-4. Only scale (and shift, of a disparity) are fitted, once: a scale that floats from
-frame to frame is the business of the consistency stage, which knows how the camera moved.
+METHOD section MAPIS-Depth, steps 1-4. Only the scale (and the shift of a disparity) is fitted, once. A scale that
+changes from frame to frame is estimated by the consistency stage (mapis.py), which knows the camera motion.
 """
 
 from __future__ import annotations
@@ -13,41 +13,35 @@ import numpy as np
 
 from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
-from scopemap.depth.power_law import ray_lengths, stretched
+from scopemap.depth.power_law import apply_power_law, ray_lengths
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 
-# A frame with less that has both an estimate and an anchor cannot fix a scale: the next one is tried.
-_LEAST_SHARE = 0.02
+# A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
+_MIN_SHARE = 0.02
 _FACTOR_MM = 1000.0
 
 
 @dataclass(frozen=True)
 class DepthScale:
-    """Depth from a predicted depth by one factor."""
+    """Metric depth as predicted depth times a factor."""
 
     factor: float
 
     def depth_mm(self, depth: np.ndarray) -> np.ndarray:
-        """Return depth (same shape, float32, mm); NaN stays NaN, and so becomes what is not positive."""
+        """Return depth (same shape, float32, mm); NaN where the input is NaN or not positive."""
         scaled = np.asarray(depth, dtype=np.float32) * np.float32(self.factor)
         return np.where(scaled > 0, scaled, np.float32(np.nan))
 
     def sigma_mm(self, sigma: np.ndarray | None) -> np.ndarray | None:
-        """Return the standard deviation, same shape, float32, mm, of depth with that of `sigma`; None for None."""
+        """Return the standard deviation of depth (same shape, float32, mm); None for None."""
         return None if sigma is None else np.asarray(sigma, dtype=np.float32) * np.float32(self.factor)
 
 
 @dataclass(frozen=True)
 class MetricDepth:
-    """Depth of one frame in millimetres, and what is known of its error.
-
-    Attributes
-    ----------
-    depth_mm : (H, W) float32, NaN = unknown. sigma_mm : (H, W) float32, one standard deviation, NaN = unknown; None:
-    nothing is said.
-    """
+    """Depth of one frame, (H, W) float32, mm, NaN = unknown, and its standard deviation or None (not estimated)."""
 
     depth_mm: np.ndarray
     sigma_mm: np.ndarray | None
@@ -55,7 +49,7 @@ class MetricDepth:
 
 @dataclass(frozen=True)
 class _Target:
-    """What the anchor says: estimated values (N,) and the depth (N,) in mm they should come out as."""
+    """Pairs to fit: estimated values (N,) and their metric depth (N,), mm."""
 
     values: np.ndarray
     depth_mm: np.ndarray
@@ -63,20 +57,18 @@ class _Target:
 
 
 class AnchoredDepth:
-    """Turns the estimates of one sequence into raw metric depth.
+    """Converts the estimates of one sequence to raw metric depth.
 
-    The first frame with enough usable pixels fixes the conversion, which is held for all later frames.
-    `settings.anchor` chooses what it is fitted to: a given range (`near-far`), a metric network's estimate of that
-    frame (`depth-pro`), the shading prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if one is
-    given, else the estimate's own millimetres if it has them, else shading. Measured depth is never touched.
+    The first frame with enough usable pixels determines the conversion for all frames. `settings.anchor` chooses the
+    target of the fit: a given range (`near-far`), a metric network's estimate of that frame (`depth-pro`), the shading
+    prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if given, else the estimate's own
+    millimetres, else shading. Measured depth is not changed.
 
-    `settings.exponent` widens (or, below 1, narrows) the range of predicted depth before anything else: the median
-    distance along the ray of the first usable frame is the pivot, which stays, and is held too.
+    `settings.exponent` applies a power law to predicted depth first; its pivot is the median distance along the ray of
+    the first usable frame. `settings.advanced.reanchor_every` repeats the fit to the reference, which bounds drift.
 
-    `settings.reanchor_every` asks the reference again every so many frames: a metric network then bounds the drift.
-
-    reference : the estimator that is asked where the anchor is neither the range nor the estimate itself.
-    Raises `SettingsError` where `near-far` is asked for and no range, or an impossible one, is given.
+    reference : metric estimator for anchors other than the range and the estimate itself.
+    Raises `SettingsError` where `near-far` is chosen without a valid range.
     """
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
@@ -90,22 +82,22 @@ class AnchoredDepth:
 
     @property
     def description(self) -> str:
-        """What fixed the scale, for people: for instance "near-far 13.5:100 mm"."""
+        """The source of the scale, for people: for instance "near-far 13.5:100 mm"."""
         return self._description
 
     @property
     def reference(self) -> DepthEstimator:
-        """The estimator that is asked where the anchor is neither the range nor the estimate itself."""
+        """The metric estimator for anchors other than the range and the estimate itself."""
         return self._reference
 
     @property
     def just_fitted(self) -> bool:
-        """Whether the frame that came last fixed the conversion, so that its depth needs no scale from the past."""
+        """Whether the last frame determined the conversion, so that its depth needs no scale from earlier frames."""
         return self._conversion is not None and self._frames_held == 0
 
     @property
     def conversion(self) -> AffineDisparity | DepthScale | None:
-        """The conversion that holds for the sequence; None until a frame fixed it."""
+        """The conversion of the sequence; None until it is fitted."""
         return self._conversion
 
     def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
@@ -113,16 +105,13 @@ class AnchoredDepth:
         return self.metric(estimate, frame).depth_mm
 
     def metric(self, estimate: DepthEstimate, frame: Frame) -> MetricDepth:
-        """Return metric depth (H, W) float32 in mm, NaN = unknown or not positive, with its sigma where one is told.
+        """Return metric depth (H, W) float32, mm, NaN = unknown, with its standard deviation where it is estimated.
 
-        Sigma is scaled as a predicted or measured depth is; of a disparity nothing is said, and neither is it where
-        the anchor's own depth takes the estimate's place.
-
-        Depth that is not measured is NaN too beyond `reach_mm`, where an estimate says nothing any more.
-        All NaN as long as no frame had enough usable pixels. Raises `InputError` if the estimate contradicts the
-        anchor, `SettingsError` if an exponent is asked for and the estimate is no predicted depth.
+        Sigma is scaled with depth; it is None for disparity, and where the anchor's depth replaces the estimate.
+        Predicted depth beyond `max_depth_mm` is NaN. All is NaN until a frame had enough usable pixels. Raises
+        `InputError` if the estimate contradicts the anchor, `SettingsError` for an exponent without predicted depth.
         """
-        estimate = self._in_range(estimate, frame)
+        estimate = self._after_power_law(estimate, frame)
         self._frames_held += 1
         first_mm = self._anchor(estimate, frame) if self._is_due(estimate) else None
         if self._conversion is None:
@@ -130,14 +119,14 @@ class AnchoredDepth:
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         sigma_mm = self._conversion.sigma_mm(estimate.sigma) if first_mm is None else None
         if estimate.kind != "measured":
-            depth_mm = np.where(depth_mm <= reach_mm(self._settings), depth_mm, np.float32(np.nan))
+            depth_mm = np.where(depth_mm <= max_depth_mm(self._settings), depth_mm, np.float32(np.nan))
         return MetricDepth(depth_mm, sigma_mm)
 
-    def _in_range(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
-        """Return the estimate with the range that the exponent gives it; its error grows in proportion, as a share."""
+    def _after_power_law(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
+        """Return the estimate after the power law; its relative error is multiplied by the exponent."""
         exponent = self._settings.exponent
         if exponent == "fit":
-            raise SettingsError("depth.exponent=fit: only a whole run can fit it, before it starts; give a number here")
+            raise SettingsError("depth.exponent=fit is resolved by a run before it starts; give a number here")
         if exponent == 1.0:
             return estimate
         if estimate.kind != "depth":
@@ -148,10 +137,10 @@ class AnchoredDepth:
         if self._pivot is None:
             distance = estimate.values * ray_lengths(frame.camera)
             seen = distance[frame.valid & (distance > 0)]
-            if seen.size < _LEAST_SHARE * distance.size:
+            if seen.size < _MIN_SHARE * distance.size:
                 return estimate
             self._pivot = float(np.median(seen))
-        values = stretched(estimate.values, frame.camera, exponent, self._pivot)
+        values = apply_power_law(estimate.values, frame.camera, exponent, self._pivot)
         if estimate.sigma is None:
             return replace(estimate, values=values)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -161,34 +150,34 @@ class AnchoredDepth:
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self._conversion is None:
             return True
-        every = self._settings.reanchor_every
+        every = self._settings.advanced.reanchor_every
         return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
-        """Fix the conversion; return this frame's depth (H, W) where it is the anchor's and not the conversion's."""
+        """Fit the conversion; return the depth (H, W) of this frame where the anchor gives it directly, else None."""
         usable = frame.valid & np.isfinite(estimate.values)
-        if usable.mean() < _LEAST_SHARE:
+        if usable.mean() < _MIN_SHARE:
             return None
         first_mm = None
         source = self._source(estimate)
         if source == "own":
             self._conversion = DepthScale(1.0)
         elif source == "factor":
-            self._conversion = self._by_factor(estimate, usable)
+            self._conversion = self._from_factor(estimate, usable)
         elif source == "near-far":
             self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
         else:
             reference = self._reference.estimate(frame)
-            known = usable & (reference.values > 0) & (reference.values <= reach_mm(self._settings))
-            if known.mean() < _LEAST_SHARE:
+            known = usable & (reference.values > 0) & (reference.values <= max_depth_mm(self._settings))
+            if known.mean() < _MIN_SHARE:
                 return None
             focal_px = reference.focal_px or frame.camera.fx
             target = _Target(estimate.values[known], reference.values[known], focal_px)
             self._conversion = self._fitted(estimate, target)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
-            first_mm = None if self._settings.fit_shift else reference.values
+            first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
-        self._description = self._described(source, estimate, frame)
+        self._description = self._describe(source, estimate, frame)
         return first_mm
 
     def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
@@ -201,9 +190,9 @@ class AnchoredDepth:
             return "near-far"
         return "own" if anchor == "auto" and estimate.kind == "depth" else "reference"
 
-    def _by_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
+    def _from_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
         """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
-        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.factor
+        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.paper.factor
         positive = values[values > 0]
         if not positive.size:
             raise InputError("anchoring depth by a factor: no pixel of the first usable frame has a positive value")
@@ -219,26 +208,26 @@ class AnchoredDepth:
     def _fitted(self, estimate: DepthEstimate, target: _Target) -> AffineDisparity | DepthScale:
         if estimate.kind == "depth":
             return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
-        if self._settings.fit_shift:
-            return fit_affine_disparity(target.depth_mm, target.values, reach_mm(self._settings))
+        if self._settings.paper.fit_shift:
+            return fit_affine_disparity(target.depth_mm, target.values, max_depth_mm(self._settings))
         baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px)
         return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
 
-    def _described(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
+    def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
         if estimate.kind == "measured":
             return "measured depth"
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
-            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.factor:g}"
+            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.paper.factor:g}"
         name = self._settings.backend if source == "own" else self._reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
         return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"
 
 
-def reach_mm(settings: DepthSettings) -> float:
-    """Return how far predicted depth may reach, mm: a stated farthest tissue is believed beyond `max_depth_mm`."""
+def max_depth_mm(settings: DepthSettings) -> float:
+    """Return the largest valid predicted depth, mm: `settings.max_depth_mm`, or the far end of near-far if larger."""
     return max(settings.max_depth_mm, *(settings.near_far_mm or (0.0,)))
 
 

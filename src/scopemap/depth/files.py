@@ -45,7 +45,7 @@ class FilesDepth:
     folder : holds one file per frame; `*_depth.*` and `*.depth.*` are preferred where other images lie there too.
     rectifier : from the source camera to the working camera.
     depth_scale_mm : mm per unit by the input's own calibration, or None.
-    measured_reach_mm : farthest depth that measured files can hold, of floats twice the first file's; None: predicted.
+    measured_max_mm : farthest depth that measured files can hold, of floats twice the first file's; None: predicted.
 
     Raises `InputError` where the folder does not exist, holds no usable file, or two files for one number.
     """
@@ -62,7 +62,7 @@ class FilesDepth:
         self._only_type = first.dtype if settings.files_kind == "auto" else None
         self._is_rectified = (self._folder / "depth.json").exists()
         self._scale = self._found_scale(first, settings, depth_scale_mm)
-        self.measured_reach_mm = _reach(first) * self._scale.mm if self._kind == "measured" else None
+        self.measured_max_mm = _reach(first) * self._scale.mm if self._kind == "measured" else None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the depth or disparity of `frame` (found by `frame.index`), rectified, NaN = unknown.

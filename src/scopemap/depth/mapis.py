@@ -110,7 +110,9 @@ class Mapis:
             weight = by_variance(weight, warped_share, share)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_share = blended_share(weight, warped_share, share)
-        self._carried = _Carried(depth_mm, refined_share) if self.settings.recursive else _Carried(scaled_mm, share)
+        self._carried = (
+            _Carried(depth_mm, refined_share) if self.settings.paper.recursive else _Carried(scaled_mm, share)
+        )
         return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
 
     def links(self, kind: DepthKind) -> bool:
@@ -122,7 +124,7 @@ class Mapis:
         self._carried = None
 
     def _scales(self, kind: DepthKind) -> bool:
-        frame_scale = self.settings.frame_scale
+        frame_scale = self.settings.advanced.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
     def _held(self, scale: float, linked_share: float) -> float:
@@ -130,11 +132,11 @@ class Mapis:
 
         The links' errors add up, and where tissue rushes by they have a sign: depth would grow or shrink without end.
         """
-        return float(scale ** (1 - self.settings.scale_pull * max(1 - linked_share, 0.0) ** 2))
+        return float(scale ** (1 - self.settings.advanced.scale_pull * max(1 - linked_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
-        if self.settings.blend != "auto":
-            return self.settings.blend
+        if self.settings.paper.blend != "auto":
+            return self.settings.paper.blend
         return "none" if kind == "measured" else "linear"
 
     def _warped(
@@ -152,20 +154,22 @@ class Mapis:
         warped_mm = np.where(link.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, link.to_previous, camera, T_current_previous)
-        filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
+        filtered_mm = bilateral_filtered(
+            warped_mm, self.settings.advanced.filter_sigma_px, self.settings.advanced.filter_sigma_mm
+        )
         warped_share = pull(self._carried.share, link.to_previous)
-        return _Carried(filtered_mm, faded_share(warped_share, share, self.settings.sigma_fading))
+        return _Carried(filtered_mm, faded_share(warped_share, share, self.settings.advanced.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
         match blend:
             case "exponential":
-                return np.exp(-distance / np.float32(self.settings.tau))
+                return np.exp(-distance / np.float32(self.settings.paper.tau))
             case "linear":
                 return 1 - np.clip(distance, 0, 1)
             case "paper-equation":
                 return np.clip(distance, 0, 1)
-        return np.full_like(distance, self.settings.constant_weight)
+        return np.full_like(distance, self.settings.paper.constant_weight)
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame
+from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.masking.field_of_view import FieldOfView
 from scopemap.masking.mask_files import MaskFiles
 from scopemap.masking.overlays import OverlayFinder
@@ -57,6 +58,8 @@ class Masker:
         for covered in (overlays, files):
             if covered is not None:
                 valid &= ~covered
+        if is_constant(frame.rgb):
+            valid = np.zeros_like(valid)
         return replace(frame, valid=valid & field)
 
 

@@ -17,8 +17,8 @@ from scopemap.tracking import FrameTracker, Tracker
 
 # Depth as it is and poses as tracked: consistency over time is a part of our method, not of the input that all share.
 PLAIN = {
-    "mapis.frame_scale": "none",
-    "mapis.blend": "none",
+    "mapis.advanced.frame_scale": "none",
+    "mapis.paper.blend": "none",
     "smoothing.method": "none",
     "mapping.method": "none",
 }

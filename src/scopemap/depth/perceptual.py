@@ -1,15 +1,23 @@
-"""LPIPS with AlexNet (Zhang et al., CVPR 2018): heads from the `lpips` package, backbone from the weights registry."""
+"""Perceptual distance between two images: LPIPS with AlexNet, or structural similarity, which needs no weights.
+
+LPIPS: Zhang et al., CVPR 2018; heads from the `lpips` package, backbone from the weights registry.
+SSIM: Wang et al., IEEE TIP 2004.
+"""
 
 from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Protocol
 
+import cv2
 import numpy as np
+from skimage.metrics import structural_similarity
 
-from scopemap.depth.perceptual.distance import PerceptualResult
-from scopemap.errors import WeightsError, check_shape
+from scopemap.errors import SettingsError, WeightsError, check_shape
 from scopemap.io import weights
 from scopemap.io.device import choose_device
 
@@ -17,6 +25,68 @@ CHECKPOINTS = ("alexnet", "alexnet-features")
 
 # lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
 _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
+
+
+@dataclass(frozen=True)
+class PerceptualResult:
+    """How different two images look.
+
+    Attributes
+    ----------
+    map : (H, W) float32 >= 0, the distance around each pixel; 0 = alike.
+    score : the distance of the whole images, the mean of `map`.
+    """
+
+    map: np.ndarray
+    score: float
+
+
+class PerceptualDistance(Protocol):
+    """Distance between two images as people see them."""
+
+    name: str
+
+    def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
+        """Compare two (H, W, 3) uint8 images of one size; the order does not matter."""
+        ...
+
+    def provenance(self) -> dict[str, str]:
+        """Return what the result depends on, as text: names, versions, hashes."""
+        ...
+
+
+def create_perceptual(name: str = "auto", device: str = "auto") -> PerceptualDistance:
+    """Return the distance "lpips", "structure", or with "auto" lpips if its weights are at hand, else structure.
+
+    Raises `SettingsError` for an unknown name and `WeightsError` where lpips lacks its weights.
+    """
+    if name == "auto":
+        name = "lpips" if weights.is_present(*CHECKPOINTS) else "structure"
+    match name:
+        case "lpips":
+            return LpipsAlex(device=device)
+        case "structure":
+            return StructureDistance()
+    raise SettingsError(f"unknown perceptual distance '{name}': choose one of auto, lpips, structure")
+
+
+class StructureDistance:
+    """One minus the structural similarity of the grey values in 7 x 7 px, clipped to 0..1."""
+
+    name = "structure"
+
+    def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
+        """Compare two (H, W, 3) uint8 images of one size, 7 px or more on each side."""
+        check_shape("rgb_a", rgb_a, (None, None, 3))
+        check_shape("rgb_b", rgb_b, rgb_a.shape)
+        grey_a, grey_b = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for rgb in (rgb_a, rgb_b))
+        _, similarity = structural_similarity(grey_a, grey_b, full=True, data_range=255.0)
+        distance = np.clip(1.0 - similarity, 0.0, 1.0).astype(np.float32)
+        return PerceptualResult(distance, float(distance.mean(dtype=np.float64)))
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name and scikit-image's version."""
+        return {"perceptual": self.name, "scikit-image": version("scikit-image")}
 
 
 class LpipsAlex:
