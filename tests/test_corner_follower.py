@@ -13,7 +13,7 @@ from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence
 from scopemap.flow import CornerFollower, DisFlow
-from scopemap.frame import Frame, SeenAgain
+from scopemap.frame import Correspondences2D3D, Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.pipeline import Estimators, Pipeline
 from scopemap.tracking import Tracker
@@ -58,7 +58,7 @@ def test_corners_of_masked_or_unknown_tissue_are_not_followed() -> None:
         ("depth", {}, [None, 0, 0, 2, 2]),
         ("measured", {}, [None] * 5),
         ("depth", {"tracking__corner_depth_share": 0.0}, [None] * 5),
-        ("depth", {"networks__flow": "none"}, [None] * 5),
+        ("depth", {"networks__keyframe_flow": "none"}, [None] * 5),
     ],
 )
 def test_the_tracker_is_given_the_corners_of_its_keyframe(
@@ -71,11 +71,11 @@ def test_the_tracker_is_given_the_corners_of_its_keyframe(
     track = Tracker.track
 
     def listening(self: Tracker, frame: Frame) -> object:
-        given.append(frame.corners_again)
+        given.append(frame.keyframe_correspondences)
         return track(self, frame)
 
     monkeypatch.setattr(Tracker, "track", listening)
     pipeline = Pipeline(config, Estimators.create(config, sequence))
     for frame in sequence.frames():
         pipeline.step(pipeline.perceive(frame))
-    assert [seen.host if isinstance(seen, SeenAgain) else None for seen in given] == hosts
+    assert [seen.host if isinstance(seen, Correspondences2D3D) else None for seen in given] == hosts

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, TrackingSettings
-from scopemap.frame import Frame, SeenAgain
+from scopemap.frame import Correspondences2D3D, Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.geometry.warp import carried_points
 from scopemap.tracking import Tracker
@@ -22,14 +22,16 @@ CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
 TWIST = np.array([0.05, -0.08, 0.1, 2.0, -1.5, 4.0])
 
 
-def _seen(T: np.ndarray, count: int = 400, wild: float = 0.0, noise_px: float = 0.0, seed: int = 0) -> SeenAgain:
+def _seen(
+    T: np.ndarray, count: int = 400, wild: float = 0.0, noise_px: float = 0.0, seed: int = 0
+) -> Correspondences2D3D:
     random = np.random.default_rng(seed)
     pixels = random.uniform([5, 5], [155, 123], (count, 2))
     points = CAMERA.unproject(pixels) * random.uniform(20, 60, (count, 1))
     seen = CAMERA.project(points @ T[:3, :3].T + T[:3, 3]) + random.normal(0, noise_px, (count, 2))
     lost = random.random(count) < wild
     seen[lost] += random.uniform(-40, 40, (int(lost.sum()), 2))
-    return SeenAgain(points, seen, 0.8)
+    return Correspondences2D3D(points, seen, 0.8)
 
 
 def _off(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -89,7 +91,7 @@ def test_points_are_carried_from_where_flow_begins() -> None:
     assert len(nothing.points_mm) == nothing.share == 0
 
 
-def _wall(shift_px: int, index: int, seen: SeenAgain | None = None, soft_px: float = 0.0) -> Frame:
+def _wall(shift_px: int, index: int, seen: Correspondences2D3D | None = None, soft_px: float = 0.0) -> Frame:
     """A wall of noise 40 mm away, white or soft, shifted by whole pixels."""
     noise = np.random.default_rng(3).normal(0, 1, (128, 400))
     if soft_px:
@@ -97,7 +99,9 @@ def _wall(shift_px: int, index: int, seen: SeenAgain | None = None, soft_px: flo
     texture = np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
     rgb = np.repeat(texture[:, 100 + shift_px : 260 + shift_px, None], 3, -1)
     valid = np.ones((128, 160), bool)
-    return Frame(index, index / 30, rgb, CAMERA, valid, np.full((128, 160), 40.0, np.float32), seen_again=seen)
+    return Frame(
+        index, index / 30, rgb, CAMERA, valid, np.full((128, 160), 40.0, np.float32), flow_correspondences=seen
+    )
 
 
 def _tracked(frame: Frame, soft_px: float = 0.0, **changes: float) -> tuple[Tracker, float, str, str]:
@@ -112,10 +116,12 @@ def _tracked(frame: Frame, soft_px: float = 0.0, **changes: float) -> tuple[Trac
 WAY_MM = 40 * 40 / CAMERA.fx  # of 40 px
 
 
-def _truly(T_current_previous: np.ndarray, share: float = 0.8) -> SeenAgain:
+def _truly(T_current_previous: np.ndarray, share: float = 0.8) -> Correspondences2D3D:
     pixels = np.stack(np.meshgrid(np.arange(10, 150, 5), np.arange(10, 118, 5)), -1).reshape(-1, 2).astype(float)
     points = CAMERA.unproject(pixels) * 40.0
-    return SeenAgain(points, CAMERA.project(points @ T_current_previous[:3, :3].T + T_current_previous[:3, 3]), share)
+    return Correspondences2D3D(
+        points, CAMERA.project(points @ T_current_previous[:3, :3].T + T_current_previous[:3, 3]), share
+    )
 
 
 def test_flow_decides_where_the_image_alone_goes_astray() -> None:
@@ -127,12 +133,12 @@ def test_flow_decides_where_the_image_alone_goes_astray() -> None:
     assert (status, reason) == ("ok", "flow decided")
     assert way_mm == pytest.approx(WAY_MM, abs=0.1)
     assert tracker.wants_keyframe()
-    few = replace(frame, seen_again=_truly(moved, share=0.09))
+    few = replace(frame, flow_correspondences=_truly(moved, share=0.09))
     # Landmarks would find the way as well.
     alone = {"remembered_keyframes": 0}
     for silent in (
         _tracked(frame, flow_contradiction=0, **alone),
-        _tracked(replace(frame, seen_again=None), **alone),
+        _tracked(replace(frame, flow_correspondences=None), **alone),
         _tracked(few, **alone),
     ):
         assert silent[2] == "lost" or abs(silent[1] - WAY_MM) > 1
@@ -149,7 +155,7 @@ def test_flow_has_no_say_where_it_agrees_or_is_in_disarray() -> None:
     assert agreeing[1:] == plain[1:]
     random = np.random.default_rng(0)
     seen = _truly(near)
-    disarray = SeenAgain(seen.points_mm, random.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
+    disarray = Correspondences2D3D(seen.points_mm, random.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
     assert _tracked(_wall(2, 1, disarray, soft_px=3), soft_px=3)[1:] == plain[1:]
 
 
@@ -187,13 +193,13 @@ def test_the_paper_listens_to_no_flow() -> None:
     assert Config.load("paper").tracking.flow_contradiction == 0
 
 
-def _corners(T_current_host: np.ndarray, depth_error: np.ndarray | float = 1.0, host: int = 0) -> SeenAgain:
+def _corners(T_current_host: np.ndarray, depth_error: np.ndarray | float = 1.0, host: int = 0) -> Correspondences2D3D:
     """Corners on a rough wall, seen where a motion takes them, lifted by a depth that is wrong by a factor."""
     rng = np.random.default_rng(5)
     pixels = rng.uniform([10, 10], [150, 118], (300, 2))
     points = CAMERA.unproject(pixels) * rng.uniform(30, 60, (300, 1))
     seen = CAMERA.project(points @ T_current_host[:3, :3].T + T_current_host[:3, 3])
-    return SeenAgain(points * np.reshape(depth_error, (-1, 1)), seen, 0.9, host)
+    return Correspondences2D3D(points * np.reshape(depth_error, (-1, 1)), seen, 0.9, host)
 
 
 def test_corners_set_a_pose_right() -> None:
@@ -229,7 +235,7 @@ def test_corners_that_move_by_themselves_fade_out() -> None:
 
 def test_too_few_corners_say_nothing() -> None:
     seen = _corners(np.eye(4))
-    few = SeenAgain(seen.points_mm[:49], seen.pixels[:49], 0.2, 0)
+    few = Correspondences2D3D(seen.points_mm[:49], seen.pixels[:49], 0.2, 0)
     assert refined_by_corners(few, CAMERA, np.eye(4), 0.2) is None
 
 
@@ -239,7 +245,7 @@ def test_the_tracker_listens_to_corners_of_its_keyframe_alone(host: int, share: 
     plain = _tracked(_wall(2, 1, soft_px=3), soft_px=3)
     aside = np.eye(4)
     aside[0, 3] = -(plain[1] + 0.2)
-    frame = replace(_wall(2, 1, soft_px=3), corners_again=_corners(aside, host=host))
+    frame = replace(_wall(2, 1, soft_px=3), keyframe_correspondences=_corners(aside, host=host))
     told = _tracked(frame, soft_px=3, corner_depth_share=share)
     assert told[2] == "ok"
     assert told[1] == pytest.approx(plain[1] + 0.2 * listens, abs=0.01)
@@ -253,8 +259,8 @@ def test_flow_in_disarray_bears_nothing_out() -> None:
     strange = np.repeat(np.clip(128 + 40 * other / other.std(), 0, 255).astype(np.uint8)[..., None], 3, -1)
     mixed = (0.25 * first.rgb + 0.75 * strange).astype(np.uint8)
     seen = _truly(np.eye(4))
-    disarray = SeenAgain(seen.points_mm, rng.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
+    disarray = Correspondences2D3D(seen.points_mm, rng.uniform([0, 0], [160, 128], seen.pixels.shape), 0.8)
     alone = _tracked(replace(first, index=1, rgb=mixed), soft_px=3, min_inlier_share=0.6, remembered_keyframes=0)
     assert alone[2] == "lost"
-    borne = replace(first, index=1, rgb=mixed, seen_again=disarray)
+    borne = replace(first, index=1, rgb=mixed, flow_correspondences=disarray)
     assert _tracked(borne, soft_px=3, min_inlier_share=0.6, remembered_keyframes=0)[2] == "lost"

@@ -49,11 +49,15 @@ def _tracked_frames(
 def test_points_land_where_the_true_motion_takes_them(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = _tracked_frames(phantom, monkeypatch)
     poses = true_poses(phantom)
-    known = [n for n, frame in enumerate(frames) if frame.seen_again is not None and frame.seen_again.share > 0]
+    known = [
+        n
+        for n, frame in enumerate(frames)
+        if frame.flow_correspondences is not None and frame.flow_correspondences.share > 0
+    ]
     # Neither the first frame, nor a black one, nor the one after it.
     assert known == [n for n in range(FRAMES) if n not in (0, LOST, LOST + 1)]
     for n in known:
-        seen = frames[n].seen_again
+        seen = frames[n].flow_correspondences
         assert seen is not None
         assert seen.share > 0.3
         still = flow_error_px(seen, frames[n].camera, np.eye(4))
@@ -62,14 +66,14 @@ def test_points_land_where_the_true_motion_takes_them(phantom: Path, monkeypatch
 
 def test_no_flow_does_not_hold_the_camera(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames, poses = _tracked_frames(phantom, monkeypatch, networks__flow="none")
-    assert all(frame.seen_again is None for frame in frames)
+    assert all(frame.flow_correspondences is None for frame in frames)
     true = true_poses(phantom)
     assert np.linalg.norm(poses[-1][:3, 3] - true[-1][:3, 3]) < 0.3 * np.linalg.norm(true[-1][:3, 3])
 
 
 def test_measured_depth_brings_no_flow(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames, _ = _tracked_frames(phantom, monkeypatch, depth__files_kind="measured")
-    assert all(frame.seen_again is None for frame in frames)
+    assert all(frame.flow_correspondences is None for frame in frames)
 
 
 @pytest.mark.parametrize(("scaled", "speaks"), [("auto", True), ("robust", False)])

@@ -1,4 +1,4 @@
-"""Frame: the one thing that flows. Truth: what only evaluation may see.
+"""Frame: the data type that flows through all stages. Truth: known poses and depth, for evaluation only.
 
 A stage takes a Frame and returns a new one (`dataclasses.replace`); nothing is changed in place.
 """
@@ -17,14 +17,14 @@ TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "pre
 
 
 @dataclass(frozen=True)
-class SeenAgain:
-    """Points of an earlier frame, where optical flow finds them in this one.
+class Correspondences2D3D:
+    """Points of an earlier frame, and the pixels of the current frame where optical flow observes them.
 
     Attributes
     ----------
-    points_mm : (N, 3) float64, in the camera of the earlier frame. pixels : (N, 2) float64 x, y in this frame.
-    share : of this frame's pixels that flow and depth could be trusted in; the points are some of them. Of corners, the
-    share of them that was found. host : number of the earlier frame, -1: the one before.
+    points_mm : (N, 3) float64, in the camera of the earlier frame. pixels : (N, 2) float64 x, y in the current frame.
+    share : observed share of what could be observed: of the current frame's pixels, for corners of the keyframe's.
+    host : number of the earlier frame, -1: the previous one.
     """
 
     points_mm: np.ndarray
@@ -33,13 +33,13 @@ class SeenAgain:
     host: int = -1
 
     def __post_init__(self) -> None:
-        check_shape("SeenAgain.points_mm", self.points_mm, (None, 3))
-        check_shape("SeenAgain.pixels", self.pixels, (len(self.points_mm), 2))
+        check_shape("Correspondences2D3D.points_mm", self.points_mm, (None, 3))
+        check_shape("Correspondences2D3D.pixels", self.pixels, (len(self.points_mm), 2))
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One rectified image of the sequence and what the stages have found out about it.
+    """One rectified image of the sequence with the results of the stages so far.
 
     Attributes
     ----------
@@ -48,12 +48,12 @@ class Frame:
     rgb : (H, W, 3) uint8, sRGB.
     camera : pinhole camera of the working size.
     valid : (H, W) bool, True where the pixel shows usable tissue.
-    depth_mm : (H, W) float32 along the optical axis, NaN = unknown; None until a depth stage has spoken.
+    depth_mm : (H, W) float32 along the optical axis, NaN = unknown; None before depth estimation.
     T_world_camera : (4, 4) float64, takes a point in the camera to the world; None until tracked.
     name : the file's own name, or "".
-    depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: nothing is said of it.
-    seen_again : what flow carries over from the frame before; None where there is none, or nothing is known of it.
-    corners_again : the same of the corners of the keyframe.
+    depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: not estimated.
+    flow_correspondences : points of the previous frame in this one, by flow; None where there are none.
+    keyframe_correspondences : the keyframe's corners in this frame, by flow; None where there are none.
     """
 
     index: int
@@ -65,8 +65,8 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
-    seen_again: SeenAgain | None = None
-    corners_again: SeenAgain | None = None
+    flow_correspondences: Correspondences2D3D | None = None
+    keyframe_correspondences: Correspondences2D3D | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -82,14 +82,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known to be true of a frame; never handed to an estimator.
+    """Ground truth of a frame; never passed to an estimator.
 
     Attributes
     ----------
     index : as `Frame.index`.
     T_world_camera : (4, 4) float64, mm, or None.
     depth_mm : (H, W) float32 of the working size, NaN = unknown, or None.
-    quality : how the truth came about.
+    quality : how the truth was obtained.
     """
 
     index: int

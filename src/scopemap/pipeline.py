@@ -31,7 +31,7 @@ from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
 from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
 from scopemap.flow import CornerFollower, FlowEstimator, create_flow, pair_flow
-from scopemap.frame import Frame, SeenAgain
+from scopemap.frame import Correspondences2D3D, Frame
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
@@ -208,10 +208,10 @@ class Pipeline:
             percept.frame,
             depth_mm=percept.raw_mm,
             depth_sigma_mm=percept.raw_sigma_mm,
-            seen_again=self._seen_again(percept),
+            flow_correspondences=self._flow_correspondences(percept),
         )
         if self._corners is not None and percept.kind != "measured":
-            raw = replace(raw, corners_again=self._corners.find(raw))
+            raw = replace(raw, keyframe_correspondences=self._corners.find(raw))
         track = self._tracker.track(raw)
         elsewhere = track.status != "lost" and self._last is not None and track.map != self._last.map
         if elsewhere:
@@ -316,7 +316,7 @@ class Pipeline:
         values = np.full_like(distance.map, distance.score) if settings.paper.perceptual_score else distance.map
         return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values, float(frame.valid.mean()))
 
-    def _seen_again(self, percept: Percept) -> SeenAgain | None:
+    def _flow_correspondences(self, percept: Percept) -> Correspondences2D3D | None:
         """Return points of the frame before where flow finds them in this one; None where either is not known."""
         link = percept.link
         if link is None or self._last is None or self._last_mm is None or self._last.status == "lost":

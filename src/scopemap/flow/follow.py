@@ -6,7 +6,7 @@ import numpy as np
 
 from scopemap.flow.corners import corners, followed
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame, SeenAgain
+from scopemap.frame import Correspondences2D3D, Frame
 
 _CELL_PX = 12
 
@@ -27,11 +27,11 @@ class CornerFollower:
         depth_mm = keyframe.depth_mm[self._places[:, 1], self._places[:, 0]]
         self._points_mm = keyframe.camera.unproject(self._places.astype(np.float64)) * depth_mm[:, None]
 
-    def find(self, frame: Frame) -> SeenAgain | None:
+    def find(self, frame: Frame) -> Correspondences2D3D | None:
         """Return the corners that flow finds in a frame; None where there is nothing to follow."""
         if self._keyframe is None or not len(self._places):
             return None
         flows = self._flow.estimate_both(self._keyframe.rgb, frame.rgb)
         number, pixels = followed(self._places, flows, frame.valid, self._consistency_px)
         share = len(number) / len(self._places)
-        return SeenAgain(self._points_mm[number].astype(np.float64), pixels, share, self._keyframe.index)
+        return Correspondences2D3D(self._points_mm[number].astype(np.float64), pixels, share, self._keyframe.index)

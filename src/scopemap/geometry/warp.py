@@ -7,7 +7,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
-from scopemap.frame import SeenAgain
+from scopemap.frame import Correspondences2D3D
 
 _MOST_POINTS = 1500
 
@@ -65,7 +65,7 @@ def moved_depth(
 
 def carried_points(
     depth_previous_mm: np.ndarray, to_previous: np.ndarray, consistent: np.ndarray, camera: PinholeCamera
-) -> SeenAgain:
+) -> Correspondences2D3D:
     """Return points of the previous frame and the pixels of the current one where flow finds them, on a grid.
 
     depth_previous_mm : (H, W) float32 on the previous grid, NaN = unknown. to_previous : (H, W, 2) float32 px.
@@ -80,7 +80,7 @@ def carried_points(
     known = np.isfinite(depth_mm)
     points_mm = camera.unproject(there[known]) * depth_mm[known, None]
     pixels = np.column_stack([columns, rows])[known].astype(np.float64)
-    return SeenAgain(points_mm.astype(np.float64), pixels, step**2 * len(pixels) / consistent.size)
+    return Correspondences2D3D(points_mm.astype(np.float64), pixels, step**2 * len(pixels) / consistent.size)
 
 
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.frame import SeenAgain
+from scopemap.frame import Correspondences2D3D
 from scopemap.geometry.least_squares import RAYLEIGH_TO_SIGMA
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 
@@ -41,7 +41,7 @@ class FlowPose:
     error_px: float
 
 
-def pose_by_flow(seen: SeenAgain, camera: PinholeCamera) -> FlowPose | None:
+def pose_by_flow(seen: Correspondences2D3D, camera: PinholeCamera) -> FlowPose | None:
     """Return the motion that brings the points to where they are seen, or None where they are too few to tell.
 
     Gauss-Newton from standing still, with Cauchy weights whose scale is the robust deviation of the errors at each
@@ -65,7 +65,7 @@ def pose_by_flow(seen: SeenAgain, camera: PinholeCamera) -> FlowPose | None:
 
 
 def refined_by_corners(
-    seen: SeenAgain, camera: PinholeCamera, T_current_host: np.ndarray, depth_share: float
+    seen: Correspondences2D3D, camera: PinholeCamera, T_current_host: np.ndarray, depth_share: float
 ) -> np.ndarray | None:
     """Return the motion (4, 4), close to the one given, that a keyframe's corners ask for; None where they are too few.
 
@@ -96,7 +96,7 @@ def refined_by_corners(
     return orthonormalised(T)
 
 
-def flow_error_px(seen: SeenAgain, camera: PinholeCamera, T_current_previous: np.ndarray) -> float:
+def flow_error_px(seen: Correspondences2D3D, camera: PinholeCamera, T_current_previous: np.ndarray) -> float:
     """Return the median distance of the points, moved by a motion (4, 4), from where flow sees them, px."""
     errors, _, ahead = _linearised(seen, camera, T_current_previous, 1.0)
     return float(np.median(np.where(ahead, np.linalg.norm(errors, axis=1), np.inf)))
@@ -116,7 +116,7 @@ def _sigma_px(square: np.ndarray) -> float:
 
 
 def _linearised(
-    seen: SeenAgain, camera: PinholeCamera, T: np.ndarray, unit_mm: float
+    seen: Correspondences2D3D, camera: PinholeCamera, T: np.ndarray, unit_mm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors (N, 2) px, derivatives (N, 2, 6) by a twist in rad and `unit_mm`, and which points (N,) are ahead."""
     moved = seen.points_mm @ T[:3, :3].T + T[:3, 3]

@@ -50,9 +50,9 @@ class Tracker:
 
     The first usable frame fixes the world. Where a frame is lost, the record says so and why, and the next one starts
     from the last pose that is known, from where the last motion would have led, or from where the landmarks of a recent
-    keyframe say that it is: whichever fits best, and that keyframe is tracked against from there. Where a frame brings
-    points that flow carried over (`Frame.seen_again`) and they contradict its pose, they decide. Where frames stay
-    lost although they are clear, a new map begins, with a world of its own; a later loss may lead back to an older one.
+    keyframe say that it is: whichever fits best, and that keyframe is tracked against from there. Where the points of
+    the previous frame (`Frame.flow_correspondences`) contradict a frame's pose, they decide. Where frames stay lost
+    although they are clear, a new map begins, with a world of its own; a later loss may lead back to an older one.
     """
 
     def __init__(self, settings: TrackingSettings) -> None:
@@ -208,7 +208,7 @@ class Tracker:
 
     def _by_corners(self, keyframe: _Keyframe, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment:
         """Return the alignment that the keyframe's corners make of this one, or this one where they cannot tell."""
-        seen, share = frame.corners_again, self.settings.corner_depth_share
+        seen, share = frame.keyframe_correspondences, self.settings.corner_depth_share
         if seen is None or not self._has_corners(keyframe, frame):
             return alignment
         # What does not correlate is not nearly where it should be, and no start for anything.
@@ -222,12 +222,12 @@ class Tracker:
         return found if found.correlation > _STILL_ALIKE * alignment.correlation else alignment
 
     def _has_corners(self, keyframe: _Keyframe, frame: Frame) -> bool:
-        seen = frame.corners_again
+        seen = frame.keyframe_correspondences
         return seen is not None and seen.host == keyframe.index and self.settings.corner_depth_share > 0
 
     def _by_flow(self, frame: Frame, pyramid: list[View], alignment: Alignment) -> Alignment | None:
         """Return what takes the alignment's place where flow from the frame before contradicts it, else None."""
-        keyframe, seen, factor = self._keyframe, frame.seen_again, self.settings.flow_contradiction
+        keyframe, seen, factor = self._keyframe, frame.flow_correspondences, self.settings.flow_contradiction
         self._flow_agrees = False
         if keyframe is None or seen is None or factor == 0 or self._frames_lost:
             return None
