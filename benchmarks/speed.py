@@ -62,8 +62,8 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
     }
     if pipeline._corners is not None:
         parts["corners"] = (pipeline._corners, "find")
-    if pipeline._backend is not None:
-        parts["back end"] = (pipeline._backend, "adjust")
+    if config.mapping.method == "full":
+        parts["back end"] = (pipeline._mapper, "submaps")
     for part, (owner, name) in parts.items():
         setattr(owner, name, timed(getattr(owner, name), part, seconds))
     previous = None
@@ -72,7 +72,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    pipeline.fuse(pipeline.pieces()[0])
+    pipeline.fuse(pipeline.submaps()[0][0])
     seldom = ("keyframe", "back end")
     per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
     # What does not happen at every frame is spread over all.

@@ -18,7 +18,7 @@ from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping import Backend, Correction, Seat
+from scopemap.mapping import Backend, Correction, TrackedPose
 from scopemap.mapping.backend import _Keyframe, _neighbours, _of
 from scopemap.mapping.bundle_adjustment import Points, Solution
 from scopemap.mapping.depth_correction import DepthGrid
@@ -46,7 +46,7 @@ def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, flo
 def test_drifting_poses_are_set_right_and_frames_between_keyframes_with_them() -> None:
     drift = [se3_exp(0.01 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     for number in (0, 1, 3, 4, 5):
         backend.add(_frame(number, tracked[number]))
     correction = backend.adjust()
@@ -60,7 +60,7 @@ def test_drifting_poses_are_set_right_and_frames_between_keyframes_with_them() -
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    backend = Backend(MappingSettings(depth_share=0.05, scale_sigma=0.3))
+    backend = Backend(MappingSettings(depth_share=0.05, scale_sigma=0.3), DisFlow())
     for number in range(6):
         backend.add(_frame(number, factor=0.8 if number == 2 else 1.0))
     correction = backend.adjust()
@@ -119,7 +119,7 @@ def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> N
 
 def test_keyframes_without_a_single_corner_are_no_harm() -> None:
     speckled = np.random.default_rng(0).random(plane_scene.EVERYWHERE.shape) < 0.6
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     for number in range(3):
         backend.add(replace(_frame(number), valid=speckled))
     correction = backend.adjust()
@@ -141,7 +141,7 @@ def test_what_goes_wrong_with_a_keyframe_is_heard_of_at_the_next(monkeypatch: py
         raise RuntimeError("flow broke")
 
     monkeypatch.setattr(Linker, "add", broken)
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     backend.add(_frame(0))
     wait(backend._links)
     with pytest.raises(RuntimeError, match="flow broke"):
@@ -160,37 +160,37 @@ def test_outside_all_keyframes_the_nearest_correction_holds() -> None:
     assert "as tracked" in correction.description
 
 
-def _seated(keyframe: int, x_mm: float, stretch: int = 0) -> Seat:
-    return Seat(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), stretch)
+def _tracked(keyframe: int, x_mm: float, segment: int = 0) -> TrackedPose:
+    return TrackedPose(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), segment)
 
 
 def test_a_frame_takes_as_much_of_the_next_correction_as_it_has_moved() -> None:
     T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))])
-    seats = {0: _seated(0, 0), 2: _seated(0, 1), 5: _seated(0, 2), 7: _seated(0, 9), 10: _seated(0, 10)}
-    correction = Correction(np.array([0, 10]), T, np.log([1.0, 2.0]), seats=seats, depth_mm=50.0)
+    tracked = {0: _tracked(0, 0), 2: _tracked(0, 1), 5: _tracked(0, 2), 7: _tracked(0, 9), 10: _tracked(0, 10)}
+    correction = Correction(np.array([0, 10]), T, np.log([1.0, 2.0]), tracked=tracked, depth_mm=50.0)
     for index, share in ((0, 0), (2, 0.1), (5, 0.2), (7, 0.9), (10, 1)):
         assert correction.pose(index, np.eye(4))[0, 3] == pytest.approx(4 * share)
         assert correction.depth_factor(index) == pytest.approx(2.0**share)
     # Of frame 4 nothing is known, and of a camera at rest nothing can be: time has to do.
     assert correction.pose(4, np.eye(4))[0, 3] == pytest.approx(1.6)
-    resting = replace(correction, seats={0: _seated(0, 3), 5: _seated(0, 3), 10: _seated(0, 3)})
+    resting = replace(correction, tracked={0: _tracked(0, 3), 5: _tracked(0, 3), 10: _tracked(0, 3)})
     assert resting.pose(5, np.eye(4))[0, 3] == pytest.approx(2.0)
 
 
 def test_a_camera_found_again_is_corrected_as_from_there_on() -> None:
     T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(4)])
     # Up to frame 23 all goes on from keyframe 20; then keyframe 10 finds the camera again, and 30 comes of that.
-    seats = {0: _seated(0, 0), 10: _seated(0, 1), 20: _seated(10, 2), 30: _seated(10, 3)}
-    seats |= {22: _seated(20, 2.2), 26: _seated(10, 2.6), 33: _seated(30, 3.3), 35: _seated(20, 3.5)}
-    correction = Correction(np.array([0, 10, 20, 30]), T, np.zeros(4), seats=seats, depth_mm=50.0)
+    tracked = {0: _tracked(0, 0), 10: _tracked(0, 1), 20: _tracked(10, 2), 30: _tracked(10, 3)}
+    tracked |= {22: _tracked(20, 2.2), 26: _tracked(10, 2.6), 33: _tracked(30, 3.3), 35: _tracked(20, 3.5)}
+    correction = Correction(np.array([0, 10, 20, 30]), T, np.zeros(4), tracked=tracked, depth_mm=50.0)
     for index, of in ((20, 2), (22, 2), (26, 3), (30, 3), (33, 3), (35, 2)):
         np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
 
 
 def test_keyframes_hang_on_those_that_they_were_aligned_to() -> None:
     T = np.eye(4)
-    seats = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
-    keyframes = [_Keyframe(frame, Seat(number, of, T)) for frame, number, of in seats]
+    tracked = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
+    keyframes = [_Keyframe(frame, TrackedPose(number, of, T)) for frame, number, of in tracked]
     # What keyframe 40 was aligned to is none: the one before it in its map has to do.
     expected = [[0, 1], [2, 3], [0, 4], [4, 5], [3, 6]]
     np.testing.assert_array_equal(_neighbours(keyframes), expected)
@@ -210,14 +210,23 @@ def test_loops_are_told_in_the_millimetres_of_the_joined_world() -> None:
 
 def test_the_way_and_the_depth_of_a_joined_map_are_taken_in_the_common_world() -> None:
     grid = DepthGrid(np.broadcast_to(np.linspace(-0.2, 0.2, 4), (6, 7, 4)).copy(), np.log(20.0), np.log(80.0))
-    world = Similarity(2.0, np.eye(3), np.array([5.0, 0, 0]))
+    merged = {0: Similarity.identity(), 1: Similarity(2.0, np.eye(3), np.array([5.0, 0, 0]))}
     T, depth_mm = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))]), np.full((10, 12), 20.0, np.float32)
     # Keyframe 10 of map 0 is at 5 mm; those of map 1, whose world begins there, at twice their millimetres from it.
-    seats = {10: Seat(1, 10, np.eye(4)), 14: _seated(10, 1.0)._replace(map=1), 20: _seated(10, 4.0)._replace(map=1)}
+    tracked = {
+        10: TrackedPose(1, 10, np.eye(4)),
+        14: _tracked(10, 1.0)._replace(map=1),
+        20: _tracked(10, 4.0)._replace(map=1),
+    }
     correction = Correction(
-        np.array([10, 20]), T, np.zeros(2), grids=(grid, grid), worlds={0: Similarity.identity(), 1: world}, seats=seats
+        np.array([10, 20]),
+        T,
+        np.zeros(2),
+        grids=(grid, grid),
+        S_common_map=merged,
+        tracked=tracked,
     )
-    assert correction.pose(14, seats[14].T_world_camera)[0, 3] == pytest.approx(5 + 2 + 1)
+    assert correction.pose(14, tracked[14].T_world_camera)[0, 3] == pytest.approx(5 + 2 + 1)
     expected = 2 * np.exp(grid.log_factor(2 * depth_mm))
     np.testing.assert_allclose(correction.depth_factors(14, depth_mm), expected, rtol=1e-5)
     assert not np.allclose(expected, 2 * np.exp(grid.log_factor(depth_mm)))
@@ -229,21 +238,27 @@ def test_few_points_that_ask_for_another_depth_are_what_moves_by_itself(sure: in
     points = Points(np.zeros(count, int), np.ones((count, 3)), np.zeros(count), np.full(count, 0.1))
     sigma = np.where(known, 0.01, np.inf)
     found = Solution(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), sigma, 0.2, 1)
-    assert bool(Backend(MappingSettings())._doubt(points, found)) == refused
+    assert bool(Backend(MappingSettings(), DisFlow())._doubt(points, found)) == refused
 
 
 def test_a_loss_divides_what_lies_before_it_from_what_lies_after_it() -> None:
     T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(2)])
     # Keyframe 0 finds the camera again after frames 4 and 5 were lost; keyframe 10 comes of that.
-    seats = {0: _seated(0, 0), 2: _seated(0, 0.2), 7: _seated(0, 0.7, 2), 10: _seated(0, 1, 2), 12: _seated(10, 1.2, 2)}
-    correction = Correction(np.array([0, 10]), T, np.zeros(2), seats=seats, depth_mm=50.0)
+    tracked = {
+        0: _tracked(0, 0),
+        2: _tracked(0, 0.2),
+        7: _tracked(0, 0.7, 2),
+        10: _tracked(0, 1, 2),
+        12: _tracked(10, 1.2, 2),
+    }
+    correction = Correction(np.array([0, 10]), T, np.zeros(2), tracked=tracked, depth_mm=50.0)
     for index, of in ((2, 0), (7, 1), (12, 1)):
         np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
 
 
 def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
     rng = np.random.default_rng(1)
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
     for number in range(5):
         frame = _frame(number)
@@ -262,7 +277,7 @@ def test_tissue_that_moves_by_itself_leaves_poses_as_tracked() -> None:
 def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> None:
     factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
     for most, refused in ((0.2, True), (0.6, False)):
-        backend = Backend(MappingSettings(max_depth_change=most, depth_share=0.5))
+        backend = Backend(MappingSettings(max_depth_change=most, depth_share=0.5), DisFlow())
         for number in range(5):
             frame = _frame(number)
             assert frame.depth_mm is not None
@@ -274,7 +289,7 @@ def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> Non
 
 def test_nothing_to_adjust_is_an_error_of_the_caller() -> None:
     with pytest.raises(ValueError, match="no keyframe"):
-        Backend(MappingSettings()).adjust()
+        Backend(MappingSettings(), DisFlow()).adjust()
 
 
 def test_a_waiting_frame_comes_back_as_it_was() -> None:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
+from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.mapping import LARGEST_LOG_FACTOR, Backend, Correction
 from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid
@@ -144,7 +145,7 @@ def test_bent_depth_of_a_plane_seen_from_six_places_is_straightened() -> None:
     frames = [_bent(number) for number in range(6)]
     results = {}
     for step_sigma in (0.0, 0.1):
-        backend = Backend(MappingSettings(depth_step_sigma=step_sigma))
+        backend = Backend(MappingSettings(depth_step_sigma=step_sigma), DisFlow())
         for frame in frames:
             backend.add(frame)
         correction = backend.adjust()
@@ -155,7 +156,7 @@ def test_bent_depth_of_a_plane_seen_from_six_places_is_straightened() -> None:
 
 
 def test_where_the_adjustment_is_refused_depth_stays_too() -> None:
-    backend = Backend(MappingSettings(max_sigma_px=1e-6))
+    backend = Backend(MappingSettings(max_sigma_px=1e-6), DisFlow())
     frames = [_bent(number) for number in range(4)]
     for frame in frames:
         backend.add(frame)
@@ -165,7 +166,7 @@ def test_where_the_adjustment_is_refused_depth_stays_too() -> None:
 
 
 def test_a_camera_that_only_turns_tells_nothing_of_depth() -> None:
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     frames = []
     for number in range(5):
         view = plane_scene.see(plane_scene.pose(turn_rad=(0.01 * number, -0.012 * number, 0.02 * number)))

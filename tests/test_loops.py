@@ -11,6 +11,7 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
+from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend
@@ -115,7 +116,7 @@ def test_one_false_loop_gives_way_to_others() -> None:
 def test_the_back_end_closes_loops_where_it_may(closing: bool) -> None:
     tracked = _drifting()
     settings = SETTINGS if closing else SETTINGS.model_copy(update={"loop_landmarks": 0})
-    backend = Backend(settings)
+    backend = Backend(settings, DisFlow())
     for number in range(COUNT):
         backend.add(_frame(number, tracked[number]))
     correction = backend.adjust()
@@ -146,7 +147,7 @@ def test_a_camera_that_dwells_ties_no_keyframe_to_all_others() -> None:
 
 def test_loops_that_lead_astray_are_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
     """An adjustment that ends badly from where loops made it begin is made once more, from where tracking ended."""
-    backend = Backend(SETTINGS)
+    backend = Backend(SETTINGS, DisFlow())
     for number, pose in enumerate(POSES[:12]):
         backend.add(_frame(number, pose))
     starts = []

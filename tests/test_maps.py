@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,16 +17,17 @@ from tiny_phantom import SIZE, true_poses, with_true_depth
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
+from scopemap.flow import DisFlow
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
-from scopemap.mapping import Backend, Correction, Seat
+from scopemap.mapping import Backend, Correction, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
 from scopemap.phantom import PhantomSpec, write_phantom
-from scopemap.pipeline import Estimators, Pipeline
 from scopemap.reconstruction import DepthReader
+from scopemap.tracking import Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FIRST, SECOND, GIVEN_UP = 10, 13, 2
@@ -69,9 +69,9 @@ def test_the_largest_map_is_kept_and_the_rest_lost(result: Reconstruction) -> No
     assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (SECOND - GIVEN_UP - 1)
     assert result.records[0].track.reason == "tracked in another map, number 0"
     assert "keyframe" in result.records[FIRST].track.reason
-    note = next(text for text in result.provenance["warnings"] if text.startswith("maps:"))
-    assert "there are 2" in note
-    assert f"of {FIRST + SECOND - GIVEN_UP} frames tracked, {SECOND - GIVEN_UP} are in the result" in note
+    note = next(text for text in result.provenance["warnings"] if "submaps" in text)
+    assert note.startswith("2 submaps")
+    assert f"{SECOND - GIVEN_UP} of {FIRST + SECOND - GIVEN_UP} tracked frames are in the result" in note
 
 
 def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
@@ -128,7 +128,9 @@ def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> 
     assert len(result.mesh.faces) > 0
 
 
-def _keyframe(number: int, at_mm: tuple[float, float, float], told: Similarity, factor: float) -> tuple[Frame, Seat]:
+def _keyframe(
+    number: int, at_mm: tuple[float, float, float], told: Similarity, factor: float
+) -> tuple[Frame, TrackedPose]:
     """A keyframe of a plane, its pose told in another world, its depth times `factor`; every map is told by its own."""
     view = plane_scene.see(plane_scene.pose(at_mm=at_mm))
     T_world_camera = told.transform_poses(view.T_world_camera)
@@ -136,22 +138,22 @@ def _keyframe(number: int, at_mm: tuple[float, float, float], told: Similarity, 
     frame = Frame(
         10 * number, number / 3, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, T_world_camera
     )
-    return frame, Seat(int(factor != 1), 10 * max(number - 2, 0), T_world_camera)
+    return frame, TrackedPose(int(factor != 1), 10 * max(number - 2, 0), T_world_camera)
 
 
 def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
     worlds = (Similarity.identity(), Similarity(1.3, so3_exp(np.array([0.2, -0.9, 0.4])), np.array([30.0, -8.0, 5.0])))
     places = [(2.0 * number, 0.5 * number, 0.1 * number) for number in range(10)]
-    backend = Backend(MappingSettings())
-    frames, seats = [], {}
+    backend = Backend(MappingSettings(), DisFlow())
+    frames, tracked = [], {}
     for number, at_mm in enumerate(places):
         # Every other keyframe is of the other map.
-        frame, seats[10 * number] = _keyframe(number, at_mm, worlds[number % 2], worlds[number % 2].scale)
-        backend.add(frame, seats[10 * number])
+        frame, tracked[10 * number] = _keyframe(number, at_mm, worlds[number % 2], worlds[number % 2].scale)
+        backend.add(frame, tracked[10 * number])
         frames.append(frame)
     assert [backend.keyframes(number) for number in range(3)] == [5, 5, 0]
-    correction = backend.adjust(0, seats)
-    assert sorted(correction.worlds) == [0, 1]
+    correction = backend.adjust(0, tracked)
+    assert sorted(correction.S_common_map) == [0, 1]
     assert "2 maps joined" in correction.description
     for frame, at_mm in zip(frames, places, strict=True):
         moved = correction.frame(frame)
@@ -162,7 +164,7 @@ def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
 
 
 def test_maps_that_do_not_are_adjusted_apart() -> None:
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     with pytest.raises(ValueError, match="no keyframe"):
         backend.adjust()
     for number in range(6):
@@ -170,62 +172,62 @@ def test_maps_that_do_not_are_adjusted_apart() -> None:
         backend.add(*_keyframe(number, at_mm, Similarity.identity(), 1.0 + 0.2 * (number >= 3)))
     correction = backend.adjust(1)
     np.testing.assert_array_equal(correction.index, [30, 40, 50])
-    assert list(correction.worlds) == [1]
+    assert list(correction.S_common_map) == [1]
 
 
 @pytest.mark.parametrize("swelling", [False, True])
 def test_one_map_that_does_not_fit_is_left_alone(swelling: bool) -> None:
-    backend, rng = Backend(MappingSettings()), np.random.default_rng(0)
+    backend, rng = Backend(MappingSettings(), DisFlow()), np.random.default_rng(0)
     for number in range(15):
-        frame, seat = _keyframe(number, (1.5 * number, 0.4 * number, 0.0), Similarity.identity(), 1.0)
+        frame, pose = _keyframe(number, (1.5 * number, 0.4 * number, 0.0), Similarity.identity(), 1.0)
         if swelling and number % 3 == 1:
             x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (240, 180)))
             swell = cv2.GaussianBlur(rng.normal(0, 1, (180, 240, 2)).astype(np.float32), (0, 0), 10)
             swell *= 4 / np.abs(swell).max()
             frame = replace(frame, rgb=cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR))
-        backend.add(frame, seat._replace(map=number % 3))
-    assert sorted(backend.adjust(0).worlds) == ([0, 2] if swelling else [0, 1, 2])
+        backend.add(frame, pose._replace(map=number % 3))
+    assert sorted(backend.adjust(0).S_common_map) == ([0, 2] if swelling else [0, 1, 2])
 
 
-class _Joining:
-    """A back end that joins maps 1 and 2."""
-
-    def keyframes(self, _: int) -> int:
-        return 1
-
-    def adjust(self, main: int, _: Mapping[int, Seat], among: Collection[int]) -> Correction:
+def test_what_has_most_frames_in_all_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    def merging(self: Backend, main: int, tracked: Mapping[int, TrackedPose], among: Collection[int]) -> Correction:
+        """Merge maps 1 and 2."""
         maps = [number for number in ((1, 2) if main in (1, 2) else (main,)) if number in among]
-        worlds = {number: Similarity.identity() for number in maps}
-        return Correction(np.zeros(1, int), np.eye(4)[None], np.zeros(1), worlds=worlds)
+        merged = {number: Similarity.identity() for number in maps}
+        return Correction(np.zeros(1, int), np.eye(4)[None], np.zeros(1), S_common_map=merged)
 
-
-def test_what_has_most_frames_in_all_comes_first(spliced: Path) -> None:
-    pipeline = Pipeline(Config(), Estimators.create(with_true_depth(spliced, **LIGHT), open_sequence(spliced)))
-    frames = [0] * 11 + [1] * 8 + [2] * 7 + [3] * 9 + [4] * 10
-    pipeline._seats = {index: Seat(number, 0, np.eye(4)) for index, number in enumerate(frames)}
-    pipeline._backend = None
-    assert [(piece.maps, piece.frames) for piece in pipeline.pieces()] == [((0,), 11), ((4,), 10)]
-    joining: Any = _Joining()
-    pipeline._backend = joining
-    pieces = pipeline.pieces()
-    assert [(piece.maps, piece.frames) for piece in pieces] == [((1, 2), 15), ((0,), 11), ((4,), 10)]
-    assert "there are 5" in pipeline.maps_note(pieces)[0]
-    assert "15 are in the result" in pipeline.maps_note(pieces)[0]
+    monkeypatch.setattr(Backend, "keyframes", lambda self, number: 1)
+    monkeypatch.setattr(Backend, "adjust", merging)
+    of_map = [0] * 11 + [1] * 8 + [2] * 7 + [3] * 9 + [4] * 10
+    for method, expected in (
+        ("none", [((0,), 11), ((4,), 10)]),
+        ("full", [((1, 2), 15), ((0,), 11), ((4,), 10)]),
+    ):
+        mapper = Mapper(MappingSettings(method=method), DisFlow())
+        for index, number in enumerate(of_map):
+            mapper.observe(Track(index, "ok", "", np.eye(4), 0, map=number))
+        submaps, warnings = mapper.submaps()
+        assert [(submap.maps, len(submap.frames)) for submap in submaps] == expected
+        assert f"{expected[0][1]} of 45 tracked frames are in the result" in warnings[0]
+        assert warnings[0].startswith("5 submaps" if method == "none" else "4 submaps")
 
 
 def test_what_sticks_to_the_lens_joins_nothing() -> None:
-    backend, dirt = Backend(MappingSettings()), np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32)
+    backend, dirt = (
+        Backend(MappingSettings(), DisFlow()),
+        np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32),
+    )
     dirt = cv2.GaussianBlur(dirt, (0, 0), 1.5)
     for number in range(10):
         at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 5 else (45.0 + 2 * number, 0.0, 0.0)
-        frame, seat = _keyframe(number, at_mm, Similarity.identity(), 1.0)
+        frame, pose = _keyframe(number, at_mm, Similarity.identity(), 1.0)
         frame.rgb[60:130, 80:170] = np.clip(100 + 30 * dirt / dirt.std(), 0, 255).astype(np.uint8)
-        backend.add(frame, seat._replace(map=int(number >= 5)))
-    assert list(backend.adjust().worlds) == [0]
+        backend.add(frame, pose._replace(map=int(number >= 5)))
+    assert list(backend.adjust().S_common_map) == [0]
 
 
 def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = Backend(MappingSettings())
+    backend = Backend(MappingSettings(), DisFlow())
     for number in range(10):
         backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
 
@@ -237,7 +239,7 @@ def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.Monkey
     correction = backend.adjust()
     assert not correction.refused
     np.testing.assert_array_equal(correction.index, [0, 20, 40, 60, 80])
-    assert list(correction.worlds) == [0]
+    assert list(correction.S_common_map) == [0]
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +275,7 @@ def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(
     assert status == ["initial"] + ["ok"] * 9 + ["lost"] * GIVEN_UP + ["ok"] * (44 - GIVEN_UP)
     assert result.records[10 + GIVEN_UP].track.reason == "began a map that was joined"
     assert any("2 maps joined" in note for note in result.provenance["notes"])
-    assert not [text for text in result.provenance["warnings"] if text.startswith("maps:")]
+    assert not [text for text in result.provenance["warnings"] if "submaps" in text]
     np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
     report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
     assert report.ate_rmse_mm < 0.4

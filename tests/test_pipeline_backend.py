@@ -13,7 +13,8 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.pipeline import Estimators, Piece, Pipeline, Step
+from scopemap.mapping import Submap
+from scopemap.pipeline import Estimators, Pipeline, Step
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
@@ -59,9 +60,9 @@ def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Estimators, "create", bent)
-        config = with_true_depth(phantom, **SETTINGS, backend__depth_step_sigma=request.param)
+        config = with_true_depth(phantom, **SETTINGS, mapping__depth_step_sigma=request.param)
         adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
-        plain = with_true_depth(phantom, **SETTINGS, backend__method="none")
+        plain = with_true_depth(phantom, **SETTINGS, mapping__method="none")
         tracked = reconstruct(open_sequence(phantom), plain)
     return _Run(request.param, phantom, folder / "out", steps, adjusted, tracked)
 
@@ -129,8 +130,9 @@ def test_what_waited_is_fused_though_no_keyframe_ever_came(run: _Run) -> None:
     config = with_true_depth(run.phantom, fusion__advanced__min_weight=0.0, **SETTINGS)
     pipeline = Pipeline(config, Estimators.create(config, open_sequence(run.phantom)))
     pipeline._waiting.put(run.steps[0].frame)
-    assert pipeline.pieces() == []
-    assert len(pipeline.fuse(Piece(0, (0,), 1)).mesh.vertices) > 0
+    assert pipeline.submaps() == ([], [])
+    only = frozenset({run.steps[0].frame.index})
+    assert len(pipeline.fuse(Submap(0, (0,), only, only)).mesh.vertices) > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:

@@ -11,7 +11,6 @@ motion, so it may run a frame ahead of `step`.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,7 +35,7 @@ from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, fol
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points, pull
 from scopemap.io.sequence import Sequence
-from scopemap.mapping import Backend, Correction, Seat
+from scopemap.mapping import Mapper, Submap
 from scopemap.masking.mask_files import MaskFiles, create_masks
 from scopemap.masking.masker import Masker
 from scopemap.tracking import FrameTracker, Track, Tracker, create_smoother
@@ -126,29 +125,9 @@ class Estimators:
         return parts | masks | {"anchor": self.anchor.description}
 
 
-LEAST_FRAMES_APART = 10
-"""Frames that a piece must have to be given back beside the largest."""
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Maps that are in one world after the last frame.
-
-    Attributes
-    ----------
-    main : number of the one with most frames. maps : all numbers. frames : how many were tracked in them. correction :
-    what the back end makes of these frames; None: they are as tracked.
-    """
-
-    main: int
-    maps: tuple[int, ...]
-    frames: int
-    correction: Correction | None = None
-
-
 @dataclass(frozen=True)
 class Fused:
-    """The surface of a piece, world mm, may be empty; the settings with the sizes that it has; what to say of these."""
+    """Surface of a submap, world mm, may be empty; the settings with the sizes that it has; notes on these."""
 
     mesh: trimesh.Trimesh
     settings: FusionSettings
@@ -171,7 +150,7 @@ class Pipeline:
         self._tracker = tracker or Tracker(own)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self._backend = Backend(config.mapping) if config.mapping.method == "full" else None
+        self._mapper = Mapper(config.mapping, create_flow(config.networks.keyframe_flow, config.networks.device))
         self._volume = None if waits else TsdfVolume(config.fusion)
         self._waiting = FrameSpool()
         self._previous: Frame | None = None
@@ -182,8 +161,6 @@ class Pipeline:
         self._corners = (
             CornerFollower(estimators.keyframe_flow, config.mapis.advanced.consistency_px) if follows else None
         )
-        self._seats: dict[int, Seat] = {}
-        self._losses = 0
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the frame before it."""
@@ -200,9 +177,6 @@ class Pipeline:
 
     def step(self, percept: Percept) -> Step:
         """Track a frame, make its depth consistent, fuse it or let it wait until all are tracked."""
-        if percept.kind == "measured":
-            # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
-            self._backend = None
         refined = self._refine(percept, None) if self.config.mapis.paper.order == "refine-first" else None
         raw = replace(
             percept.frame,
@@ -225,68 +199,45 @@ class Pipeline:
         frame = replace(percept.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
         # Measured depth that was scaled or blended is not what the next frame measures.
         measured = percept.kind == "measured" and not self._mapis.links("measured")
-        track = self._keyed(track, frame, measured=measured)
+        # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
+        track = self._keyed(track, frame, measured=measured, adjustable=percept.kind != "measured")
         if track.status == "lost":
             self._mapis.forget()
             self._smooth.forget()
-            self._losses += 1
         else:
-            self._seats[frame.index] = self._seat(track)
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
+        self._mapper.observe(track)
         self._last, self._last_mm = track, refined.depth_mm
         return Step(frame, track, percept.raw_mm, refined)
 
-    def pieces(self) -> list[Piece]:
-        """Adjust all keyframes together after the last frame, and join what can be joined; most frames first.
+    def submaps(self) -> tuple[list[Submap], list[str]]:
+        """Adjust all keyframes together after the last frame, and merge what can be merged; with warnings.
 
         Poses and depths that `step` gave away are as tracked: whoever kept them has to correct them.
         """
-        frames = Counter(seat.map for seat in self._seats.values())
-        pieces: list[Piece] = []
-        while frames:
-            main = max(frames, key=lambda number: frames[number])
-            correction = None
-            if self._backend is not None and self._backend.keyframes(main):
-                correction = self._backend.adjust(main, self._seats, among=frames)
-            maps = (main,) if correction is None else tuple(sorted(correction.worlds))
-            pieces.append(Piece(main, maps, sum(frames.pop(number) for number in maps), correction))
-        pieces.sort(key=lambda piece: -piece.frames)
-        return pieces[:1] + [piece for piece in pieces[1:] if piece.frames >= LEAST_FRAMES_APART]
+        return self._mapper.submaps()
 
-    def maps_note(self, pieces: list[Piece]) -> list[str]:
-        """What to say where maps are left; nothing where all are one piece."""
-        maps = {seat.map for seat in self._seats.values()}
-        if not pieces or maps == set(pieces[0].maps):
-            return []
-        beside = f"{len(pieces) - 1} more with {LEAST_FRAMES_APART} frames or more are kept beside it (maps/)"
-        return [
-            f"maps: there are {len(maps)}, since the camera was lost and not found again; of {len(self._seats)} frames "
-            f"tracked, {pieces[0].frames} are in the result; how the others lie to them is not known, {beside}"
-        ]
-
-    def fuse(self, piece: Piece) -> Fused:
-        """Fuse what waited of a piece, in voxels that suit it, as the back end corrected it."""
-        volume = self._volume_of(piece) if self._volume is None else self._volume
+    def fuse(self, submap: Submap) -> Fused:
+        """Fuse what waited of a submap, in voxels that suit it, as the back end corrected it."""
+        volume = self._volume_of(submap) if self._volume is None else self._volume
         if volume is None:
             return Fused(trimesh.Trimesh(), self.config.fusion)
         note = [f"fusion: {described(volume.sizes)}"] if follows_scene(self.config.fusion) else []
         return Fused(volume.extract_mesh(), with_sizes(self.config.fusion, volume.sizes), note)
 
-    def _volume_of(self, piece: Piece) -> TsdfVolume | None:
-        elsewhere = {index for index, seat in self._seats.items() if seat.map not in piece.maps}
+    def _volume_of(self, submap: Submap) -> TsdfVolume | None:
         # Other maps' millimetres are not those of the main one.
-        others = {index for index, seat in self._seats.items() if seat.map != piece.main}
-        typical_mm = self._waiting.typical_mm(others)
+        typical_mm = self._waiting.typical_mm(submap.main_frames)
         if typical_mm is None:
             return None
         volume = TsdfVolume(self.config.fusion, choose_sizes(self.config.fusion, typical_mm))
         for frame in self._waiting.frames():
-            if frame.index not in elsewhere:
-                volume.integrate(frame if piece.correction is None else piece.correction.frame(frame))
+            if frame.index in submap.frames:
+                volume.integrate(frame if submap.correction is None else submap.correction.frame(frame))
         return volume
 
-    def _keyed(self, track: Track, frame: Frame, *, measured: bool) -> Track:
+    def _keyed(self, track: Track, frame: Frame, *, measured: bool, adjustable: bool) -> Track:
         """Make the frame a keyframe where one is due; a first frame that cannot be one fixes no world and is lost."""
         if track.status == "lost" or not self._tracker.wants_keyframe():
             return track
@@ -294,14 +245,11 @@ class Pipeline:
         adopted = self._tracker.adopt(keyframe, measured=measured)
         if adopted and self._corners is not None:
             self._corners.start(keyframe)
-        if adopted and self._backend is not None:
-            self._backend.add(keyframe, self._seat(track))
+        if adopted and adjustable:
+            self._mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track
-
-    def _seat(self, track: Track) -> Seat:
-        return Seat(track.map, track.keyframe, track.T_world_camera, self._losses)
 
     def _link(self, frame: Frame, kind: DepthKind) -> Correspondence | None:
         """Link a masked frame to the one before it; None for the first, and where MAPIS would not use it."""

@@ -25,8 +25,8 @@ from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
 from scopemap.io.sequence import Sequence
 from scopemap.io.video_format.redundant_frames import is_constant
-from scopemap.mapping import LARGEST_LOG_FACTOR
-from scopemap.pipeline import Estimators, Fused, Percept, Piece, Pipeline, Step
+from scopemap.mapping import LARGEST_LOG_FACTOR, Submap
+from scopemap.pipeline import Estimators, Fused, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder
 from scopemap.tracking import FrameTracker
 
@@ -81,10 +81,10 @@ def reconstruct(
     records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
     if all(record.track.status == "lost" for record in records):
         raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
-    pieces = clock.timed("back end", pipeline.pieces)
+    submaps, warnings = clock.timed("back end", pipeline.submaps)
     tracked = _Tracked(sequence, config, pipeline, clock, records, camera_note + exponent_note, distances, writer)
-    results = [tracked.result(piece) for piece in pieces]
-    results[0].provenance["warnings"] += pipeline.maps_note(pieces)
+    results = [tracked.result(submap) for submap in submaps]
+    results[0].provenance["warnings"] += warnings
     result = replace(results[0], others=results[1:])
     if out is not None:
         result.save(Path(out))
@@ -149,15 +149,15 @@ class _Tracked:
     distances: _Distances
     writer: DepthWriter | None
 
-    def result(self, piece: Piece) -> Reconstruction:
-        """Correct and fuse one piece; its depth is written anew."""
-        sequence, clock, correction = self.sequence, self.clock, piece.correction
-        records = only_maps(self.records, piece.maps)
+    def result(self, submap: Submap) -> Reconstruction:
+        """Correct and fuse one submap; its depth is written anew."""
+        sequence, clock, correction = self.sequence, self.clock, submap.correction
+        records = only_maps(self.records, submap.maps)
         if correction is not None:
             records = corrected(records, correction)
             if self.writer is not None:
                 clock.timed("depth corrected", self.writer.correct, records, correction)
-        fused: Fused = clock.timed("fuse", self.pipeline.fuse, piece)
+        fused: Fused = clock.timed("fuse", self.pipeline.fuse, submap)
         config = self.config.model_copy(update={"fusion": fused.settings})
         estimators = self.pipeline.estimators
         provenance = _provenance(sequence, estimators, clock, records)

@@ -44,12 +44,12 @@ class FrameSpool:
         """Return how many frames wait."""
         return len(self._entries)
 
-    def typical_mm(self, without: Collection[int] = ()) -> float | None:
+    def typical_mm(self, among: Collection[int] | None = None) -> float | None:
         """Return the median of the frames' median depths, mm; None where no depth is known.
 
-        without : numbers of frames that do not count.
+        among : numbers of the frames that count; None: all.
         """
-        some = [entry.median_mm for entry in self._entries if entry.number not in without]
+        some = [entry.median_mm for entry in self._entries if among is None or entry.number in among]
         medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
         return float(np.median(medians_mm)) if medians_mm else None
 

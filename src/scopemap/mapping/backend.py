@@ -13,7 +13,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow import DisFlow
+from scopemap.flow import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
@@ -24,7 +24,7 @@ from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.map_merging import join_maps
 from scopemap.mapping.pose_graph import spread_loops
-from scopemap.mapping.pose_interpolation import Correction, Seat, unchanged
+from scopemap.mapping.pose_interpolation import Correction, TrackedPose, unchanged
 
 # Points whose depth is known to a tenth; fewer than that share of all may be what moves by itself.
 _SURE, _LEAST_SURE = 0.1, 0.1
@@ -36,7 +36,7 @@ class _Keyframe(NamedTuple):
     """Number of a keyframe's frame, and how it was tracked."""
 
     frame: int
-    seat: Seat
+    tracked: TrackedPose
 
 
 class _Adjusted(NamedTuple):
@@ -60,16 +60,15 @@ class _Adjusted(NamedTuple):
 class Backend:
     """Takes keyframes as they come and returns what has to be corrected.
 
-    Keyframes are linked in a thread of their own, by OpenCV's DIS flow whatever flow the front end uses: over the wide
-    gaps between keyframes many pairs are needed, and the adjustment does away with what it gets wrong. Loops are
+    Keyframes are linked in a thread of their own, by the flow given, which no other thread may use meanwhile. Loops are
     looked for there, too; those between maps join them, and what all of them say is spread over all keyframes before
     these are adjusted.
     """
 
-    def __init__(self, settings: MappingSettings) -> None:
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self.settings = settings
         self._keyframes: list[_Keyframe] = []
-        self._linker = Linker(settings, DisFlow())
+        self._linker = Linker(settings, flow)
         self._finder = LoopFinder(settings) if settings.loop_landmarks > 0 else None
         self._loops: list[Loop] = []
         self._camera: PinholeCamera | None = None
@@ -78,39 +77,42 @@ class Backend:
 
     def keyframes(self, map_number: int = 0) -> int:
         """Return how many keyframes of a map were added."""
-        return sum(keyframe.seat.map == map_number for keyframe in self._keyframes)
+        return sum(keyframe.tracked.map == map_number for keyframe in self._keyframes)
 
-    def add(self, keyframe: Frame, seat: Seat | None = None) -> None:
+    def add(self, keyframe: Frame, tracked: TrackedPose | None = None) -> None:
         """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
 
-        seat : how it was tracked; None: in map 0, from the keyframe before.
+        tracked : how it was tracked; None: in map 0, from the keyframe before.
         """
         if keyframe.T_world_camera is None:
             raise ValueError("a keyframe needs a pose")
-        if seat is None:
+        if tracked is None:
             before = self._keyframes[-1].frame if self._keyframes else keyframe.index
-            seat = Seat(0, before, keyframe.T_world_camera)
-        self._keyframes.append(_Keyframe(keyframe.index, seat))
+            tracked = TrackedPose(0, before, keyframe.T_world_camera)
+        self._keyframes.append(_Keyframe(keyframe.index, tracked))
         # What went wrong with earlier keyframes is heard of now, not after the last frame.
         while self._links and self._links[0].done():
             self._links.popleft().result()
-        self._links.append(self._worker.submit(self._link, keyframe, seat.map))
+        self._links.append(self._worker.submit(self._link, keyframe, tracked.map))
 
     def adjust(
-        self, map_number: int = 0, seats: Mapping[int, Seat] | None = None, among: Collection[int] | None = None
+        self,
+        map_number: int = 0,
+        tracked: Mapping[int, TrackedPose] | None = None,
+        among: Collection[int] | None = None,
     ) -> Correction:
         """Return the correction of all frames of a map, and of those maps that show the same, after the last keyframe.
 
-        seats : by number of the frame, how it was tracked; frames of several maps need it. among : numbers of the maps
-        that may be joined; None: all. The correction changes nothing where a rigid scene cannot explain what was seen.
-        Raises ValueError where no keyframe of that map was added.
+        tracked : by number of the frame, how it was tracked; frames of several maps need it. among : numbers of the
+        maps that may be merged; None: all. The correction changes nothing where a rigid scene cannot explain what was
+        seen. Raises ValueError where no keyframe of that map was added.
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
         while self._links:
             self._links.popleft().result()
         self._worker.shutdown()
-        free = {keyframe.seat.map for keyframe in self._keyframes} if among is None else set(among)
+        free = {keyframe.tracked.map for keyframe in self._keyframes} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
         found = alone = self._adjusted(worlds, map_number)
         others = [*self._joined(map_number, free)][1:]
@@ -122,7 +124,7 @@ class Backend:
             together = self._adjusted(more, map_number)
             if together.fits(alone, self.settings.max_sigma_px):
                 found, worlds = together, more
-        return replace(found.correction, worlds=worlds, seats=seats or {})
+        return replace(found.correction, S_common_map=worlds, tracked=tracked or {})
 
     def _link(self, keyframe: Frame, map_number: int) -> None:
         """Link a keyframe to those just before it, and to those elsewhere that show the same."""
@@ -134,12 +136,12 @@ class Backend:
 
     def _joined(self, map_number: int, free: Collection[int]) -> dict[int, Similarity]:
         """Return the worlds of the maps, of those that are free, that belong together with this one."""
-        map_of = [keyframe.seat.map for keyframe in self._keyframes]
+        map_of = [keyframe.tracked.map for keyframe in self._keyframes]
         points, _ = self._linker.collected(np.flatnonzero(np.array(map_of) == map_number))
         if len(set(map_of)) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
         depth_mm = float(np.exp(np.median(points.log_depth)))
-        T_world_camera = np.stack([keyframe.seat.T_world_camera for keyframe in self._keyframes])
+        T_world_camera = np.stack([keyframe.tracked.T_world_camera for keyframe in self._keyframes])
         loops = [loop for loop in self._loops if map_of[loop.past] in free and map_of[loop.new] in free]
         return join_maps(T_world_camera, map_of, loops, map_number, depth_mm)
 
@@ -147,11 +149,11 @@ class Backend:
         """Adjust all keyframes of the maps with these worlds together."""
         camera, settings = self._camera, self.settings
         assert camera is not None
-        chosen = [k for k, keyframe in enumerate(self._keyframes) if keyframe.seat.map in worlds]
+        chosen = [k for k, keyframe in enumerate(self._keyframes) if keyframe.tracked.map in worlds]
         own = [self._keyframes[k] for k in chosen]
-        world_of = [worlds[keyframe.seat.map] for keyframe in own]
+        world_of = [worlds[keyframe.tracked.map] for keyframe in own]
         T_world_camera = np.stack(
-            [w.transform_poses(k.seat.T_world_camera) for w, k in zip(world_of, own, strict=True)]
+            [w.transform_poses(k.tracked.T_world_camera) for w, k in zip(world_of, own, strict=True)]
         )
         log_unit = np.log([world.scale for world in world_of])
         points, sightings = self._linker.collected(chosen)
@@ -168,7 +170,7 @@ class Backend:
         if start is not None and self._doubt(points, found):
             # Loops may be what is wrong.
             found, loops = adjust(replace(problem, start=None)), 0
-        map_of = np.array([keyframe.seat.map for keyframe in own])
+        map_of = np.array([keyframe.tracked.map for keyframe in own])
         host, other = map_of[points.host[sightings.point]], map_of[sightings.keyframe]
         off_px = errors_px(problem, found)
         within = {number: _sigma_px(off_px[(host == number) & (other == number)]) for number in worlds}
@@ -234,11 +236,11 @@ def _neighbours(keyframes: Sequence[_Keyframe]) -> np.ndarray:
     pairs: list[tuple[int, int]] = []
     latest: dict[int, int] = {}
     for k, keyframe in enumerate(keyframes):
-        first = place.get(keyframe.seat.keyframe, k)
-        first = latest.get(keyframe.seat.map, k) if first >= k else first
+        first = place.get(keyframe.tracked.keyframe, k)
+        first = latest.get(keyframe.tracked.map, k) if first >= k else first
         if first < k:
             pairs.append((first, k))
-        latest[keyframe.seat.map] = k
+        latest[keyframe.tracked.map] = k
     return np.array(pairs, dtype=int).reshape(-1, 2)
 
 

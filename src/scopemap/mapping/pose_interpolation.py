@@ -16,17 +16,17 @@ from scopemap.mapping.depth_correction import DepthGrid
 _AT_REST = 1e-6  # rad
 
 
-class Seat(NamedTuple):
+class TrackedPose(NamedTuple):
     """How a frame was tracked.
 
     map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), its pose in
-    that map's world. stretch : the same number for all frames between which the camera was not lost.
+    that map's world. segment : the same number for all frames between which the camera was not lost.
     """
 
     map: int
     keyframe: int
     T_world_camera: np.ndarray
-    stretch: int = 0
+    segment: int = 0
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,13 @@ class Correction:
 
     Attributes
     ----------
-    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the world as
-    tracked, or joined, around a keyframe to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
-    sigma_px : robust standard deviation of what remains between keyframes, px; NaN where nothing linked them.
-    refused : why nothing is changed, "" where it is. loops : pairs of keyframes, far apart in time or of two maps, that
-    were found to show the same place. grids : K of them, by what more the depth of each place is to be multiplied;
-    none: nothing more. worlds : by number of each map whose frames it is for, how its world lies in the one that these
-    were joined to. seats : by number of the frame, how it was tracked; of frames not in there it is not known.
-    depth_mm : typical depth; a way as long as that counts as much as a turn by 1 rad.
+    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the common world as
+    tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
+    robust standard deviation of the reprojection errors; NaN where nothing was observed twice. refused : why nothing is
+    changed, "" where it is. loops : accepted loop closures. grids : (K,) what the depth of each pixel is multiplied by
+    besides; (): nothing. S_common_map : by number of each merged map, Sim(3) from its world to the common one.
+    tracked : by number of the frame, how it was tracked, where that is known. depth_mm : typical depth, the unit of
+    translations beside rotations in rad.
     """
 
     index: np.ndarray
@@ -52,8 +51,8 @@ class Correction:
     refused: str = ""
     loops: int = 0
     grids: tuple[DepthGrid, ...] = ()
-    worlds: Mapping[int, Similarity] = field(default_factory=dict)
-    seats: Mapping[int, Seat] = field(default_factory=dict)
+    S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
+    tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
 
     @property
@@ -68,7 +67,7 @@ class Correction:
             )
         turn_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         closed = f", {self.loops} loops closed" if self.loops else ""
-        closed += f", {len(self.worlds)} maps joined" if len(self.worlds) > 1 else ""
+        closed += f", {len(self.S_common_map)} maps joined" if len(self.S_common_map) > 1 else ""
         return (
             f"back end: {len(self.index)} keyframes adjusted, turned by up to {turn_deg:.1f} deg{closed}; points seen "
             f"again lie {self.sigma_px:.2f} px from where they should{self._bent()}"
@@ -116,8 +115,8 @@ class Correction:
 
     def _world(self, index: int) -> Similarity:
         """How the world of a frame's map lies in the common one."""
-        seat = self.seats.get(index)
-        return self.worlds.get(0 if seat is None else seat.map, Similarity.identity())
+        tracked = self.tracked.get(index)
+        return self.S_common_map.get(0 if tracked is None else tracked.map, Similarity.identity())
 
     def _bent(self) -> str:
         """How far the grids go, for the description; nothing where there are none."""
@@ -151,8 +150,8 @@ class Correction:
     def _share(self, index: int, before: int, after: int) -> float:
         """How far a frame is on the way from one keyframe to the next, by motion; by time where that is not known."""
         frames = (int(self.index[before]), index, int(self.index[after]))
-        if all(frame in self.seats for frame in frames):
-            first, own, last = (self._world(f).transform_poses(self.seats[f].T_world_camera) for f in frames)
+        if all(frame in self.tracked for frame in frames):
+            first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)
             there, onwards = self._motion(first, own), self._motion(own, last)
             if there + onwards > _AT_REST:
                 return there / (there + onwards)
@@ -168,13 +167,15 @@ class Correction:
         return same and not self._lost_between(index, keyframe)
 
     def _lost_between(self, one: int, other: int) -> bool:
-        return one in self.seats and other in self.seats and self.seats[one].stretch != self.seats[other].stretch
+        return (
+            one in self.tracked and other in self.tracked and self.tracked[one].segment != self.tracked[other].segment
+        )
 
     def _reference(self, index: int) -> int | None:
         """Number of the keyframe that a frame was aligned to, where that is known."""
-        seat = self.seats.get(index)
-        place = 0 if seat is None else int(np.searchsorted(self.index, seat.keyframe))
-        known = seat is not None and place < len(self.index) and self.index[place] == seat.keyframe
+        tracked = self.tracked.get(index)
+        place = 0 if tracked is None else int(np.searchsorted(self.index, tracked.keyframe))
+        known = tracked is not None and place < len(self.index) and self.index[place] == tracked.keyframe
         return place if known else None
 
 

@@ -1,0 +1,96 @@
+"""Submaps: the frames that share a world, sorted, adjusted and merged after the last frame.
+
+The tracker starts a new map where the camera is lost for good. Maps that loop closures tie together are merged into one
+submap; the relative pose of the others stays unknown, and each is a result of its own.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from scopemap.config import MappingSettings
+from scopemap.flow import FlowEstimator
+from scopemap.frame import Frame
+from scopemap.mapping.backend import Backend
+from scopemap.mapping.pose_interpolation import Correction, TrackedPose
+from scopemap.tracking import Track
+
+LEAST_FRAMES = 10
+"""Tracked frames that a submap needs to be a result beside the largest."""
+
+
+@dataclass(frozen=True)
+class Submap:
+    """Frames that share a world after the last frame.
+
+    Attributes
+    ----------
+    main : number of its map with most frames, whose millimetres are kept. maps : numbers of all maps merged into it.
+    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. correction : of
+    poses and depth of these frames; None: they are as tracked.
+    """
+
+    main: int
+    maps: tuple[int, ...]
+    frames: frozenset[int]
+    main_frames: frozenset[int]
+    correction: Correction | None = None
+
+
+class Mapper:
+    """Takes every track and every keyframe, and returns the submaps after the last frame.
+
+    flow : between keyframes, for the thread of the back end alone; "none" leaves all frames as tracked.
+    """
+
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+        links = settings.method == "full" and flow.name != "none"
+        self._backend = Backend(settings, flow) if links else None
+        self._tracked: dict[int, TrackedPose] = {}
+        self._lost_frames = 0
+
+    def observe(self, track: Track) -> None:
+        """Note where a frame was tracked, or that it was lost."""
+        if track.status == "lost":
+            self._lost_frames += 1
+        else:
+            self._tracked[track.index] = self._pose(track)
+
+    def add_keyframe(self, keyframe: Frame, track: Track) -> None:
+        """Take a keyframe with refined depth and pose, to be adjusted with the others; before it is observed."""
+        if self._backend is not None:
+            self._backend.add(keyframe, self._pose(track))
+
+    def submaps(self) -> tuple[list[Submap], list[str]]:
+        """Return the submaps, most frames first, and warnings about frames that are not in the first.
+
+        All keyframes are adjusted together here: poses and depths that were handed on before need the submap's
+        correction. Small submaps, but for the first, are left out.
+        """
+        frames = Counter(pose.map for pose in self._tracked.values())
+        found: list[Submap] = []
+        while frames:
+            main = max(frames, key=lambda number: frames[number])
+            correction = None
+            if self._backend is not None and self._backend.keyframes(main):
+                correction = self._backend.adjust(main, self._tracked, among=frames)
+            maps = (main,) if correction is None else tuple(sorted(correction.S_common_map))
+            found.append(Submap(main, maps, self._frames_of(maps), self._frames_of((main,)), correction))
+            for number in maps:
+                del frames[number]
+        found.sort(key=lambda submap: -len(submap.frames))
+        kept = found[:1] + [submap for submap in found[1:] if len(submap.frames) >= LEAST_FRAMES]
+        if len(found) < 2:
+            return kept, []
+        return kept, [
+            f"{len(found)} submaps: the camera was lost and not found again; {len(kept[0].frames)} of "
+            f"{len(self._tracked)} tracked frames are in the result; the relative pose of the others is unknown; "
+            f"{len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
+        ]
+
+    def _frames_of(self, maps: tuple[int, ...]) -> frozenset[int]:
+        return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)
+
+    def _pose(self, track: Track) -> TrackedPose:
+        return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)
