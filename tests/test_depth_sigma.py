@@ -18,7 +18,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth import AnchoredDepth, DepthEstimate
-from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
@@ -144,8 +144,8 @@ def test_nothing_is_said_of_a_disparity_nor_of_the_anchors_own_depth() -> None:
 # ---- MAPIS
 
 
-def _link() -> Correspondence:
-    return Correspondence(np.zeros((*SHAPE, 2), np.float32), np.ones(SHAPE, bool), DISTANCE)
+def _link() -> DenseCorrespondence:
+    return DenseCorrespondence(np.zeros((*SHAPE, 2), np.float32), np.ones(SHAPE, bool), DISTANCE)
 
 
 def _refined(sigmas: tuple[Any, Any], motion: np.ndarray | None = None, **changes: Any) -> list[RefinedDepth]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MapisSettings
-from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth, robust_scale
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth, robust_scale
 from scopemap.geometry.se3 import se3
 
 SHAPE = (48, 64)
@@ -30,13 +30,13 @@ def _mapis(**changes: Any) -> Mapis:
     return Mapis(chosen(MapisSettings, **(plain | changes)))
 
 
-def _link(distance: np.ndarray | float = 0.0, flow_x: float = 0.0) -> Correspondence:
+def _link(distance: np.ndarray | float = 0.0, flow_x: float = 0.0) -> DenseCorrespondence:
     to_previous = np.zeros((*SHAPE, 2), np.float32)
     to_previous[..., 0] = flow_x
-    return Correspondence(to_previous, np.ones(SHAPE, bool), np.broadcast_to(np.float32(distance), SHAPE).copy())
+    return DenseCorrespondence(to_previous, np.ones(SHAPE, bool), np.broadcast_to(np.float32(distance), SHAPE).copy())
 
 
-def _second(mapis: Mapis, link: Correspondence, T: np.ndarray | None = None, kind: Any = "depth") -> RefinedDepth:
+def _second(mapis: Mapis, link: DenseCorrespondence, T: np.ndarray | None = None, kind: Any = "depth") -> RefinedDepth:
     mapis.refine(DEPTH, kind, CAMERA, None, None)
     return mapis.refine(OTHER, kind, CAMERA, link, T)
 
@@ -134,7 +134,7 @@ def test_a_chain_that_little_holds_does_not_run_away(pull: float, least: float, 
     mapis = _mapis(frame_scale="robust", blend="none", scale_pull=pull)
     consistent = np.zeros(SHAPE, bool)
     consistent[:, : round(0.3 * SHAPE[1])] = True
-    link = Correspondence(_link().to_previous, consistent, _link().distance)
+    link = DenseCorrespondence(_link().to_previous, consistent, _link().distance)
     flat, away = np.full(SHAPE, 40.0, np.float32), se3(np.eye(3), np.array([0.0, 0.0, 2.0]))
     mapis.refine(flat, "depth", CAMERA, None, None)
     scales = [mapis.refine(flat, "depth", CAMERA, link, away).scale for _ in range(120)]
@@ -148,7 +148,7 @@ def test_a_chain_that_all_holds_is_left_alone(round_view: bool) -> None:
     if round_view:
         v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
         inside = np.hypot(u - 32, v - 24) < 24
-        link = Correspondence(link.to_previous, inside, link.distance, float(inside.mean()))
+        link = DenseCorrespondence(link.to_previous, inside, link.distance, float(inside.mean()))
     mapis.refine(DEPTH, "depth", CAMERA, None, None)
     scales = [mapis.refine(2 * DEPTH, "depth", CAMERA, link, None).scale for _ in range(100)]
     np.testing.assert_allclose(scales, 0.5, rtol=1e-4)
@@ -199,7 +199,7 @@ def test_forget_cuts_the_chain_and_holds_the_scale() -> None:
     mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
     mapis.refine(DEPTH, "depth", CAMERA, None, None)
     mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None)
-    mapis.forget()
+    mapis.reset()
     after = mapis.refine(3 * OTHER, "depth", CAMERA, _link(), None)
     assert after.warped_share == 0.0
     assert after.scale == pytest.approx(0.5, rel=1e-5)
@@ -229,7 +229,7 @@ def test_without_a_warped_value_the_scaled_raw_depth_stands() -> None:
     mapis.refine(holed, "depth", CAMERA, None, None)
     consistent = np.ones(SHAPE, bool)
     consistent[:, :7] = False
-    link = Correspondence(np.zeros((*SHAPE, 2), np.float32), consistent, np.zeros(SHAPE, np.float32))
+    link = DenseCorrespondence(np.zeros((*SHAPE, 2), np.float32), consistent, np.zeros(SHAPE, np.float32))
     refined = mapis.refine(4 * OTHER, "depth", CAMERA, link, None)
     np.testing.assert_array_equal(refined.depth_mm[:10], (4 * OTHER * np.float32(refined.scale))[:10])
     np.testing.assert_array_equal(refined.depth_mm[:, :7], (4 * OTHER * np.float32(refined.scale))[:, :7])
@@ -264,7 +264,8 @@ def test_the_bilateral_filter_calms_what_is_warped() -> None:
 
 def test_the_paper_preset_carries_unrefined_values() -> None:
     paper = Config.load("paper").mapis
-    assert (paper.blend, paper.frame_scale, paper.recursive, paper.order) == ("linear", "none", False, "refine-first")
+    assert (paper.advanced.frame_scale, paper.paper.blend) == ("none", "linear")
+    assert (paper.paper.recursive, paper.paper.order) == (False, "refine-first")
 
 
 def test_depth_of_another_size_is_refused() -> None:

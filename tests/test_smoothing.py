@@ -106,7 +106,7 @@ def test_after_a_loss_the_past_is_forgotten_and_s_goes_on() -> None:
     found = []
     for i, position in enumerate(x):
         if i == 3:
-            smoother.forget()
+            smoother.reset()
         found.append(smoother(_at([position, 0, 0]))[0, 3])
     np.testing.assert_array_equal(found[3:5], x[3:5])
     s = 1 - np.exp(-5 * 0.2)

@@ -27,7 +27,7 @@ from scopemap.depth import (
     max_depth_mm,
 )
 from scopemap.depth.files import FilesDepth
-from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
 from scopemap.flow import CornerFollower, FlowEstimator, create_flow, pair_flow
 from scopemap.frame import Correspondences2D3D, Frame
@@ -56,7 +56,7 @@ class Percept:
     frame: Frame
     raw_mm: np.ndarray
     kind: DepthKind
-    link: Correspondence | None
+    link: DenseCorrespondence | None
     anchored: bool = False
     raw_sigma_mm: np.ndarray | None = None
 
@@ -190,8 +190,8 @@ class Pipeline:
         elsewhere = track.status != "lost" and self._last is not None and track.map != self._last.map
         if elsewhere:
             # What is known of the frames just before is of another world.
-            self._mapis.forget()
-            self._smooth.forget()
+            self._mapis.reset()
+            self._smooth.reset()
         if refined is None:
             # What links a lost frame to its past cannot be trusted either.
             known = replace(percept, link=None) if track.status == "lost" or elsewhere else percept
@@ -202,8 +202,8 @@ class Pipeline:
         # Good depth tracks better by itself than flow over wide gaps would make it (BENCHMARK.md).
         track = self._keyed(track, frame, measured=measured, adjustable=percept.kind != "measured")
         if track.status == "lost":
-            self._mapis.forget()
-            self._smooth.forget()
+            self._mapis.reset()
+            self._smooth.reset()
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
             self._fuse(frame)
@@ -251,7 +251,7 @@ class Pipeline:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track
 
-    def _link(self, frame: Frame, kind: DepthKind) -> Correspondence | None:
+    def _link(self, frame: Frame, kind: DepthKind) -> DenseCorrespondence | None:
         """Link a masked frame to the one before it; None for the first, and where MAPIS would not use it."""
         past, settings = self._previous, self.config.mapis
         if past is None or not self._mapis.links(kind):
@@ -262,7 +262,9 @@ class Pipeline:
         rgb = pull(past.rgb, flow.to_previous) if settings.paper.compare_warped else past.rgb
         distance = self.estimators.perceptual.compare(rgb, frame.rgb)
         values = np.full_like(distance.map, distance.score) if settings.paper.perceptual_score else distance.map
-        return Correspondence(flow.to_previous, flow.consistent & seen & frame.valid, values, float(frame.valid.mean()))
+        return DenseCorrespondence(
+            flow.to_previous, flow.consistent & seen & frame.valid, values, float(frame.valid.mean())
+        )
 
     def _flow_correspondences(self, percept: Percept) -> Correspondences2D3D | None:
         """Return points of the frame before where flow finds them in this one; None where either is not known."""

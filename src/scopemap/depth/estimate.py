@@ -1,4 +1,4 @@
-"""The contract of depth estimators: what comes out of one, and of what kind it is."""
+"""The interface of depth estimators and the type that they return."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ DepthKind = Literal["disparity", "depth", "measured"]
 
 @dataclass(frozen=True)
 class DepthEstimate:
-    """What an estimator says of one frame.
+    """Depth or disparity of one frame.
 
     Attributes
     ----------
     values : (H, W) float32, NaN = unknown; meaning and unit by `kind`.
     kind : "disparity": unitless, larger is nearer, known up to a scale and a shift; "depth": predicted, mm along the
-        optical axis, whose scale may float from frame to frame; "measured": mm, to be trusted.
+        optical axis, with a scale that may change from frame to frame; "measured": mm, reliable.
     focal_px : focal length that the estimator found in the image, px of this frame's width, or None.
-    sigma : (H, W) float32, one standard deviation of `values`, in their unit, NaN = unknown; None: the estimator does
-        not say.
+    sigma : (H, W) float32, one standard deviation of `values`, in their unit, NaN = unknown; None: not
+        estimated.
     """
 
     values: np.ndarray

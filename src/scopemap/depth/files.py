@@ -1,8 +1,8 @@
 """Depth from files: one disparity or depth image per frame, found by the number in its name.
 
-8-bit images are disparity unless `depth.files_kind` says otherwise (0 = farthest, not unknown); 16-bit images are
+8-bit images are disparity unless `depth.files_kind` is set (0 = farthest, not unknown); 16-bit images are
 measured depth. The files show the source's view, distorted as the frames are, at any size; a depth folder written by
-scopemap itself (`depth.json` beside the files) is in the geometry of the rectified frames.
+scopemap itself (`depth.json` in it) is in the geometry of the rectified frames.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _C3VD_RANGE_MM = 100.0
 
 @dataclass(frozen=True)
 class _Scale:
-    """Millimetres per unit of depth, and how that is known."""
+    """Millimetres per unit of depth, and the source of that number."""
 
     mm: float
     source: str
 
 
 class FilesDepth:
-    """Depth estimator that reads what others estimated or measured.
+    """Depth estimator that reads depth or disparity from files.
 
-    folder : holds one file per frame; `*_depth.*` and `*.depth.*` are preferred where other images lie there too.
+    folder : holds one file per frame; `*_depth.*` and `*.depth.*` are preferred where the folder has other images.
     rectifier : from the source camera to the working camera.
     depth_scale_mm : mm per unit by the input's own calibration, or None.
     measured_max_mm : farthest depth that measured files can hold, of floats twice the first file's; None: predicted.
@@ -58,11 +58,11 @@ class FilesDepth:
         self._folder, self._rectifier = Path(folder), rectifier
         self._files = depth_files(self._folder)
         first = _read(next(iter(self._files.values())))
-        self._kind = settings.files_kind if settings.files_kind != "auto" else self._told_by(first)
+        self._kind = settings.files_kind if settings.files_kind != "auto" else self._kind_of(first)
         self._only_type = first.dtype if settings.files_kind == "auto" else None
         self._is_rectified = (self._folder / "depth.json").exists()
         self._scale = self._found_scale(first, settings, depth_scale_mm)
-        self.measured_max_mm = _reach(first) * self._scale.mm if self._kind == "measured" else None
+        self.measured_max_mm = _largest(first) * self._scale.mm if self._kind == "measured" else None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the depth or disparity of `frame` (found by `frame.index`), rectified, NaN = unknown.
@@ -89,7 +89,7 @@ class FilesDepth:
             origin["depth_scale"] = f"{self._scale.mm:.6g} mm per unit ({self._scale.source})"
         return origin
 
-    def _told_by(self, array: np.ndarray) -> DepthKind:
+    def _kind_of(self, array: np.ndarray) -> DepthKind:
         if array.dtype == np.uint8:
             return "disparity"
         first_name = next(iter(self._files.values())).name.lower()
@@ -98,9 +98,9 @@ class FilesDepth:
     def _found_scale(self, array: np.ndarray, settings: DepthSettings, calibrated_mm: float | None) -> _Scale:
         if settings.files_scale_mm is not None:
             return _Scale(settings.files_scale_mm, "depth.files_scale_mm")
-        beside = _scale_beside(self._folder)
-        if beside is not None:
-            return beside
+        stated = _scale_in(self._folder)
+        if stated is not None:
+            return stated
         if np.issubdtype(array.dtype, np.floating):
             return _Scale(1.0, "floats are taken as mm")
         if calibrated_mm is not None:
@@ -112,7 +112,7 @@ class FilesDepth:
     def _check(self, array: np.ndarray, file: Path) -> None:
         if self._only_type not in (None, array.dtype):
             raise InputError(
-                f"the depth file {file} holds {array.dtype}, the first one {self._only_type}: say what both are by "
+                f"the depth file {file} holds {array.dtype}, the first one {self._only_type}: set their kind by "
                 "depth.files_kind (disparity, depth or measured)"
             )
         geometry = self._rectifier.target if self._is_rectified else self._rectifier.source
@@ -133,7 +133,7 @@ class FilesDepth:
 def depth_files(folder: Path) -> dict[int, Path]:
     """Return the depth files of a folder by the last whole number in their names, in the order of the numbers.
 
-    Where some names say depth or disparity, the others are left out, as are names that say what else they hold
+    Where some names contain depth or disparity, the others are left out, as are names of other content
     (`*_color.*`, masks, normals). Raises `InputError` where there is none, or two have the same number.
     """
     if not folder.is_dir():
@@ -156,7 +156,7 @@ def depth_files(folder: Path) -> dict[int, Path]:
 
 
 def _read(file: Path) -> np.ndarray:
-    """Return (h, w) uint8, uint16 or floating; raises `InputError` for what is no depth image."""
+    """Return (h, w) uint8, uint16 or floating; raises `InputError` for other content."""
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False) if file.suffix.lower() == _NUMPY else _read_image(file)
     except (OSError, ValueError, EOFError) as error:
@@ -167,7 +167,7 @@ def _read(file: Path) -> np.ndarray:
     if array.ndim != 2 or not (array.dtype in (np.uint8, np.uint16) or np.issubdtype(array.dtype, np.floating)):
         raise InputError(
             f"the depth file {file} holds {array.dtype} of shape {array.shape}: expected one channel of 8 or 16 bit "
-            "or floats; a coloured picture of depth cannot be turned back into depth"
+            "or floats; a colour-mapped depth picture cannot be converted to depth"
         )
     return array
 
@@ -192,13 +192,13 @@ def _depth(array: np.ndarray, scale_mm: float) -> np.ndarray:
     return np.where(known, array * np.float32(scale_mm), np.nan).astype(np.float32)
 
 
-def _reach(array: np.ndarray) -> float:
+def _largest(array: np.ndarray) -> float:
     if np.issubdtype(array.dtype, np.integer):
         return float(np.iinfo(array.dtype).max - (array.dtype == np.uint16))  # 65535 is unknown
     return 2.0 * float(np.max(array, initial=0.0, where=np.isfinite(array)))
 
 
-def _scale_beside(folder: Path) -> _Scale | None:
+def _scale_in(folder: Path) -> _Scale | None:
     """Return the scale that a `depth.json` or `camera.yaml` in the folder states."""
     written, calibration = folder / "depth.json", folder / "camera.yaml"
     if written.exists():

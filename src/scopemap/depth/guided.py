@@ -25,7 +25,7 @@ def masked_mean(image: np.ndarray, known: np.ndarray, radius_px: int) -> np.ndar
     window = (2 * radius_px + 1, 2 * radius_px + 1)
     share = cv2.boxFilter(known.astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
     mean = cv2.boxFilter(np.where(known, image, 0).astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
-    # Running sums leave rounding noise where a window holds nothing: half a pixel's share tells the two apart.
+    # Running sums leave rounding noise where a window holds nothing: half a pixel's share is the threshold.
     occupied = share > 0.5 / (window[0] * window[1])
     return np.divide(mean, share, out=np.full_like(mean, np.nan), where=occupied)
 
@@ -34,7 +34,7 @@ def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: fl
     """Smooth an image with itself as guide: differences well below `edge` go, those well above stay.
 
     image : (H, W) float32.
-    known : (H, W) bool; other pixels have no say and come out NaN.
+    known : (H, W) bool; other pixels are ignored and NaN in the result.
     radius_px : radius of the window.
     edge : standard deviation within a window that counts as an edge, unit of the image.
 

@@ -4,8 +4,8 @@ METHOD section MAPIS-Depth, steps 5-8. The previous depth is warped into the cur
 blended with the current estimate by a weight from their perceptual distance. The paper's text trusts the warped depth
 where the images are alike, its equation does the reverse; `blend = "paper-equation"` is the latter, taken literally.
 
-Where the estimator says how certain it is, the odds of that weight are multiplied by the ratio of inverse variances: a
-pixel that was seen well and is now in glare keeps what was seen. Sigma is carried along as a share of depth.
+Where the estimator gives a standard deviation, the odds of that weight are multiplied by the ratio of inverse
+variances: a pixel with glare keeps its earlier depth. The standard deviation is propagated as a share of depth.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from scopemap.errors import check_shape
 from scopemap.geometry.uncertainty import blended_share, by_variance, faded_share, sigma_share
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 
-_LEAST_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
+_MIN_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
 
 
 @dataclass(frozen=True)
-class Correspondence:
-    """What links a frame to the one before it.
+class DenseCorrespondence:
+    """Dense correspondence of a frame with the previous one.
 
     Attributes
     ----------
-    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, where it can be trusted.
-    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant where one score was asked for.
-    usable_share : of the current image that shows tissue, so could be linked.
+    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, flow check passed.
+    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant for a single score.
+    usable_share : share of the current image that shows tissue.
     """
 
     to_previous: np.ndarray
@@ -48,9 +48,9 @@ class RefinedDepth:
 
     Attributes
     ----------
-    depth_mm : (H, W) float32, NaN = unknown. scale : factor that was put on the raw depth.
-    warped_share : share of the image that had a warped previous depth. sigma_mm : (H, W) float32, one standard
-    deviation of the depth, NaN = nothing is said.
+    depth_mm : (H, W) float32, NaN = unknown. scale : factor applied to the raw depth.
+    warped_share : share of the image with a warped previous depth. sigma_mm : (H, W) float32, one standard
+    deviation of the depth, NaN = unknown.
     """
 
     depth_mm: np.ndarray
@@ -60,14 +60,14 @@ class RefinedDepth:
 
 
 class _Carried(NamedTuple):
-    """What the next frame takes over: depth (H, W) mm and its sigma as a share of it, NaN = unknown."""
+    """Depth (H, W) mm for the next frame, and its standard deviation as a share of it, NaN = unknown."""
 
     depth_mm: np.ndarray
     share: np.ndarray
 
 
 class Mapis:
-    """Refines the raw depth of one frame after the other; `forget` cuts the chain after a lost frame."""
+    """Refines the raw depth of frames in order; `reset` starts a new chain after a lost frame."""
 
     def __init__(self, settings: MapisSettings) -> None:
         self.settings = settings
@@ -79,7 +79,7 @@ class Mapis:
         raw_mm: np.ndarray,
         kind: DepthKind,
         camera: PinholeCamera,
-        link: Correspondence | None,
+        link: DenseCorrespondence | None,
         T_current_previous: np.ndarray | None,
         *,
         sigma_mm: np.ndarray | None = None,
@@ -87,10 +87,9 @@ class Mapis:
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
-        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where nothing is said; `link` is
-        None for the first frame. With a motion the previous depth is moved by it; with None its values are carried
-        unchanged, as in the paper. A frame that was just `anchored` to a metric depth takes nothing from the past: the
-        chain of scales starts anew with it.
+        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where unknown; `link` is None for
+        the first frame. With a motion the previous depth is transformed by it; with None its values are warped
+        unchanged, as in the paper. A frame just `anchored` to a metric depth starts a new chain of scales.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         if anchored:
@@ -101,7 +100,7 @@ class Mapis:
         if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
             if link is not None and self._carried is not None:
-                self._scale = self._held(self._scale, overlap / max(link.usable_share, 1e-6))
+                self._scale = self._pulled_back(self._scale, overlap / max(link.usable_share, 1e-6))
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm, refined_share = scaled_mm, share
         blend = self._blend(kind)
@@ -116,21 +115,21 @@ class Mapis:
         return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
 
     def links(self, kind: DepthKind) -> bool:
-        """Return whether depth of this kind is compared with the frame before it at all."""
+        """Return whether depth of this kind is compared with the previous frame at all."""
         return self._scales(kind) or self._blend(kind) != "none"
 
-    def forget(self) -> None:
-        """Let the next frame start without a previous depth; the scale found last is held."""
+    def reset(self) -> None:
+        """Let the next frame start without a previous depth; the last scale is kept."""
         self._carried = None
 
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.advanced.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
-    def _held(self, scale: float, linked_share: float) -> float:
-        """Pull a chain of scales back to the estimator's own the more, the less of the tissue in view holds it.
+    def _pulled_back(self, scale: float, linked_share: float) -> float:
+        """Return the scale pulled back towards 1, the more the fewer pixels are linked to the previous frame.
 
-        The links' errors add up, and where tissue rushes by they have a sign: depth would grow or shrink without end.
+        Errors of chained scales accumulate, and fast motion biases them: depth would grow or shrink without limit.
         """
         return float(scale ** (1 - self.settings.advanced.scale_pull * max(1 - linked_share, 0.0) ** 2))
 
@@ -142,11 +141,11 @@ class Mapis:
     def _warped(
         self,
         camera: PinholeCamera,
-        link: Correspondence | None,
+        link: DenseCorrespondence | None,
         T_current_previous: np.ndarray | None,
         share: np.ndarray,
     ) -> _Carried:
-        """Bring what the frame before knew to the current one, whose own sigma is `share` of its depth."""
+        """Warp the previous depth and its uncertainty to the current frame, whose own relative sigma is `share`."""
         if link is None or self._carried is None:
             nothing = np.full((camera.height, camera.width), np.nan, np.float32)
             return _Carried(nothing, nothing)
@@ -173,11 +172,11 @@ class Mapis:
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:
-    """Return the median ratio of the warped to the raw depth, or `otherwise` where too little of both is known.
+    """Return the median ratio of warped to raw depth, or `otherwise` where they overlap too little.
 
-    Only a scale: chaining a shift from frame to frame diverges.
+    Only a scale is fitted: chaining a shift from frame to frame diverges.
     """
     both = np.isfinite(raw_mm) & np.isfinite(warped_mm) & (raw_mm > 0)
-    if both.mean() < _LEAST_OVERLAP:
+    if both.mean() < _MIN_OVERLAP:
         return otherwise
     return float(np.exp(np.median(np.log(warped_mm[both] / raw_mm[both]))))

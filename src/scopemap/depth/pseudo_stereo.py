@@ -35,19 +35,19 @@ class AffineDisparity:
         return cls(1 / (baseline_mm * focal_px), 0.0)
 
     def depth_mm(self, disparity: np.ndarray) -> np.ndarray:
-        """Return depth (same shape, float32, mm); NaN where disparity is NaN or lies at or beyond infinity."""
+        """Return depth (same shape, float32, mm); NaN where disparity is NaN or the depth is infinite or negative."""
         inverse = self.scale * np.asarray(disparity, dtype=np.float64) + self.shift
         return np.divide(1.0, inverse, out=np.full(inverse.shape, np.nan), where=inverse > 0).astype(np.float32)
 
     def sigma_mm(self, sigma: np.ndarray | None) -> np.ndarray | None:
-        """Return None: what a disparity's sigma means for depth hangs on a shift that is itself a guess."""
+        """Return None: the depth error of a disparity depends on its shift, which is uncertain."""
         return None
 
 
 def baseline_closed_form(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float) -> float:
     """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2: B = sum(D g) / sum(g g), g = f / d.
 
-    depth_mm, disparity : arrays of one shape; pixels that are not finite or have a disparity near 0 have no say.
+    depth_mm, disparity : arrays of one shape; pixels that are not finite or have a disparity near 0 are left out.
     Raises `InputError` if no pixel is left.
     """
     depth, disparity = _usable(depth_mm, disparity)
@@ -77,7 +77,7 @@ def fit_baseline_lbfgsb(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: f
 def fit_affine_disparity(depth_mm: np.ndarray, disparity: np.ndarray, max_depth_mm: float) -> AffineDisparity:
     """Fit 1 / D = scale * d + shift robustly (Huber weights, scale by the median deviation, on inverse depth).
 
-    depth_mm, disparity : arrays of one shape; pixels that are not finite and positive in depth have no say.
+    depth_mm, disparity : arrays of one shape; pixels without a finite positive depth are left out.
     max_depth_mm : the farthest pixel of the fit is kept at or before this depth, so that 1 / D stays positive.
 
     Raises `InputError` if fewer than two pixels are left, or disparity is constant or falls towards the camera.

@@ -2,7 +2,7 @@
 
 In endoscopy the lamp sits at the camera and is the only light, so brightness falls with the square of the distance
 along the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue turns away
-from the lamp the farther it lies down a lumen, which makes it darker still, and light bounces between the walls, which
+from the lamp the farther it is down a lumen, which makes it darker still, and light bounces between the walls, which
 makes it brighter: the exponent is therefore a setting, chosen on real frames (benchmarks/depth_without_download.py).
 """
 
@@ -38,7 +38,7 @@ class ShadingDepth:
     """Depth estimator: distance along the ray = k * brightness^-exponent; its z is the depth.
 
     k is fixed on the first usable frame, by the stated prior that the tissue's median distance there is
-    `settings.shading_median_mm`, and held from then on, so that depth shrinks as the camera approaches.
+    `settings.shading_median_mm`, and kept from then on, so that depth shrinks as the camera approaches.
     """
 
     name = "shading"

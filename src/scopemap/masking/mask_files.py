@@ -1,4 +1,4 @@
-"""Masks from files: what others know to be no tissue, instruments above all, one image per frame or one for all."""
+"""Masks from files: pixels that show no tissue, such as instruments; one image per frame, or one for all frames."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class MaskFiles:
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
 
-        Masked is what is not 0, in a JPEG what is above 127. Raises `InputError` for a file that is no image,
+        Masked are pixels other than 0, in a JPEG those above 127. Raises `InputError` for a file that is no image,
         `CalibrationError` for one of another aspect than the images.
         """
         if self._single is not None:
@@ -65,7 +65,7 @@ class MaskFiles:
         image = read_decoded(file)
         if image is None:
             raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
-        # An alpha channel is no part of what is drawn.
+        # The alpha channel is ignored.
         level = image if image.ndim == 2 else image[..., :3].max(-1)
         masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
         if self._grow_px > 0:
@@ -74,7 +74,7 @@ class MaskFiles:
         return masked > 0
 
     def provenance(self) -> dict[str, str]:
-        """Return the folder, how many masks it holds, and how many of the frames that were asked for have one."""
+        """Return the folder, how many masks it holds, and how many of the frames have one."""
         if self._single is not None:
             return {"masks": f"{self._single}, for all frames"}
         found = f"{len(self._files)} files in {self._folder}"
@@ -84,7 +84,7 @@ class MaskFiles:
 
     @property
     def warnings(self) -> list[str]:
-        """What to say where most frames have no mask; numbers that do not fit look just like that."""
+        """A warning where most frames have no mask, since wrong numbers in the names look the same."""
         missing = len(self._asked - set(self._files))
         if 2 * missing <= len(self._asked):
             return []

@@ -30,7 +30,7 @@ _CALM_WIDTH_PX = 5
 class Masker:
     """Narrows `Frame.valid` to usable tissue; the field of view is learnt from the frames it has seen so far.
 
-    files : masks of what is known to be no tissue, or None.
+    files : masks of pixels that show no tissue, or None.
     """
 
     def __init__(self, settings: MaskSettings, files: MaskFiles | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Text, logos and panels burned into the picture: what stays as it is, with sharp edges, while all else moves."""
+"""Overlays burned into the picture (text, logos, panels): sharp edges that stay in place while the scene moves."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Red tissue is dark in green: there white and black writing both stand out.
+# The green channel: red tissue is dark there, so both white and black text have contrast.
 _CHANNEL = 1
-# Whether the camera has moved is seen in a small copy without its local mean, in so many parts of it, levels of 255.
+# Camera motion is detected in a small copy without its local mean, divided into parts; grey levels of 255.
 _SMALL_SIDE_PX, _LOCAL_PX, _PARTS = 60, 9, (8, 6)
 _TEXTURE, _ALIKE, _LEAST_PARTS, _MOVED_SHARE = 1.0, 0.94, 12, 0.7
 _LEAST_COUNT, _MEMORY, _LOOK_EVERY = 12, 40, 4
-# What is an edge, levels of 255; which share of it may change, on average and in one image: coding changes it a little.
+# Edge threshold, grey levels; share of an edge that may change on average and in one image (video coding changes it).
 _EDGE, _STILL_SHARE, _NOW_SHARE = 40, 0.1, 0.25
 _RIM_PX, _CLOSING_PX, _GROW_PX, _LEAST_PX, _LARGEST_SHARE = 2, 5, 2, 6, 0.25
-# What lies so far around an edge that stays must change, levels of 255 without noise, or be of one colour, nearly all.
+# The surroundings of a static edge must change (grey levels after noise removal) or be uniform, nearly all of them.
 _CALM_PX, _NEAR_PX, _FAR_PX, _CHANGED, _PLAIN, _AROUND_SHARE = 5, 4, 8, 1.5, 2.0, 0.7
-# An overlay is gone where so much of its edges differs: half of their pixels are of what lies beside it.
+# An overlay has disappeared where this share of its edge pixels differs (half of them belong to the surroundings).
 _GONE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What was found at the last look.
+    """Overlays of the last detection.
 
-    mask : (H, W) bool. labels : (H, W) int32, its parts, from 1. edges : (N,) places in the flat image, of the edges
-    that stay. level, limit : (N,) float32, what was learnt of them, and how far they may be from it. of : (N,) part.
+    mask : (H, W) bool. labels : (H, W) int32, its components, from 1. edges : (N,) flat indices of static edge pixels.
+    level, limit : (N,) float32, their mean level and the tolerated deviation. of : (N,) component.
     """
 
     mask: np.ndarray
@@ -38,7 +38,7 @@ class _Found:
     of: np.ndarray
 
     def shown(self, level: np.ndarray) -> np.ndarray | None:
-        """Return which overlays are in this image, (H, W) bool: a menu may go while the camera rests."""
+        """Return the overlays present in this image, (H, W) bool: a menu may disappear while the camera is at rest."""
         differs = np.abs(level.ravel()[self.edges] - self.level) > self.limit
         if not differs.any():
             return self.mask
@@ -46,18 +46,17 @@ class _Found:
         gone = np.bincount(self.of, differs) > _GONE_SHARE * edges
         if not gone.any():
             return self.mask
-        gone[0] = True  # what is no part of the mask
+        gone[0] = True  # the background
         return None if gone[edges > 0].all() else ~gone[self.labels]
 
 
 class OverlayFinder:
-    """Learns from one image after the other, all of one size, which edges the camera's motion does not move.
+    """Detects static edges in a sequence of images of one size while the camera moves.
 
-    It keeps a running mean of the image and of how far each pixel is from it. Images count once the texture has changed
-    in most parts of the field since the last that counted, and an edge that stays counts only where what lies around it
-    does not: tissue at rest is no overlay, whether all of it rests or a part. Nothing is found before 12 images; what
-    was seen more than 40 ago fades. Overlays that one can see through, or whose own content changes all the time, are
-    not found.
+    It keeps a running mean of the image and of the absolute deviation from it. An image is used once the texture has
+    changed in most parts of the field since the last one used. A static edge is an overlay only where its surroundings
+    are not static, so tissue at rest is not masked. Nothing is found before 12 images; the memory is 40 images.
+    Transparent overlays, and overlays whose content changes all the time, are not found.
     """
 
     def __init__(self) -> None:
@@ -66,11 +65,11 @@ class OverlayFinder:
         self._mean, self._change, self._calm_change = self._last, self._last, self._last
         self._found: _Found | None = None
 
-    def __call__(self, rgb: np.ndarray, field: np.ndarray, beside: np.ndarray | None = None) -> np.ndarray | None:
-        """Return where overlays are, (H, W) bool; None where there are none, or too little has moved so far.
+    def __call__(self, rgb: np.ndarray, field: np.ndarray, outside: np.ndarray | None = None) -> np.ndarray | None:
+        """Return the overlays, (H, W) bool; None where there are none, or the camera has moved too little so far.
 
-        rgb : (H, W, 3) uint8. field : (H, W) bool, where tissue is seen, and overlays are looked for; its outermost
-        pixels are left out, as its rim stays. beside : (H, W) bool, where overlays are looked for, too.
+        rgb : (H, W, 3) uint8. field : (H, W) bool, field of view, searched without its static rim.
+        outside : (H, W) bool, searched too.
         """
         level = cv2.extractChannel(rgb, _CHANNEL)
         detail = _small_detail(level, field)
@@ -82,14 +81,14 @@ class OverlayFinder:
             self._last = detail
             self._learn(level)
             if self.count >= _LEAST_COUNT and self.count % _LOOK_EVERY == 0:
-                self._found = self._overlays(level, field if beside is None else field | beside)
+                self._found = self._overlays(level, field if outside is None else field | outside)
         return None if self._found is None else self._found.shown(level)
 
     def _learn(self, level: np.ndarray) -> None:
         self.count += 1
         weight = 1 / min(self.count, _MEMORY)
         now = level.astype(np.float32)
-        # The light of the whole picture going up and down is no change of what is seen.
+        # Changes of exposure are not changes of content.
         steady = now * (cv2.mean(self._mean)[0] / max(cv2.mean(level)[0], 1.0))
         calm = cv2.blur(steady - self._mean, (_CALM_PX, _CALM_PX))
         cv2.accumulateWeighted(np.abs(calm), self._calm_change, weight)
@@ -99,7 +98,7 @@ class OverlayFinder:
     def _overlays(self, level: np.ndarray, field: np.ndarray) -> _Found | None:
         contrast = cv2.morphologyEx(self._mean, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
         still = (contrast >= _EDGE) & (self._change <= _STILL_SHARE * contrast)
-        # What has just gone, a menu, must not be kept by the memory.
+        # An overlay that has just disappeared must not persist in the running mean.
         still &= cv2.absdiff(level.astype(np.float32), self._mean) <= _NOW_SHARE * contrast
         still &= cv2.erode(field.astype(np.uint8), _square(_RIM_PX), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
         if np.count_nonzero(still) < _LEAST_PX:
@@ -115,13 +114,13 @@ class OverlayFinder:
 
 
 def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Return a small copy less its local mean, float32, 0 outside the field: what stays of it when the light changes.
+    """Return a small copy minus its local mean, float32, 0 outside the field, so independent of illumination.
 
-    The mean is taken inside the field alone: else its rim would be detail, and stay.
+    The mean is taken inside the field only, else its static rim would count as detail.
     """
     factor = max(1, min(level.shape) // _SMALL_SIDE_PX)
     height, width = (side // factor for side in level.shape)
-    # A whole factor is several times as fast as any.
+    # An integer factor is several times faster.
     whole = level[: height * factor, : width * factor]
     small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     inside = field[factor // 2 :: factor, factor // 2 :: factor][:height, :width].astype(np.float32)
@@ -131,13 +130,10 @@ def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
 
 
 def _has_moved(before: np.ndarray, now: np.ndarray) -> bool:
-    """Whether most parts that have texture show another one, by correlation: a lamp that changes moves nothing.
-
-    An overlay fills few parts.
-    """
+    """Whether the texture of most parts has changed, by correlation, which is independent of illumination."""
     textured = _in_parts(np.abs(now)) >= _TEXTURE
     if np.count_nonzero(_in_parts(np.abs(before)) >= _TEXTURE) < _LEAST_PARTS:
-        # A black picture is not waited for to come back.
+        # After a black picture the next textured one counts.
         return bool(np.count_nonzero(textured) >= _LEAST_PARTS)
     textured &= _in_parts(np.abs(before)) >= _TEXTURE
     parts = np.count_nonzero(textured)
@@ -151,14 +147,11 @@ def _in_parts(values: np.ndarray) -> np.ndarray:
 
 
 def _stands_alone(still: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return where edges that stay, (H, W) bool, stay alone: around them nearly all is `other`, (H, W) bool.
-
-    That is: moving, or of one colour. What rests among pixels that rest may be tissue before a camera at rest.
-    """
+    """Return the static edges, (H, W) bool, whose surroundings are nearly all `other` (moving or uniform), bool."""
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
     near = cv2.dilate(closed, _square(_NEAR_PX))
     count, labels = cv2.connectedComponents(near)
-    # The largest label in reach: a pixel between two groups counts for one of them.
+    # The largest label within the radius: a pixel between two groups counts for one of them.
     around = cv2.dilate(labels.astype(np.float32), _square(_FAR_PX)).astype(np.int32)
     around[near > 0] = 0
     pixels = np.bincount(around.ravel(), minlength=count)
@@ -171,7 +164,7 @@ def _square(radius_px: int) -> np.ndarray:
 
 
 def _grown(still: np.ndarray) -> np.ndarray | None:
-    """Return edges (H, W) bool with the gaps between them, what they enclose, and a margin; specks are left out."""
+    """Return edges (H, W) bool with gaps closed, holes filled and a margin; specks are removed."""
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     found = np.zeros_like(closed)

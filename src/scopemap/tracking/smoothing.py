@@ -22,7 +22,7 @@ class Smoother(Protocol):
         """Return the smoothed pose (4, 4) of the newest frame, given its estimate (4, 4)."""
         ...
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Let the next pose start without a past: between it and the last one frames were lost."""
         ...
 
@@ -34,7 +34,7 @@ class NoSmoothing:
         """Return the pose unchanged."""
         return T_world_camera
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Do nothing: there is no past."""
 
 
@@ -47,7 +47,7 @@ class Wema:
         self._count = 0
 
     def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
-        """Return the smoothed pose; the first two, also after `forget`, have too short a past and stay as they are."""
+        """Return the smoothed pose; the first two, also after `reset`, have too short a past and stay as they are."""
         settings, past = self.settings, self._past
         smoothed = T_world_camera
         if len(past) == 2:
@@ -59,7 +59,7 @@ class Wema:
         self._count += 1
         return smoothed
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Let the next pose start without a past; s goes on growing."""
         self._past = []
 

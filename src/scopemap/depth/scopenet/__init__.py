@@ -1,1 +1,1 @@
-"""ScopeNet, the embedded depth network: what it is told (planes), the network, and the estimator around it."""
+"""ScopeNet, the embedded depth network: input planes, network, and estimator."""

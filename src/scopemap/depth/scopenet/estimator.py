@@ -1,6 +1,6 @@
 """ScopeNet behind the `DepthEstimator` contract: the weights that come with the package, or others of the same network.
 
-The network tells ln of the distance along the ray, which is what the lamp sees, and ln of the Laplace scale b of its
+The network estimates ln of the distance along the ray and ln of the Laplace scale b of its
 error. Depth is distance times the z of the unit ray. A Laplace distribution has the standard deviation sqrt(2) b; of a
 logarithm it is, to first order, the relative one of distance, and so of depth.
 """
@@ -35,8 +35,8 @@ class ScopeNetDepth:
 
     network : is changed: its batch normalisation goes into its convolutions.
     device : "auto", "cpu" or "cuda".
-    rays_known : whether the frames' camera is calibrated. False: the network is not told the directions of the rays,
-        as it was in part of its training; depth is still distance times the z of the assumed camera's ray.
+    rays_known : whether the frames' camera is calibrated. False: the network gets no ray directions, as in
+        part of its training; depth is still distance times the z of the assumed camera's ray.
     origin : where the weights came from, for the provenance.
     """
 
@@ -66,7 +66,7 @@ class ScopeNetDepth:
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth, mm, of the frame's size, with its standard deviation, mm; every pixel has both.
 
-        Masked pixels are told to the network as such; what it says there is a guess from around them.
+        The mask is an input plane; depth of masked pixels is extrapolated from their surroundings.
         """
         unit_rays = _unit_rays(frame.camera)
         planes = input_planes(frame.rgb, unit_rays if self._rays_known else None, frame.valid)
@@ -77,7 +77,7 @@ class ScopeNetDepth:
         return DepthEstimate(depth_mm, "depth", sigma=sigma_mm)
 
     def provenance(self) -> dict[str, str]:
-        """Return the name, which weights with their hash, and whether the rays were known to the network."""
+        """Return the name, the weights with their hash, and whether the rays were given."""
         return {"depth": self.name, **self._origin, "rays": "known" if self._rays_known else "assumed"}
 
     def _batch(self, planes: np.ndarray) -> Tensor:

@@ -35,7 +35,7 @@ class _Block(nn.Module):
 
 
 class _Context(nn.Module):
-    """Adds what the whole image says to every pixel."""
+    """Adds global image features to every pixel."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What the network is told of a frame: colour, brightness, ray directions and which pixels show tissue."""
+"""Input planes of the network: colour, brightness, ray directions and valid pixels."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarra
     """Return the network's input (8, H, W) float32.
 
     rgb : (H, W, 3) uint8, sRGB.
-    unit_rays : (H, W, 3) float32 directions of length 1, camera axes; None = unknown, told as zeros.
+    unit_rays : (H, W, 3) float32 directions of length 1, camera axes; None = unknown, zeros.
     valid : (H, W) bool, where usable tissue shows.
 
     Planes: red, green, blue (-0.5..0.5), ln of the linear brightness of red and green against the median of the valid
-    pixels (what the lamp's distance is read from, whatever the exposure), ray x, y, z, valid (0 or 1).
+    pixels (a cue for distance that does not depend on exposure), ray x, y, z, valid (0 or 1).
     """
     height, width = valid.shape
     check_shape("rgb", rgb, (height, width, 3))
