@@ -20,7 +20,8 @@ from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
 from scopemap.evaluation.depth import evaluate_depth
 from scopemap.evaluation.depth_sequence import depth_scale, scale_jitter
 from scopemap.evaluation.image_link import ImageLink, ImageLinker
-from scopemap.flow import DisFlow, pair_flow
+from scopemap.flow.consistency import pair_flow
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.warp import pull
 

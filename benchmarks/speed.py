@@ -21,7 +21,8 @@ import numpy as np
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
-from scopemap.flow import DisFlow, pair_flow
+from scopemap.flow.consistency import pair_flow
+from scopemap.flow.dis import DisFlow
 from scopemap.fusion import TsdfVolume
 from scopemap.io.opening import open_sequence
 from scopemap.phantom import PhantomSpec, write_phantom

@@ -12,8 +12,8 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
-from scopemap.flow import DisFlow
 from scopemap.flow.corners import corners, sampled_at
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.fusion import FrameSpool
 from scopemap.geometry.align import Similarity

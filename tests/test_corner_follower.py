@@ -12,7 +12,8 @@ from plane_scene import CAMERA
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence
-from scopemap.flow import CornerFollower, DisFlow
+from scopemap.flow.dis import DisFlow
+from scopemap.flow.follow import CornerFollower
 from scopemap.frame import Correspondences2D3D, Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.pipeline import Estimators, Pipeline

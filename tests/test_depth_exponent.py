@@ -17,8 +17,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.options import parse_settings
 from scopemap.cli.run import summary_lines
 from scopemap.config import Config, DepthSettings
-from scopemap.depth import create_depth, power_law
+from scopemap.depth import power_law
 from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.create import create_depth
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.power_law import (
     PairFit,

@@ -16,7 +16,8 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings
-from scopemap.depth import AnchoredDepth, create_anchor, create_depth
+from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.files import FilesDepth, depth_files
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
-from scopemap.flow import DisFlow
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.mapping import LARGEST_LOG_FACTOR, Backend, Correction
 from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid

@@ -18,7 +18,7 @@ from torch import nn
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import Config, DepthSettings
-from scopemap.depth import create_anchor, create_depth
+from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.scopenet import estimator as module
 from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth, folded, load_network
 from scopemap.depth.scopenet.network import ScopeNet

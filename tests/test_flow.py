@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 from torchvision.models.optical_flow import raft_large, raft_small
 
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.flow import DisFlow, NoFlow, RaftFlow, create_flow, pair_flow
-from scopemap.flow.consistency import agree
-from scopemap.flow.raft import torchvision_names
+from scopemap.flow.consistency import agree, pair_flow
+from scopemap.flow.create import create_flow
+from scopemap.flow.dis import DisFlow
+from scopemap.flow.none import NoFlow
+from scopemap.flow.raft import RaftFlow, torchvision_names
 from scopemap.geometry.warp import pull
 
 SHAPE = (140, 171)

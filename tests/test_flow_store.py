@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.benchmark.flow_store import FlowStore
-from scopemap.flow import DisFlow
+from scopemap.flow.dis import DisFlow
 
 
 class Counting(DisFlow):

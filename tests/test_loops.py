@@ -11,7 +11,7 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
-from scopemap.flow import DisFlow
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend

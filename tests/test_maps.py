@@ -17,7 +17,7 @@ from tiny_phantom import SIZE, true_poses, with_true_depth
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
-from scopemap.flow import DisFlow
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.align import Similarity

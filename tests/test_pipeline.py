@@ -18,7 +18,8 @@ from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth,
 
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.config import DepthSettings
-from scopemap.depth import AnchoredDepth, DepthEstimate
+from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError
 from scopemap.frame import Frame

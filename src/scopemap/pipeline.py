@@ -17,19 +17,16 @@ import numpy as np
 import trimesh
 
 from scopemap.config import Config, DepthSettings, FusionSettings
-from scopemap.depth import (
-    AnchoredDepth,
-    DepthEstimator,
-    DepthKind,
-    create_anchor,
-    create_depth,
-    files_folder,
-    max_depth_mm,
-)
+from scopemap.depth.anchor import AnchoredDepth, max_depth_mm
+from scopemap.depth.create import create_anchor, create_depth, files_folder
+from scopemap.depth.estimate import DepthEstimator, DepthKind
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
-from scopemap.flow import CornerFollower, FlowEstimator, create_flow, pair_flow
+from scopemap.flow.consistency import pair_flow
+from scopemap.flow.create import create_flow
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.follow import CornerFollower
 from scopemap.frame import Correspondences2D3D, Frame
 from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, described, follows_scene, with_sizes
 from scopemap.geometry.se3 import inverse

@@ -20,7 +20,7 @@ import numpy as np
 
 from scopemap.calibration.focal_length import with_focal_from_motion
 from scopemap.config import Config, FusionSettings
-from scopemap.depth import DepthEstimator
+from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
 from scopemap.io.sequence import Sequence

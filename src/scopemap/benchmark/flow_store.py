@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.flow import FlowEstimator, pair_flow
+from scopemap.flow.consistency import pair_flow
+from scopemap.flow.estimator import FlowEstimator
 
 _CONSISTENCY_PX = 1.0
 

@@ -47,7 +47,7 @@ from scopemap.config import Config, Preset, explain
 from scopemap.errors import InputError, ScopemapError, SettingsError
 from scopemap.evaluation.depth import DepthScaling
 from scopemap.evaluation.protocols import PROTOCOLS
-from scopemap.flow import FLOWS
+from scopemap.flow.create import FLOWS
 from scopemap.geometry.align import AlignMode
 from scopemap.io.opening import DATASETS
 from scopemap.phantom import PhantomSpec, parse_events

@@ -1,3 +1,4 @@
+<<<<<<< HEAD
 """Image to depth: estimators behind one protocol, chosen by name, and the anchor that makes them metric."""
 
 from __future__ import annotations
@@ -83,3 +84,6 @@ def _depth_pro(model: str, device: str) -> DepthEstimator:
     from scopemap.depth.depth_pro import DepthPro
 
     return DepthPro.from_folder_or_hub(model, device)
+=======
+"""Depth of one image: estimators behind one protocol (`create.py`), metric anchor, consistency over time (MAPIS)."""
+>>>>>>> 5f8a1ab (Packages depth and flow import nothing by themselves: factories in create.py)

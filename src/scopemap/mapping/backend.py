@@ -13,7 +13,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d

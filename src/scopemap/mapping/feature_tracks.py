@@ -11,8 +11,8 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow import FlowEstimator
 from scopemap.flow.corners import corners, followed
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
 from scopemap.mapping.bundle_adjustment import Points, Sightings

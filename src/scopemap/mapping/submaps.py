@@ -10,7 +10,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from scopemap.config import MappingSettings
-from scopemap.flow import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.pose_interpolation import Correction, TrackedPose

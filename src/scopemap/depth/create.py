@@ -1,0 +1,74 @@
+"""Creates the depth estimator and the metric anchor that the settings name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scopemap.cameras.rectification import Rectifier
+from scopemap.config import DepthSettings
+from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.estimate import DepthEstimator
+from scopemap.depth.files import FilesDepth
+from scopemap.depth.shading import ShadingDepth
+from scopemap.errors import SettingsError
+
+_FILES = "files:"
+
+
+def create_depth(
+    settings: DepthSettings,
+    rectifier: Rectifier,
+    device: str,
+    depth_scale_mm: float | None = None,
+    *,
+    calibrated: bool = True,
+) -> DepthEstimator:
+    """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
+
+    rectifier : from the camera that depth files show the view of to the working camera.
+    device : "auto", "cpu" or "cuda", for networks.
+    depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+    calibrated : whether the frames' camera is known; False: ScopeNet is not told the rays, which would mislead it.
+
+    Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
+    """
+    folder = files_folder(settings)
+    if folder is not None:
+        return FilesDepth(folder, rectifier, settings, depth_scale_mm)
+    if settings.backend == "shading":
+        return ShadingDepth(settings)
+    # Networks take seconds to import: only who asks for one waits.
+    if settings.backend == "scopenet":
+        from scopemap.depth.scopenet.estimator import ScopeNetDepth
+
+        return ScopeNetDepth.from_file(settings.model, device, rays_known=calibrated)
+    if settings.backend == "depth-pro":
+        return _depth_pro(settings.model, device)
+    if settings.backend == "depth-anything":
+        from scopemap.depth.depth_anything import DepthAnything
+
+        return DepthAnything.from_folder_or_hub(settings.model, device)
+    raise SettingsError(
+        f"unknown depth '{settings.backend}': choose scopenet, shading, depth-anything, depth-pro or files:FOLDER"
+    )
+
+
+def files_folder(settings: DepthSettings) -> Path | None:
+    """Return the folder that depth files come from, None where depth comes from elsewhere."""
+    return Path(settings.backend.removeprefix(_FILES)) if settings.backend.startswith(_FILES) else None
+
+
+def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
+    """Return the metric anchor of a sequence, with the estimator that it may have to ask.
+
+    Raises `SettingsError` where the range is missing or impossible, `WeightsError` where Depth Pro is asked for and
+    its weights are missing.
+    """
+    needs_network = settings.anchor == "depth-pro" and settings.backend != "depth-pro"
+    return AnchoredDepth(settings, _depth_pro("", device) if needs_network else ShadingDepth(settings))
+
+
+def _depth_pro(model: str, device: str) -> DepthEstimator:
+    from scopemap.depth.depth_pro import DepthPro
+
+    return DepthPro.from_folder_or_hub(model, device)
