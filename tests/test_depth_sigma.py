@@ -17,15 +17,9 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
 from scopemap.config.mapping import FusionAdvanced
-<<<<<<< HEAD
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
-=======
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.mapis import Correspondence, Mapis, RefinedDepth
->>>>>>> 5f8a1ab (Packages depth and flow import nothing by themselves: factories in create.py)
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume

@@ -28,7 +28,7 @@ def create_depth(
     rectifier : from the camera that depth files show the view of to the working camera.
     device : "auto", "cpu" or "cuda", for networks.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
-    calibrated : whether the frames' camera is known; False: ScopeNet is not told the rays, which would mislead it.
+    calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
 
     Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
     """
@@ -37,7 +37,7 @@ def create_depth(
         return FilesDepth(folder, rectifier, settings, depth_scale_mm)
     if settings.backend == "shading":
         return ShadingDepth(settings)
-    # Networks take seconds to import: only who asks for one waits.
+    # Networks take seconds to import, so they are imported when chosen.
     if settings.backend == "scopenet":
         from scopemap.depth.scopenet.estimator import ScopeNetDepth
 
@@ -59,9 +59,9 @@ def files_folder(settings: DepthSettings) -> Path | None:
 
 
 def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
-    """Return the metric anchor of a sequence, with the estimator that it may have to ask.
+    """Return the metric anchor of a sequence, with its reference estimator.
 
-    Raises `SettingsError` where the range is missing or impossible, `WeightsError` where Depth Pro is asked for and
+    Raises `SettingsError` where the range is missing or impossible, `WeightsError` where Depth Pro is chosen and
     its weights are missing.
     """
     needs_network = settings.anchor == "depth-pro" and settings.backend != "depth-pro"
