@@ -17,9 +17,9 @@ from scipy.stats import spearmanr
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher
 from scopemap.evaluation.depth import evaluate_depth
 from scopemap.evaluation.depth_sequence import depth_scale, scale_jitter
-from scopemap.evaluation.image_link import ImageLink, ImageLinker
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -272,13 +272,13 @@ def _fits(frames: Sequence[Frame], truths_mm: Sequence[np.ndarray], made: Sequen
     )
 
 
-def link_clip(frames: Sequence[Frame]) -> list[ImageLink | None]:
+def link_clip(frames: Sequence[Frame]) -> list[FrameCorrespondences | None]:
     """Return what the images alone tell of each frame and the one before it, by DIS flow; None for the first."""
-    linker, links, previous = ImageLinker(frames[0].camera), [], None
+    matcher, links, previous = FrameMatcher(frames[0].camera), [], None
     for frame in frames:
         flow = None if previous is None else pair_flow(DisFlow(), previous.rgb, frame.rgb, _CONSISTENCY_PX)
         known = (None, None) if flow is None else (flow.to_previous, flow.consistent)
-        links.append(linker.link(frame.rgb, frame.valid, *known))
+        links.append(matcher.match(frame.rgb, frame.valid, *known))
         previous = frame
     return links
 
@@ -287,7 +287,7 @@ def steadiness(
     camera: PinholeCamera,
     counted: Sequence[np.ndarray],
     depths_mm: Sequence[np.ndarray],
-    links: Sequence[ImageLink | None],
+    links: Sequence[FrameCorrespondences | None],
 ) -> Steadiness:
     """Return how steady depth (H, W) mm of consecutive frames is, over the pixels `counted` (H, W) bool."""
     meter, scales = ConsistencyMeter(camera), []

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sample_trajectories import as_trajectory, vector_a
 
 from scopemap.benchmark.published import PublishedTable, published_rows
 from scopemap.benchmark.result import RunResult
@@ -24,11 +25,12 @@ from scopemap.errors import InputError
 from scopemap.evaluation.consistency import ConsistencyMeter
 from scopemap.evaluation.depth import DepthReport
 from scopemap.evaluation.depth_sequence import scale_jitter
-from scopemap.evaluation.paper import PaperReport
-from scopemap.evaluation.poses import PoseReport
-from scopemap.evaluation.surface import DistanceSummary, compare_surfaces, surface_figures
+from scopemap.evaluation.paper import paper_figures
+from scopemap.evaluation.poses import PoseReport, match
+from scopemap.evaluation.surface import DistanceSummary, compare_surfaces
 
 NAN = float("nan")
+PAPER_FIGURES = paper_figures(match(*(as_trajectory(poses) for poses in vector_a()), "sim3"))
 FACTS = {"machine": "Linux x86_64, 2 cores", "commit": "abc1234", "versions": {"scopemap": "0.1.0", "numpy": "2.0"}}
 PUBLISHED: tuple[PublishedTable, ...] = ("table1_pose_scared", "table2_methods_scared", "table3_ablation_scared")
 
@@ -38,7 +40,7 @@ def run(sequence: str, method: str, ate_mm: float, **changes: Any) -> RunResult:
     poses = {"frames": 10, "tracked": changes.get("tracked", 10), "align": changes.get("align", "sim3"), "scale": 2.0}
     poses |= {"ate_rmse_mm": ate_mm, "tlr": changes.get("tlr", 1.0), "rotation_unaligned_mean_deg": 2 * ate_mm}
     poses |= {"rotation_unaligned_max_deg": 3 * ate_mm, "rpe_10_mm": NAN, "frames_until_loss": poses["tracked"]}
-    names = [field.name for field in fields(PaperReport) if not field.name.endswith(("_axes_mm", "_axes_rad", "_deg"))]
+    names = [name for name in PAPER_FIGURES if not name.endswith(("_axes_mm", "_axes_rad", "_deg"))]
     paper = {name: ate_mm * place for place, name in enumerate(names, start=1)}
     timing = {"ms_per_frame": changes.get("ms", 50.0), "seconds_read": 2.0, "seconds_total": 9.0}
     figures = {"poses": poses, "paper": paper}
@@ -187,8 +189,10 @@ def test_published_angles_are_radians_printed_as_degrees() -> None:
     worst = {"sequence": "S4", "framework": "BodySLAM"}
     assert cells(radians, **worst)[0]["R_max rad"] == "3.142"
     assert cells(degrees, **worst)[0]["R_max deg"] == "180.023"
-    assert cells(radians, framework="ours")[0]["R_avg rad"] == "**1.500 ± 2.000**"
-    assert cells(degrees, framework="ours")[0]["R_avg deg"] == f"**{math.degrees(1.5):.3f} ± {math.degrees(2):.3f}**"
+    mean, std = (RESULTS[0].figures["paper"][name] for name in ("r_avg_rad", "r_std_rad"))
+    assert cells(radians, framework="ours")[0]["R_avg rad"] == f"**{mean:.3f} ± {std:.3f}**"
+    in_degrees = f"**{math.degrees(mean):.3f} ± {math.degrees(std):.3f}**"
+    assert cells(degrees, framework="ours")[0]["R_avg deg"] == in_degrees
     assert "radians" in radians.caption
     assert "degrees" in degrees.caption
 
@@ -231,11 +235,11 @@ def test_without_the_papers_figures_there_are_no_tables_1_to_3() -> None:
 
 def test_every_column_names_a_figure_that_is_measured() -> None:
     plane = np.stack([*np.meshgrid(np.arange(5.0), np.arange(5.0)), np.zeros((5, 5))], axis=-1).reshape(-1, 3)
-    surface = surface_figures(compare_surfaces(plane, plane)) | {"normal_consistency": 1.0}
+    surface = compare_surfaces(plane, plane).figures | {"normal_consistency": 1.0}
     surface |= DistanceSummary.of(np.ones(3)).figures("accuracy_icp")
     measured: dict[str, Any] = {
         "poses": {field.name: 0 for field in fields(PoseReport)},
-        "paper": {field.name: 0 for field in fields(PaperReport)},
+        "paper": PAPER_FIGURES,
         "depth": {field.name: 0 for field in fields(DepthReport)} | {"jitter": asdict(scale_jitter(np.ones(3)))},
         "consistency": asdict(ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report()) | {"flow": "dis"},
         "surface": surface,

@@ -15,8 +15,8 @@ from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose,
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 from scopemap.evaluation.consistency import ConsistencyMeter, ConsistencyReport, DepthFrame
-from scopemap.evaluation.depth_change import alignment_errors, depth_change, looks_alike, mean_change, projected_depth
-from scopemap.evaluation.image_link import ImageLink, ImageLinker
+from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher, have_same_colour
+from scopemap.evaluation.depth_change import alignment_errors, depth_change, mean_change, projected_depth
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
 from scopemap.io.opening import open_sequence
 
@@ -27,10 +27,10 @@ TILTED_ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0), turn_rad=(0.0, 0.4, 0.
 WANDERING = [pose(at_mm=(k, -k, 0.5 * k), turn_rad=(0.02 * k, 0.03 * k, -0.05 * k)) for k in range(3)]
 
 
-def links(views: list[View], flow_sign: float = 1.0) -> list[ImageLink | None]:
-    linker = ImageLinker(CAMERA)
+def links(views: list[View], flow_sign: float = 1.0) -> list[FrameCorrespondences | None]:
+    matcher = FrameMatcher(CAMERA)
     flows = [None, *(flow_sign * true_flow(view, before) for before, view in itertools.pairwise(views))]
-    return [linker.link(view.rgb, EVERYWHERE, flow) for view, flow in zip(views, flows, strict=True)]
+    return [matcher.match(view.rgb, EVERYWHERE, flow) for view, flow in zip(views, flows, strict=True)]
 
 
 def measure(
@@ -117,7 +117,7 @@ def test_flow_of_the_wrong_sign_is_found_out() -> None:
     assert wrong.along_flow.mean_mm > 1
     # OPW looks at the pictures too: hardly a pixel finds its colour at the wrong place.
     views = [see(T) for T in poses]
-    shares = [np.mean(links(views, sign)[1].alike) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
+    shares = [np.mean(links(views, sign)[1].same_colour) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
     assert shares[0] > 0.95
     assert shares[1] < 0.3
 
@@ -137,9 +137,9 @@ def test_flicker_of_a_still_camera_has_its_closed_forms(e: float) -> None:
         assert change.relative == pytest.approx((2 * 2 * e / (1 - e) + 2 * e / (1 + e)) / 3, rel=1e-3)
         assert change.rtc == (1 if e < 0.005 else 0)
     assert report.tae_reference.percent == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
-    linker = ImageLinker(CAMERA)
-    linker.link(see(STILL[0]).rgb, EVERYWHERE)
-    link = linker.link(see(STILL[0]).rgb, EVERYWHERE)
+    matcher = FrameMatcher(CAMERA)
+    matcher.match(see(STILL[0]).rgb, EVERYWHERE)
+    link = matcher.match(see(STILL[0]).rgb, EVERYWHERE)
     assert link is not None
     from_camera = np.linalg.norm(CAMERA.unproject(link.matches.current_px), axis=1)
     assert report.orb_reference.mean_mm == pytest.approx(2 * e * PLANE_MM * from_camera.mean(), rel=1e-3)
@@ -181,9 +181,9 @@ def test_scale_serves_depth_and_estimated_poses_and_leaves_relative_figures() ->
 def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> None:
     frames = [DepthFrame(view.depth_mm, EVERYWHERE, view.T_world_camera) for view in map(see, ASIDE + ASIDE[:1])]
     frames[1] = replace(frames[1], T_world_camera=None)
-    meter, linker = ConsistencyMeter(CAMERA), ImageLinker(CAMERA)
+    meter, matcher = ConsistencyMeter(CAMERA), FrameMatcher(CAMERA)
     for frame, view in zip(frames, map(see, ASIDE + ASIDE[:1]), strict=True):
-        meter.add(frame, linker.link(view.rgb, EVERYWHERE))
+        meter.add(frame, matcher.match(view.rgb, EVERYWHERE))
     report = meter.report()
     assert (report.frames, report.pairs) == (4, 3)
     assert (report.tae_estimated.pairs, report.tae_reference.pairs) == (1, 0)
@@ -245,9 +245,9 @@ def test_flow_counts_only_where_it_is_trusted() -> None:
     depth_mm = np.tile(np.linspace(20, 60, CAMERA.width, dtype=np.float32), (CAMERA.height, 1))
     changes = []
     for trusted in (EVERYWHERE, np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)):
-        linker, meter = ImageLinker(CAMERA), ConsistencyMeter(CAMERA)
+        matcher, meter = FrameMatcher(CAMERA), ConsistencyMeter(CAMERA)
         for view in views:
-            link = linker.link(view.rgb, EVERYWHERE, nonsense, trusted)
+            link = matcher.match(view.rgb, EVERYWHERE, nonsense, trusted)
             meter.add(DepthFrame(depth_mm, EVERYWHERE), link)
         changes.append(meter.report().along_flow.mean_mm)
     assert changes[0] > 1
@@ -258,11 +258,11 @@ def test_images_must_have_the_same_colour_at_both_ends_of_the_flow() -> None:
     grey = np.full((4, 5, 3), 100, np.uint8)
     flow = np.zeros((4, 5, 2), np.float32)
     # |difference| of k in three channels of 0..1 is sqrt(3) k / 255; exp(-50 x) > 0.01 up to k = 13.56.
-    assert looks_alike(grey, grey + np.uint8(13), flow).all()
-    assert not looks_alike(grey, grey + np.uint8(14), flow).any()
+    assert have_same_colour(grey, grey + np.uint8(13), flow).all()
+    assert not have_same_colour(grey, grey + np.uint8(14), flow).any()
     flow[0, 0] = (0, -251)
     flow[1, 1] = (249, -249)
-    alike = looks_alike(grey, grey, flow)
+    alike = have_same_colour(grey, grey, flow)
     assert not alike[0, 0]
     assert np.count_nonzero(alike) == 19
 
@@ -270,13 +270,13 @@ def test_images_must_have_the_same_colour_at_both_ends_of_the_flow() -> None:
 def test_a_link_counts_neither_masked_features_nor_distrusted_flow() -> None:
     view = see(pose())
     left = np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)
-    linker = ImageLinker(CAMERA)
-    assert linker.link(view.rgb, left) is None
-    link = linker.link(view.rgb, left, np.zeros((*left.shape, 2), np.float32), left)
+    matcher = FrameMatcher(CAMERA)
+    assert matcher.match(view.rgb, left) is None
+    link = matcher.match(view.rgb, left, np.zeros((*left.shape, 2), np.float32), left)
     assert link is not None
     assert len(link.matches.current_px) > 50
     assert link.matches.current_px[:, 0].max() < 120
-    assert np.array_equal(link.alike, left)
+    assert np.array_equal(link.same_colour, left)
 
 
 # ---- the measures of one pair
@@ -328,10 +328,10 @@ def test_unusable_arguments_are_refused() -> None:
         ConsistencyMeter(CAMERA, 0.0)
     with pytest.raises(ValueError, match=r"DepthFrame.depth_mm"):
         ConsistencyMeter(CAMERA).add(DepthFrame(np.ones((3, 3)), EVERYWHERE))
-    linker = ImageLinker(CAMERA)
-    linker.link(see(pose()).rgb, EVERYWHERE)
+    matcher = FrameMatcher(CAMERA)
+    matcher.match(see(pose()).rgb, EVERYWHERE)
     with pytest.raises(ValueError, match="to_previous"):
-        linker.link(see(pose()).rgb, EVERYWHERE, np.zeros((3, 3, 2)))
+        matcher.match(see(pose()).rgb, EVERYWHERE, np.zeros((3, 3, 2)))
 
 
 # ---- real truth
@@ -340,12 +340,12 @@ def test_unusable_arguments_are_refused() -> None:
 @pytest.mark.real
 def test_true_depth_of_a_real_colon_is_consistent_and_flicker_shows(real_data: Path) -> None:
     sequence = open_sequence(real_data / "endoscopy" / "c3vd" / "trans_t1_a")
-    linker = ImageLinker(sequence.camera)
+    matcher = FrameMatcher(sequence.camera)
     meters = {flicker: ConsistencyMeter(sequence.camera) for flicker in (0.0, 0.02)}
     for number, (frame, truth) in enumerate(sequence):
         assert truth is not None
         assert truth.depth_mm is not None
-        link = linker.link(frame.rgb, frame.valid)
+        link = matcher.match(frame.rgb, frame.valid)
         for flicker, meter in meters.items():
             depth_mm = truth.depth_mm * np.float32(1 + flicker * (-1) ** number)
             meter.add(DepthFrame(depth_mm, frame.valid, None, truth.T_world_camera, truth.depth_mm), link)

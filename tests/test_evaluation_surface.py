@@ -11,14 +11,12 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scopemap.evaluation.point_to_mesh import distance_to_mesh
 from scopemap.evaluation.surface import (
     FScore,
     compare_surfaces,
-    distance_to_mesh,
     normal_consistency,
     oriented_samples,
-    report_of_nothing,
-    surface_figures,
     surface_points,
 )
 from scopemap.geometry.se3 import se3, so3_exp
@@ -80,7 +78,7 @@ def test_large_and_few_triangles() -> None:
 
 
 def test_parallel_planes_are_their_distance_apart() -> None:
-    lower = trimesh.creation.box(extents=(30, 30, 1e-6))
+    lower = trimesh.creation.box(extents=(12, 12, 1e-6))
     upper = lower.copy()
     upper.apply_translation([0, 0, 1.5])
     report = compare_surfaces(upper, lower)
@@ -105,12 +103,12 @@ def test_half_of_a_surface_is_accurate_but_not_complete() -> None:
 
 
 def test_concentric_spheres_and_points_against_a_mesh() -> None:
-    inner, outer = (trimesh.creation.icosphere(subdivisions=5, radius=radius) for radius in (20.0, 22.0))
-    assert compare_surfaces(inner, outer).chamfer_mm == pytest.approx(2.0, abs=0.02)
-    on_outer = surface_points(outer, seed=3)
-    assert compare_surfaces(on_outer, inner).accuracy.mean_mm == pytest.approx(2.0, abs=0.02)
+    inner, outer = (trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (20.0, 22.0))
+    assert compare_surfaces(inner, outer).chamfer_mm == pytest.approx(2.0, abs=0.03)
+    on_outer, others = (trimesh.sample.sample_surface(outer, 20_000, seed=seed)[0] for seed in (3, 4))
+    assert compare_surfaces(on_outer, inner).accuracy.mean_mm == pytest.approx(2.0, abs=0.04)
     # From point to point a spacing of half a millimetre shows up as error; to the mesh it does not.
-    assert 0.05 < compare_surfaces(on_outer, surface_points(outer, seed=4)).accuracy.mean_mm < 0.3
+    assert 0.05 < compare_surfaces(on_outer, others).accuracy.mean_mm < 0.3
     assert compare_surfaces(on_outer, outer).accuracy.mean_mm == pytest.approx(0, abs=1e-9)
 
 
@@ -145,9 +143,8 @@ def test_what_nobody_saw_is_not_asked_for() -> None:
     half = part(whole, seen)
     blind, informed = compare_surfaces(half, whole), compare_surfaces(half, whole, observed=half)
     assert blind.completeness.mean_mm > 3
-    assert not blind.observed_only
     assert math.isnan(blind.coverage_2mm)
-    assert informed.observed_only
+    assert math.isnan(blind.observed_share)
     assert informed.completeness.mean_mm == pytest.approx(0, abs=1e-9)
     assert informed.coverage_2mm == 1
     assert informed.observed_share == pytest.approx(half.area / whole.area)
@@ -156,9 +153,9 @@ def test_what_nobody_saw_is_not_asked_for() -> None:
 
 
 def test_coverage_is_the_share_of_the_observed_truth_within_two_millimetres() -> None:
-    whole = wavy_sheet(41, 1.0)
+    whole = wavy_sheet(21, 2.0)
     half = part(whole, whole.triangles_center[:, 0] < 20)
-    report = compare_surfaces(half, whole, observed=whole, thresholds_mm=(0.5,))
+    report = compare_surfaces(half, whole, observed=whole)
     assert report.coverage_2mm == pytest.approx(np.mean(distance_to_mesh(surface_points(whole), half) < 2))
     assert report.coverage_2mm == pytest.approx(0.5 + 2 / 40, abs=0.02)
     assert report.observed_share == 1
@@ -168,33 +165,33 @@ def test_coverage_is_the_share_of_the_observed_truth_within_two_millimetres() ->
 
 
 def test_figures_are_flat_and_named_by_threshold() -> None:
-    upper, lower = trimesh.creation.box(extents=(30, 30, 1e-6)), trimesh.creation.box(extents=(30, 30, 1e-6))
+    upper, lower = trimesh.creation.box(extents=(12, 12, 1e-6)), trimesh.creation.box(extents=(12, 12, 1e-6))
     upper.apply_translation([0, 0, 1.5])
-    figures = surface_figures(compare_surfaces(upper, lower, observed=lower, thresholds_mm=(1.0, 2.5)))
+    figures = compare_surfaces(upper, lower, observed=lower).figures
     distances = {
         f"{side}_{key}_mm" for side in ("accuracy", "completeness") for key in ("mean", "median", "rms", "p90")
     }
-    scores = {f"{key}_{limit}" for key in ("precision", "recall", "f") for limit in ("1mm", "2.5mm")}
+    scores = {f"{key}_{limit}" for key in ("precision", "recall", "f") for limit in ("1mm", "2mm", "5mm")}
     assert set(figures) == distances | scores | {"chamfer_mm", "coverage_2mm", "observed_share"}
     assert all(type(value) is float for value in figures.values())
     assert json.loads(json.dumps(figures)) == figures
     assert all(figures[key] == pytest.approx(1.5, abs=1e-5) for key in (*distances, "chamfer_mm"))
-    assert (figures["f_1mm"], figures["f_2.5mm"], figures["coverage_2mm"]) == (0, 1, 1)
+    assert (figures["f_1mm"], figures["f_2mm"], figures["coverage_2mm"]) == (0, 1, 1)
 
 
 def test_nothing_predicted_covers_nothing() -> None:
     truth = wavy_sheet(21, 1.0)
     left = part(truth, truth.triangles_center[:, 0] < 10)
-    figures = surface_figures(report_of_nothing(truth, observed=left))
-    assert set(figures) == set(surface_figures(compare_surfaces(truth, truth)))
+    figures = compare_surfaces(trimesh.Trimesh(), truth, observed=left).figures
+    assert set(figures) == set(compare_surfaces(truth, truth).figures)
     assert figures["observed_share"] == pytest.approx(left.area / truth.area)
     zero = {key for key, value in figures.items() if value == 0}
     assert zero == {"coverage_2mm"} | {f"{name}_{limit}mm" for name in ("recall", "f") for limit in (1, 2, 5)}
     assert sum(math.isnan(value) for value in figures.values()) == len(figures) - len(zero) - 1
-    assert math.isnan(surface_figures(report_of_nothing(truth))["coverage_2mm"])
+    assert math.isnan(compare_surfaces(np.empty((0, 3)), truth).coverage_2mm)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_exchanged_surfaces_exchange_accuracy_and_completeness_wherever_they_lie(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -211,7 +208,7 @@ def test_exchanged_surfaces_exchange_accuracy_and_completeness_wherever_they_lie
 
 
 def test_normals_of_tilted_planes_agree_by_the_cosine() -> None:
-    flat = trimesh.creation.box(extents=(30, 30, 1e-6))
+    flat = trimesh.creation.box(extents=(12, 12, 1e-6))
     tilted = flat.copy().apply_transform(se3(so3_exp(np.array([0.5, 0, 0])), np.zeros(3)))
     assert normal_consistency(flat, tilted) == pytest.approx(np.cos(0.5), abs=1e-3)
     flipped = flat.copy()

@@ -14,9 +14,9 @@ from tiny_phantom import write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.evaluation.surface import compare_surfaces, surface_figures
-from scopemap.evaluation.true_surface import SingleView, TrueSurface, measure_surface, read_true_surface
-from scopemap.evaluation.visibility import View, pixels_near, seen_samples, visible_from
+from scopemap.evaluation.surface import compare_surfaces
+from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
+from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, visible_from
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.datasets.c3vd import CAMERA
 from scopemap.io.opening import open_sequence
@@ -44,7 +44,7 @@ def write_coverage(path: Path, mesh: trimesh.Trimesh, seen: np.ndarray, corner: 
     return path
 
 
-def views_of(folder: Path) -> list[View]:
+def views_of(folder: Path) -> list[TrueView]:
     truths = [truth for _, truth in open_sequence(folder)]
     return [(t.T_world_camera, t.depth_mm) for t in truths]  # type: ignore[union-attr, misc]
 
@@ -102,7 +102,7 @@ def test_another_reader_agrees_on_what_c3vds_file_says(tmp_path: Path) -> None:
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "expected triangles"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1/1 2/1 4/1 3/1\n", "expected triangles"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 1 2 3\n", "expected triangles"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "expected lines"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "expected triangles"),
         ("v 0 0\nf 1/1 1/1 1/1\n", "expected lines"),
         ("v a b c\nf 1/1 1/1 1/1\n", "cannot read the true surface"),
         ("", "expected lines"),
@@ -180,7 +180,7 @@ def test_icp_is_a_second_number_and_leaves_the_first_alone() -> None:
     truth = TrueSurface(bowl(), np.ones(len(bowl().faces), bool))
     moved = bowl().apply_transform(se3(so3_exp(np.array([0.03, -0.02, 0.01])), np.array([0.2, -0.3, 1.5])))
     figures, without = measure_surface(moved, truth), measure_surface(moved, truth, icp=False)
-    assert surface_figures(compare_surfaces(moved, bowl(), observed=bowl())).items() <= without.items()
+    assert compare_surfaces(moved, bowl(), observed=bowl()).figures.items() <= without.items()
     assert {key: figures[key] for key in without} == without
     assert not any("icp" in key for key in without)
     assert figures["accuracy_mean_mm"] > 1
@@ -207,7 +207,7 @@ def scan() -> np.ndarray:
 
 def test_what_a_single_view_cannot_judge_is_left_out() -> None:
     points = scan()
-    truth = TrueSurface(points[np.isfinite(points[..., 0])], view=SingleView(np.eye(4)))
+    truth = TrueSurface(points[np.isfinite(points[..., 0])], T_view=np.eye(4))
     wall = trimesh.creation.box(extents=(130, 110, 1e-6)).apply_translation([0, 0, 50])
     behind = wall.copy().apply_translation([0, 0, 30])
     beside = trimesh.creation.icosphere(subdivisions=3, radius=5).apply_translation([60, 0, 40])
@@ -240,9 +240,8 @@ def test_a_scared_keyframe_is_read_from_its_map_and_from_its_cloud(tmp_path: Pat
     for folder in (mapped, cloud):
         truth = read_true_surface(folder)
         assert truth is not None
-        assert truth.view is not None
         assert truth.observed is truth.surface
-        np.testing.assert_array_equal(truth.view.T_world_camera, np.eye(4))
+        np.testing.assert_array_equal(truth.T_view, np.eye(4))
         np.testing.assert_allclose(np.asarray(truth.surface), expected, atol=1e-5)
     (cloud / "point_cloud.obj").write_text("v nan nan nan\n" * 4)
     with pytest.raises(InputError, match="all missing"):
@@ -270,7 +269,7 @@ def test_the_clouds_of_two_frames_of_c3vd_confirm_each_other(real_data: Path) ->
         assert z.min() > 0
         assert z.max() < 100.01
         clouds.append(points[z < 99.9])
-    truth = TrueSurface(clouds[0], view=SingleView(poses[0], reach_px=20))
+    truth = TrueSurface(clouds[0], T_view=poses[0], reach_px=20)
     # The clouds were taken from the middle of the image.
     assert 0.5 < pixels_near(clouds[0], CAMERA, poses[0], radius_px=20).mean() < 0.6
     inside = visible_from(clouds[1], CAMERA, poses[0])

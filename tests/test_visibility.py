@@ -72,7 +72,6 @@ def test_the_tolerance_is_a_share_of_the_depth() -> None:
     depth = np.full((128, 160), 50.0, np.float32)
     points = np.array([[0, 0, z] for z in (48.9, 49.1, 50.9, 51.1)])
     assert seen_samples(points, EYE, [(HERE, depth)]).tolist() == [False, True, True, False]
-    assert seen_samples(points, EYE, [(HERE, depth)], tolerance=0.1).all()
 
 
 def test_a_second_view_adds_and_never_takes_away_and_none_is_taken_once_all_is_seen() -> None:
@@ -97,22 +96,22 @@ def test_points_that_move_are_looked_for_where_they_are() -> None:
     assert seen_samples(wall, EYE, [(HERE, pushed)] * 2, moved=lambda number: where[number]).all()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_what_is_seen_does_not_depend_on_where_the_world_begins(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    points = rng.uniform([-40, -30, 20], [40, 30, 60], size=(500, 3))
+    points = rng.uniform([-40, -30, 20], [40, 30, 60], size=(3000, 3))
     depth = rng.uniform(20, 60, size=(128, 160)).astype(np.float32)
     W = se3(so3_exp(rng.normal(size=3)), rng.normal(scale=100, size=3))
-    here = seen_samples(points, EYE, [(HERE, depth)], tolerance=0.2)
-    there = seen_samples(transform(W, points), EYE, [(W, depth)], tolerance=0.2)
+    here = seen_samples(points, EYE, [(HERE, depth)])
+    there = seen_samples(transform(W, points), EYE, [(W, depth)])
     assert 20 < here.sum() < 480
     # A point may project onto the edge of two pixels.
     assert np.mean(here != there) <= 0.004
 
 
 def test_a_phantom_is_seen_where_no_tissue_cuts_the_line_of_sight() -> None:
-    spec = PhantomSpec(frames=40, width=SIZE[0], height=SIZE[1], seed=3)
+    spec = PhantomSpec(frames=12, width=SIZE[0], height=SIZE[1], seed=3)
     phantom = prepare(spec)
     volume = phantom.scene.volume
     whole = surface_mesh(volume, np.ones(volume.coefficients.shape, bool))

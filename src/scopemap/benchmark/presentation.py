@@ -21,8 +21,8 @@ from scopemap.benchmark.summary import Summary, summarise
 from scopemap.benchmark.tables import write_tables
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
-from scopemap.evaluation.image_link import ImageLinker
-from scopemap.evaluation.orb import displacements
+from scopemap.evaluation.correspondences import FrameMatcher
+from scopemap.evaluation.displacement import displacements
 from scopemap.evaluation.poses import MatchedTrajectories, match
 from scopemap.frame import Frame, Truth
 from scopemap.geometry.align import AlignMode
@@ -191,9 +191,9 @@ def _two_frames(sequence: str, rows: Sequence[Shown], frames: Frames, folder: Pa
     draw_depth_differences([scene], file)
     yield file
     poses = _poses(true_previous, true_current)
-    linker = ImageLinker(frames.camera)
-    linker.link(previous.rgb, previous.valid)
-    link = linker.link(current.rgb, current.valid)
+    matcher = FrameMatcher(frames.camera)
+    matcher.match(previous.rgb, previous.valid)
+    link = matcher.match(current.rgb, current.valid)
     if poses is None or link is None:
         return
     found = {method: displacements(link.matches, *maps, frames.camera, poses) for method, maps in depths.items()}

@@ -16,10 +16,10 @@ from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.correspondences import FrameMatcher
 from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthScaling
 from scopemap.evaluation.depth_sequence import DepthPairs, evaluate_depth_sequence, fit_sequence
-from scopemap.evaluation.image_link import ImageLinker
-from scopemap.evaluation.paper import paper_report
+from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
 from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
@@ -75,7 +75,7 @@ def pose_groups(
         matched = _matched(estimate, reference, align) or _matched(estimate, reference, "origin")
     if matched is None or reference is None:
         return figures, None
-    figures |= {"poses": asdict(pose_report(matched)), "paper": asdict(paper_report(matched))}
+    figures |= {"poses": asdict(pose_report(matched)), "paper": paper_figures(matched)}
     return figures | _by_protocols(estimate, reference, protocol.protocols), matched
 
 
@@ -125,7 +125,7 @@ def surface_figures_of(
     except Exception as error:  # the readers of mesh files raise whatever their parsers raise
         raise InputError(f"cannot read the mesh {file}: {error}") from error
     camera = None
-    if true_surface.view is not None:
+    if true_surface.T_view is not None:
         camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera
     return measure_surface(moved, true_surface, camera=camera, icp=icp)
 
@@ -134,7 +134,7 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
     surface = read_true_surface(sequence.path)
     every = sequence.selection == slice(None)
     # What a data set calls seen holds for its whole clip.
-    if surface is None or (surface.seen is not None and every) or surface.view is not None:
+    if surface is None or (surface.seen is not None and every) or surface.T_view is not None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
     chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MOST_VIEWS))]}
@@ -208,7 +208,7 @@ def _consistency(
     """Measure depth over time; where depth has a truth it is brought to its scale first, one factor for all frames."""
     scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
-    linker, meter = ImageLinker(camera), ConsistencyMeter(camera, scale)
+    matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
     flow = FlowStore(estimator, None if flows is None else flows / estimator.name)
     poses = dict(zip(estimate.indices.tolist(), range(len(estimate)), strict=True))
@@ -217,7 +217,7 @@ def _consistency(
         # Highlights move with the lamp, and what lies outside the field of view is no tissue: the same mask for all.
         valid = masker(frame).valid
         found = (None, None) if before is None else flow.to_previous(frame.index, before, frame.rgb)
-        link = linker.link(frame.rgb, valid, *found)
+        link = matcher.match(frame.rgb, valid, *found)
         before = frame.rgb
         depth_mm = depth.read(frame.index)
         row = poses.get(frame.index)

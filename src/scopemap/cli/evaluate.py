@@ -109,7 +109,7 @@ def evaluate(
     """
     if as_json and as_csv:
         raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
-    from scopemap.evaluation.paper import paper_report
+    from scopemap.evaluation.paper import paper_figures
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.io.datasets.reference import read_reference
     from scopemap.trajectory.formats.opening import read_trajectory
@@ -125,7 +125,7 @@ def evaluate(
     matched = match(estimate, reference, align.value, first=align_first)
     figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
     if paper_units:
-        figures["paper"] = asdict(paper_report(matched))
+        figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
     if depth or consistency:
         figures |= _depths(trajectory, truth, depth, consistency=consistency)

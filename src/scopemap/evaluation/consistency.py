@@ -1,44 +1,40 @@
-"""Depth's consistency in time, frame by frame: one frame in memory, the same flow and matches for every method.
+"""Temporal consistency of depth, frame by frame, with the same flow and matches for every method.
 
-What the images alone tell of a pair of frames is an `ImageLink`; make it once and hand it to the meter of every method:
-
-    linker, meters = ImageLinker(camera), {name: ConsistencyMeter(camera) for name in methods}
+    matcher, meters = FrameMatcher(camera), {name: ConsistencyMeter(camera) for name in methods}
     for each frame:
-        link = linker.link(rgb, valid, to_previous, consistent)
+        found = matcher.match(rgb, valid, to_previous, consistent)
         for name, meter in meters.items():
-            meter.add(DepthFrame(depth_mm[name], valid, T_world_camera=..., T_reference_camera=...), link)
+            meter.add(DepthFrame(depth_mm[name], valid, T_world_camera=..., T_reference_camera=...), found)
     reports = {name: meter.report() for name, meter in meters.items()}
 
-The measures are in `depth_change.py` (TAE, OPW, rTC, differences), `orb.py` (the paper's displacement) and
-`depth_sequence.py` (scale jitter). Each that needs poses is given with reference and with estimated poses, apart. Depth
-that is steady need not be right: constant depth is perfect in all that has no poses. Read them beside depth errors.
+The measures are in `depth_change` (TAE, OPW, rTC, differences), `displacement` (the paper's ORB displacement) and
+`depth_sequence` (scale jitter). Each measure that needs poses is reported for reference and for estimated poses. Steady
+depth may be wrong: constant depth is perfect in all measures without poses. Read them beside depth errors.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError, check_shape
+from scopemap.evaluation.correspondences import FrameCorrespondences
 from scopemap.evaluation.depth_change import DepthChange, alignment_errors, depth_change, mean_change, seen_from
 from scopemap.evaluation.depth_sequence import ScaleJitter, depth_scale, scale_jitter
-from scopemap.evaluation.image_link import ImageLink
-from scopemap.evaluation.orb import DisplacementSummary, displacements
+from scopemap.evaluation.displacement import DisplacementSummary, displacements
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.geometry.warp import pull
 
-Poses = Literal["reference", "estimated"]
-_POSES: tuple[Poses, ...] = ("reference", "estimated")
+_POSES = ("reference", "estimated")
 _CHANGES = ("same_pixel", "along_flow", "opw", "opw_reference", "opw_estimated")
 
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """One method's depth of one frame, and what is known of the camera.
+    """One method's depth of one frame, and the poses that are known.
 
     Attributes
     ----------
@@ -57,11 +53,19 @@ class DepthFrame:
 
 
 @dataclass(frozen=True)
-class AlignmentError:
-    """TAE in percent of depth, the mean over both directions of all pairs, and how many pairs could be measured."""
+class TemporalAlignmentError:
+    """TAE in percent of depth, the mean over both directions of all pairs, and the number of measurable pairs."""
 
     pairs: int
     percent: float
+
+    @classmethod
+    def of(cls, errors: list[tuple[float, float]]) -> TemporalAlignmentError:
+        """Summarise the two errors of each pair of frames (`alignment_errors`)."""
+        table = np.array(errors, dtype=np.float64).reshape(-1, 2)
+        known = np.isfinite(table)
+        percent = 100 * float(table[known].mean()) if known.any() else float("nan")
+        return cls(int(known.any(axis=1).sum()), percent)
 
 
 @dataclass(frozen=True)
@@ -73,12 +77,12 @@ class ConsistencyReport:
     frames, pairs : frames added, and pairs of consecutive ones.
     scale : factor applied to depth and to estimated translations before anything in mm.
     jitter : of the factor to the true depth.
-    same_pixel : |D_t - D_{t-1}| at the same pixel; holds the camera's motion, too.
+    same_pixel : |D_t - D_{t-1}| at the same pixel; includes the camera's motion.
     along_flow : the same along the flow, wherever the flow is trusted.
-    opw : along the flow where the images moreover have the same colour; its `rtc` is rTC. Holds true change of depth.
+    opw : along the flow where the images moreover have the same colour; its `rtc` is rTC. Includes true changes.
     opw_reference, opw_estimated : the same after moving the current depth into the previous camera by these poses.
     tae_reference, tae_estimated : TAE by these poses. The public protocol is `reference`.
-    orb_camera : ORB displacement between points in their own cameras; holds the camera's motion, too.
+    orb_camera : ORB displacement between points in their own cameras; includes the camera's motion.
     orb_reference, orb_estimated : ORB displacement in the world, by these poses.
     """
 
@@ -91,54 +95,67 @@ class ConsistencyReport:
     opw: DepthChange
     opw_reference: DepthChange
     opw_estimated: DepthChange
-    tae_reference: AlignmentError
-    tae_estimated: AlignmentError
+    tae_reference: TemporalAlignmentError
+    tae_estimated: TemporalAlignmentError
     orb_camera: DisplacementSummary
     orb_reference: DisplacementSummary
     orb_estimated: DisplacementSummary
 
 
 @dataclass(frozen=True)
-class _Scaled:
-    """A frame ready for measuring: depth (H, W) float32 in mm with NaN wherever it does not count, poses in mm."""
+class _Measured:
+    """A frame ready for measuring: depth (H, W) float32, mm, NaN where it does not count; poses by name, mm."""
 
     depth_mm: np.ndarray
-    poses: dict[Poses, np.ndarray]
+    poses: dict[str, np.ndarray]
 
 
 class ConsistencyMeter:
-    """Measures one method's depth as its frames come; keeps the previous frame and a few numbers per match.
+    """Measures one method's depth frame by frame; keeps the previous frame and a few numbers per match.
 
     Parameters
     ----------
     camera : of all frames.
     scale : factor on depth and on the translation of estimated poses (both share the method's unit), so that figures
         in mm of methods with different scales compare; such as the `scale` of `fit_sequence`. Where a shift belongs to
-        it, hand in depth that `DepthFit.apply` has been through. Raises `SettingsError` unless it is positive.
+        it, pass depth that `DepthFit.apply` has been applied to. Raises `SettingsError` unless it is positive.
     """
 
     def __init__(self, camera: PinholeCamera, scale: float = 1.0) -> None:
         if not (np.isfinite(scale) and scale > 0):
             raise SettingsError(f"scale of depth is {scale}: give a positive number")
         self._camera, self._scale = camera, scale
-        self._previous: _Scaled | None = None
+        self._previous: _Measured | None = None
         self._scales: list[float] = []
         self._changes: defaultdict[str, list[DepthChange]] = defaultdict(list)
-        self._alignments: defaultdict[Poses, list[tuple[float, float]]] = defaultdict(list)
-        self._displacements: defaultdict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
+        self._alignments: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._displacements: defaultdict[str, list[np.ndarray]] = defaultdict(list)
 
-    def add(self, frame: DepthFrame, link: ImageLink | None = None) -> None:
+    def add(self, frame: DepthFrame, found: FrameCorrespondences | None = None) -> None:
         """Measure the next frame against the one added before it.
 
-        `link` is between just these two frames, None at the first. Where it is None later on, flow and ORB have nothing
-        to say of this pair; the rest is measured.
+        `found` are the correspondences of these two frames, None at the first. Where it is None later on, the pair has
+        no measure along flow and no ORB displacement; the rest is measured.
         """
-        current = self._scaled(frame)
-        truth = frame.true_depth_mm
+        current, truth = self._scaled(frame), frame.true_depth_mm
         self._scales.append(float("nan") if truth is None else depth_scale(current.depth_mm, truth))
-        if self._previous is not None:
-            self._measure(self._previous, current, link)
-        self._previous = current
+        previous, self._previous = self._previous, current
+        if previous is None:
+            return
+        common = [name for name in _POSES if name in previous.poses and name in current.poses]
+        motions = {name: inverse(current.poses[name]) @ previous.poses[name] for name in common}
+        self._changes["same_pixel"].append(depth_change(previous.depth_mm, current.depth_mm))
+        for name, motion in motions.items():
+            errors = alignment_errors(previous.depth_mm, current.depth_mm, self._camera, motion)
+            self._alignments[name].append(errors)
+        self._measure_matches(previous, current, found)
+        if found is not None and found.to_previous is not None:
+            before_mm = pull(previous.depth_mm, found.to_previous)
+            self._changes["along_flow"].append(depth_change(before_mm, current.depth_mm, found.consistent))
+            self._changes["opw"].append(depth_change(before_mm, current.depth_mm, found.same_colour))
+            for name, motion in motions.items():
+                moved_mm = seen_from(current.depth_mm, self._camera, inverse(motion))
+                self._changes[f"opw_{name}"].append(depth_change(before_mm, moved_mm, found.same_colour))
 
     def report(self) -> ConsistencyReport:
         """Return the figures of all frames added so far."""
@@ -149,20 +166,20 @@ class ConsistencyMeter:
             scale=self._scale,
             jitter=scale_jitter(np.array(self._scales)),
             **changes,
-            tae_reference=self._alignment("reference"),
-            tae_estimated=self._alignment("estimated"),
-            orb_camera=self._displacement("camera"),
-            orb_reference=self._displacement("reference"),
-            orb_estimated=self._displacement("estimated"),
+            tae_reference=TemporalAlignmentError.of(self._alignments["reference"]),
+            tae_estimated=TemporalAlignmentError.of(self._alignments["estimated"]),
+            orb_camera=DisplacementSummary.of(self._displacements["camera"]),
+            orb_reference=DisplacementSummary.of(self._displacements["reference"]),
+            orb_estimated=DisplacementSummary.of(self._displacements["estimated"]),
         )
 
-    def _scaled(self, frame: DepthFrame) -> _Scaled:
+    def _scaled(self, frame: DepthFrame) -> _Measured:
         size = (self._camera.height, self._camera.width)
         check_shape("DepthFrame.depth_mm", frame.depth_mm, size)
         check_shape("DepthFrame.valid", frame.valid, size)
         counts = frame.valid & np.isfinite(frame.depth_mm) & (frame.depth_mm > 0)
         depth_mm = np.where(counts, self._scale * frame.depth_mm, np.nan).astype(np.float32)
-        poses: dict[Poses, np.ndarray] = {}
+        poses: dict[str, np.ndarray] = {}
         if frame.T_reference_camera is not None:
             poses["reference"] = frame.T_reference_camera
         if frame.T_world_camera is not None:
@@ -170,54 +187,15 @@ class ConsistencyMeter:
             poses["estimated"] = se3(T[:3, :3], self._scale * T[:3, 3])
         for T in poses.values():
             check_shape("DepthFrame pose", T, (4, 4))
-        return _Scaled(depth_mm, poses)
+        return _Measured(depth_mm, poses)
 
-    def _measure(self, previous: _Scaled, current: _Scaled, link: ImageLink | None) -> None:
-        self._changes["same_pixel"].append(depth_change(previous.depth_mm, current.depth_mm))
-        motions: dict[Poses, np.ndarray] = {}
-        for name in _shared_poses(previous, current):
-            motions[name] = inverse(current.poses[name]) @ previous.poses[name]
-            errors = alignment_errors(previous.depth_mm, current.depth_mm, self._camera, motions[name])
-            self._alignments[name].append(errors)
-        self._measure_matches(previous, current, link)
-        if link is not None and link.to_previous is not None:
-            self._measure_flow(previous, current, link, motions)
-
-    def _measure_flow(
-        self, previous: _Scaled, current: _Scaled, link: ImageLink, motions: dict[Poses, np.ndarray]
-    ) -> None:
-        assert link.to_previous is not None
-        before = pull(previous.depth_mm, link.to_previous)
-        self._changes["along_flow"].append(depth_change(before, current.depth_mm, link.consistent))
-        self._changes["opw"].append(depth_change(before, current.depth_mm, link.alike))
-        for name, T_current_previous in motions.items():
-            moved = seen_from(current.depth_mm, self._camera, inverse(T_current_previous))
-            self._changes[f"opw_{name}"].append(depth_change(before, moved, link.alike))
-
-    def _measure_matches(self, previous: _Scaled, current: _Scaled, link: ImageLink | None) -> None:
-        pairs: dict[str, tuple[np.ndarray, np.ndarray] | None] = {"camera": None}
-        pairs |= {
-            n: (previous.poses[n], current.poses[n]) for n in _POSES if n in previous.poses and n in current.poses
-        }
+    def _measure_matches(self, previous: _Measured, current: _Measured, found: FrameCorrespondences | None) -> None:
         for name in ("camera", *_POSES):
             # A pair without matches or poses keeps its place, so that pair k stays pair k in every figure.
-            measured = (np.empty(0, np.float32), np.empty(0, np.float32))
-            if link is not None and name in pairs:
-                found = displacements(link.matches, previous.depth_mm, current.depth_mm, self._camera, pairs[name])
-                measured = (found.displacement_mm.astype(np.float32), found.relative.astype(np.float32))
+            measured = np.empty((2, 0), np.float32)
+            has_poses = name in previous.poses and name in current.poses
+            if found is not None and (has_poses or name == "camera"):
+                poses = (previous.poses[name], current.poses[name]) if has_poses else None
+                ends = displacements(found.matches, previous.depth_mm, current.depth_mm, self._camera, poses)
+                measured = np.stack([ends.displacement_mm, ends.relative]).astype(np.float32)
             self._displacements[name].append(measured)
-
-    def _alignment(self, poses: Poses) -> AlignmentError:
-        errors = np.array(self._alignments[poses], dtype=np.float64).reshape(-1, 2)
-        known = np.isfinite(errors)
-        percent = 100 * float(errors[known].mean()) if known.any() else float("nan")
-        return AlignmentError(int(known.any(axis=1).sum()), percent)
-
-    def _displacement(self, name: str) -> DisplacementSummary:
-        rows = self._displacements[name]
-        return DisplacementSummary.of([row[0] for row in rows], [row[1] for row in rows])
-
-
-def _shared_poses(previous: _Scaled, current: _Scaled) -> list[Poses]:
-    """Return the kinds of pose that both frames have."""
-    return [name for name in _POSES if name in previous.poses and name in current.poses]

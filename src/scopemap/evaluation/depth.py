@@ -1,8 +1,7 @@
 """Depth maps against true depth: the field's standard errors, per image, and their mean over images.
 
 Definitions: Eigen, Puhrsch and Fergus, "Depth map prediction from a single image", NeurIPS 2014, section 4.2; average
-over images, not over pixels, as AF-SfMLearner and EndoDAC report it. Whole sequences, and scales that are found over
-them, are in `depth_sequence.py`.
+over images, not over pixels, as AF-SfMLearner and EndoDAC report it. Whole sequences are in `depth_sequence`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from scopemap.errors import SettingsError, check_shape
 ImageScaling = Literal["none", "median", "scale-and-shift"]
 DepthScaling = Literal["none", "median", "scale-and-shift", "sequence-median", "sequence-scale-and-shift"]
 """How a prediction is scaled first. Per image: factor median(g) / median(d), or least squares of scale and shift in
-disparity. Per sequence: the same, found once over the pixels of all frames."""
+disparity. Per sequence: the same over the pixels of all frames."""
 
 DEPTH_RANGES_MM: dict[str, tuple[float, float]] = {
     "scared": (1e-3, 150.0),  # AF-SfMLearner and EndoDAC, evaluate_depth.py
@@ -30,16 +29,18 @@ DEPTH_RANGES_MM: dict[str, tuple[float, float]] = {
 
 # Video-Depth-Anything floors fitted disparity at 1e-3 per metre: no pixel is farther than a kilometre.
 _LEAST_DISPARITY_PER_MM = 1e-6
+# A variance below this share of the squared mean is rounding of the sums.
+_LEAST_VARIATION = 1e-12
 
 
 @dataclass(frozen=True)
 class DepthFit:
-    """What is applied to a prediction d (mm): 1 / d' = 1 / (scale d) + shift. The default leaves it as it is.
+    """Scale and shift of a prediction d (mm): 1 / d' = 1 / (scale d) + shift. The default changes nothing.
 
     Attributes
     ----------
     scaling : how it was found.
-    scale : factor on the depth; infinite where least squares found nothing of the prediction in the truth.
+    scale : factor on the depth; infinite where least squares found no correlation with the truth.
     shift_per_mm : added to the disparity, 1/mm; not 0 under scale-and-shift only.
     """
 
@@ -106,23 +107,32 @@ def evaluate_depth(
         fit found elsewhere, such as that of a whole sequence. Raises `SettingsError` for another name.
     truth_range_mm : see `DEPTH_RANGES_MM`.
     clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and
-        Video-Depth-Anything do. Far pixels of a shifted prediction own the mean without it.
+        Video-Depth-Anything do. Without it the far pixels of a shifted prediction dominate the mean.
     """
     d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
     coverage = len(d) / max(known, 1)
     fit = scaling if isinstance(scaling, DepthFit) else _fit(d, g, scaling)
     if len(d) == 0:
         return DepthReport(fit.scaling, 0, coverage, *[float("nan")] * 10)
-    scaled = fit.apply(d)
+    d = fit.apply(d)
     if clip_prediction:
-        scaled = np.clip(scaled, *truth_range_mm)
-    return DepthReport(fit.scaling, len(d), coverage, fit.scale, fit.shift_per_mm, *_errors(scaled, g))
+        d = np.clip(d, *truth_range_mm)
+    difference, ratio = d - g, np.maximum(d / g, g / d)
+    errors = [
+        np.mean(np.abs(difference) / g),
+        np.mean(difference**2 / g),
+        np.sqrt(np.mean(difference**2)),
+        np.sqrt(np.mean(np.log(d / g) ** 2)),
+        np.mean(np.abs(difference)),
+        *(np.mean(ratio < 1.25**k) for k in (1, 2, 3)),
+    ]
+    return DepthReport(fit.scaling, len(d), coverage, fit.scale, fit.shift_per_mm, *map(float, errors))
 
 
 def compared_depths(
     predicted_mm: np.ndarray, truth_mm: np.ndarray, truth_range_mm: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return prediction and truth (N,) float64, mm, where both can be compared, and how many true depths there are.
+    """Return prediction and truth (N,) float64, mm, of the comparable pixels, and the number of true depths.
 
     Both maps are (H, W), mm, NaN = unknown. True depth counts strictly inside the range, a prediction where it is
     positive and finite.
@@ -135,17 +145,6 @@ def compared_depths(
     return d, g, int(np.count_nonzero(known))
 
 
-def disparity_fit(covariance: float, variance: float, means: tuple[float, float], scaling: DepthScaling) -> DepthFit:
-    """Return the least-squares fit 1 / g = a / d + b from moments of predicted and true disparity, in 1/mm.
-
-    `variance` is the predicted disparity's, `means` are of predicted and true disparity. A prediction without any
-    variation fits any line: it becomes the mean of the truth. The same solution as Video-Depth-Anything's
-    (arXiv 2501.12375; `benchmark/eval`), by the normal equations.
-    """
-    slope = covariance / variance if variance > 0 else 0.0
-    return DepthFit(scaling, 1 / slope if slope != 0 else float("inf"), means[1] - slope * means[0])
-
-
 def _fit(d: np.ndarray, g: np.ndarray, scaling: ImageScaling) -> DepthFit:
     if scaling not in get_args(ImageScaling):
         raise SettingsError(f"scaling of one image '{scaling}': choose one of {', '.join(get_args(ImageScaling))}")
@@ -153,29 +152,34 @@ def _fit(d: np.ndarray, g: np.ndarray, scaling: ImageScaling) -> DepthFit:
         return DepthFit(scaling)
     if scaling == "median":
         return DepthFit(scaling, float(np.median(g) / np.median(d)))
+    return disparity_fit(disparity_sums(d, g), scaling)
+
+
+def disparity_sums(d: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Return the sums (5,) of 1, x, y, x^2, x y over disparities x = 1/d, y = 1/g (1/mm) of depths (N,), mm."""
     x, y = 1 / d, 1 / g
-    means = float(x.mean()), float(y.mean())
-    return disparity_fit(float(np.mean((x - means[0]) * (y - means[1]))), float(np.var(x)), means, scaling)
+    return np.array([len(d), x.sum(), y.sum(), x @ x, x @ y])
 
 
-def _errors(d: np.ndarray, g: np.ndarray) -> list[float]:
-    difference = d - g
-    ratio = np.maximum(d / g, g / d)
-    errors = [
-        np.mean(np.abs(difference) / g),
-        np.mean(difference**2 / g),
-        np.sqrt(np.mean(difference**2)),
-        np.sqrt(np.mean(np.log(d / g) ** 2)),
-        np.mean(np.abs(difference)),
-        *(np.mean(ratio < 1.25**k) for k in (1, 2, 3)),
-    ]
-    return [float(error) for error in errors]
+def disparity_fit(sums: np.ndarray, scaling: DepthScaling) -> DepthFit:
+    """Return the least-squares fit 1 / g = a / d + b of `disparity_sums`, which add up over frames.
+
+    The identity where they are empty. A prediction without variation becomes the mean disparity of the truth. The same
+    solution as Video-Depth-Anything's (arXiv 2501.12375; `benchmark/eval`), by the normal equations.
+    """
+    count, x, y, xx, xy = sums
+    if count == 0:
+        return DepthFit(scaling)
+    mean_x, mean_y = x / count, y / count
+    variance, covariance = xx / count - mean_x**2, xy / count - mean_x * mean_y
+    slope = covariance / variance if variance > _LEAST_VARIATION * mean_x**2 else 0.0
+    return DepthFit(scaling, float(1 / slope) if slope != 0 else float("inf"), float(mean_y - slope * mean_x))
 
 
 def mean_depth_report(reports: Sequence[DepthReport]) -> DepthReport:
     """Return the mean over images; those without a comparable pixel count in `pixels` and `coverage` only.
 
-    Raises `SettingsError` where the images were scaled in different ways: their mean would have no name.
+    Raises `SettingsError` where the images were scaled in different ways.
     """
     if not reports:
         return DepthReport("none", 0, *[float("nan")] * 11)

@@ -1,6 +1,6 @@
-"""How two depth maps of one scene differ: at the same pixel, along the flow, and after the camera's motion.
+"""Differences of two depth maps of one scene: at the same pixel, along the flow, and after the camera's motion.
 
-Pure functions of one pair of frames; `consistency.py` feeds them a sequence.
+Pure functions of one pair of frames; `consistency` applies them to a sequence.
 
 - OPW and rTC: Khan et al., "Temporally consistent online depth estimation in dynamic scenes", WACV 2023, in the form of
   facebookresearch/TemporallyConsistentDepth, `eval/metrics.py`.
@@ -10,19 +10,16 @@ Pure functions of one pair of frames; `consistency.py` feeds them a sequence.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.geometry.se3 import inverse
-from scopemap.geometry.warp import moved_depth, pull
+from scopemap.geometry.warp import moved_depth
 
 _RTC_RATIO = 1.01
-# exp(-50 |difference|) > 1e-2, with colours in 0..1.
-_COLOUR_DISTANCE = 255 * np.log(1e2) / 50
-_FLOW_LIMIT_PX = 250.0
 
 
 @dataclass(frozen=True)
@@ -58,39 +55,21 @@ def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarr
 
 def mean_change(changes: Sequence[DepthChange]) -> DepthChange:
     """Return the mean over pairs of frames; pairs without a pixel are left out."""
-    kept = [change for change in changes if change.pairs > 0]
-    if not kept:
+    kept = np.array([astuple(change) for change in changes if change.pairs > 0])
+    if not len(kept):
         return DepthChange(0, *[float("nan")] * 3)
-    rows = np.array([[change.mean_mm, change.relative, change.rtc] for change in kept])
-    return DepthChange(sum(change.pairs for change in kept), *(float(value) for value in rows.mean(axis=0)))
-
-
-def looks_alike(rgb_previous: np.ndarray, rgb_current: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: where OPW counts a pixel of the current frame, by the images alone.
-
-    The previous image, pulled along the flow, must have its colour: exp(-50 |I - I_warped|) > 0.01, colours 0..1, and
-    the flow must be below 250 px along both axes (in the public code only where it is positive).
-
-    Parameters
-    ----------
-    rgb_previous, rgb_current : (H, W, 3) uint8.
-    to_previous : (H, W, 2) px: pixel p of the current frame is seen at p + to_previous(p) in the previous one.
-    """
-    difference = rgb_current.astype(np.float32) - pull(rgb_previous, to_previous)
-    same_colour = np.einsum("hwc,hwc->hw", difference, difference) < _COLOUR_DISTANCE**2
-    return same_colour & (np.abs(to_previous) < _FLOW_LIMIT_PX).all(axis=-1)
+    return DepthChange(int(kept[:, 0].sum()), *map(float, kept[:, 1:].mean(axis=0)))
 
 
 def seen_from(depth_mm: np.ndarray, camera: PinholeCamera, T_other_camera: np.ndarray) -> np.ndarray:
-    """Return, at each pixel of (H, W), the depth mm that its point has from the other camera; NaN unknown or behind."""
-    stay = np.zeros((*depth_mm.shape, 2), dtype=np.float32)
-    return moved_depth(depth_mm, stay, camera, T_other_camera)
+    """Return, at each pixel of (H, W), the depth mm of its point in the other camera; NaN unknown or behind."""
+    return moved_depth(depth_mm, np.zeros((*depth_mm.shape, 2), dtype=np.float32), camera, T_other_camera)
 
 
 def projected_depth(depth_mm: np.ndarray, camera: PinholeCamera, T_other_camera: np.ndarray) -> np.ndarray:
     """Return the depth map (H, W) float32, mm, that the other camera sees of this one's points; NaN where none falls.
 
-    As TAE has it: positions are rounded to pixels, the last point written to a pixel stays, whichever is nearer, and
+    As in TAE's code: positions are rounded to pixels, the last point written to a pixel stays, whichever is nearer, and
     points count as inside by their column and row alone; a pixel that a point behind the camera took is empty.
     """
     # Rows of (3, H W): contiguous coordinates are several times faster than points side by side.
@@ -111,9 +90,9 @@ def alignment_errors(
 ) -> tuple[float, float]:
     """Return TAE's two errors of a pair, forth and back: mean |projected - d| / d, d of the frame projected into.
 
-    NaN where no pixel can be compared (the public code counts 0 there, which favours whoever has no depth). TAE is 100
-    times the mean of these over both directions and all pairs. The public protocol fits scale and shift to the truth
-    first and clips depth to the data set's range; hand in such depth to get its figure.
+    NaN where no pixel can be compared (the public code counts 0 there, which favours methods without depth). TAE is 100
+    times the mean of these over both directions and all pairs. The public protocol first fits scale and shift to the
+    truth and clips depth to the data set's range; pass such depth to get its figure.
 
     Parameters
     ----------

@@ -1,29 +1,27 @@
-"""Errors between matched poses: absolute (APE), relative (RPE), and their statistics.
+"""Absolute (APE) and relative (RPE) errors of matched poses, and their statistics.
 
-All functions take camera-to-world poses of shape (N, 4, 4) float64, mm, matched row by row. Definitions as evo's
-documentation and Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, section IV.
+All functions take camera-to-world poses (N, 4, 4) float64, mm, matched row by row. Definitions: evo's documentation and
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, section IV.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
-from scopemap.errors import check_shape
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 
-# Share by which a pair's path may differ from the wanted length.
+# A pair over a path length is kept if its path differs by at most this share (evo's `rel_delta_tol`).
 _PATH_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Statistics of a row of non-negative errors, in their unit; NaN where there are none.
+    """Statistics of non-negative errors, in their unit; NaN where there are none. Definitions as evo's.
 
     `std` divides by N; `final` is the last error; `below_mean_percent` is the share strictly below the mean; `sse` is
-    the sum of squares. The others as their names say, all as evo has them.
+    the sum of squares.
     """
 
     mean: float
@@ -41,72 +39,38 @@ class ErrorSummary:
         """Summarise errors of shape (N,)."""
         if len(errors) == 0:
             return cls(*[float("nan")] * 9)
-        mean = float(np.mean(errors))
+        mean, squares = float(np.mean(errors)), np.square(errors)
         return cls(
             mean=mean,
             std=float(np.std(errors)),
-            rmse=float(np.sqrt(np.mean(np.square(errors)))),
+            rmse=float(np.sqrt(np.mean(squares))),
             final=float(errors[-1]),
             max=float(np.max(errors)),
-            below_mean_percent=float(100 * np.mean(errors < mean)),
+            below_mean_percent=below_percent(errors, mean),
             median=float(np.median(errors)),
             min=float(np.min(errors)),
-            sse=float(np.sum(np.square(errors))),
+            sse=float(np.sum(squares)),
         )
 
 
-@dataclass(frozen=True)
-class AxisSummaries:
-    """Statistics of the absolute error along, or about, each axis."""
-
-    x: ErrorSummary
-    y: ErrorSummary
-    z: ErrorSummary
-
-    @classmethod
-    def of(cls, errors: np.ndarray) -> AxisSummaries:
-        """Summarise the absolute values of errors of shape (N, 3)."""
-        check_shape("errors", errors, (None, 3))
-        return cls(*(ErrorSummary.of(column) for column in np.abs(errors).T))
-
-
 def below_percent(errors: np.ndarray, limit: float) -> float:
-    """Return the share of errors (N,) strictly below `limit`, in percent; NaN where there are none.
-
-    Unlike the share below a method's own mean it can rank methods.
-    """
+    """Return the share of errors (N,) strictly below `limit`, in percent; NaN where there are none."""
     return float(100 * np.mean(errors < limit)) if len(errors) else float("nan")
 
 
 def translation_errors_mm(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return `p_i - q_i`, (N, 3) mm in world axes; its norms are the absolute pose error (APE) in translation."""
-    return estimated[:, :3, 3] - reference[:, :3, 3]
+    """Return the norms of `p_i - q_i`, (N,) mm: the absolute pose error (APE) in translation."""
+    return np.asarray(np.linalg.norm(estimated[:, :3, 3] - reference[:, :3, 3], axis=1))
 
 
-def along_first_camera_mm(errors_mm: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return errors (N, 3) mm in world axes, turned into the axes of the first reference camera: `R(Q_0)^T d`.
-
-    World axes differ from data set to data set; x right, y down, z forward of the first view do not.
-    """
-    return errors_mm @ reference[0, :3, :3]
-
-
-def euler_xyz_rad(R: np.ndarray) -> np.ndarray:
-    """Return the angles about x, y, z, (N, 3) rad in -pi..pi, of rotations (N, 3, 3) `R = R_z R_y R_x`."""
-    about_x = np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    about_y = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 2, 1], R[:, 2, 2]))
-    about_z = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    return np.stack([about_x, about_y, about_z], axis=1)
-
-
-def rotation_errors_per_axis_rad(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return `|euler_xyz(R(Q_i)^T R(P_i))|`, (N, 3) rad in 0..pi: the turn about each axis of the reference camera."""
-    return np.abs(euler_xyz_rad(np.swapaxes(reference[:, :3, :3], 1, 2) @ estimated[:, :3, :3]))
+def rotation_errors(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the rotations `R(Q_i)^T R(P_i)`, (N, 3, 3), from the estimated to the reference camera."""
+    return np.swapaxes(reference[:, :3, :3], 1, 2) @ estimated[:, :3, :3]
 
 
 def rotation_errors_rad(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return the angle of `R(Q_i)^T R(P_i)`, (N,) rad in 0..pi: the absolute pose error (APE) in rotation."""
-    return rotation_angle_rad(np.swapaxes(reference[:, :3, :3], 1, 2) @ estimated[:, :3, :3])
+    """Return the angles of `rotation_errors`, (N,) rad in 0..pi: the absolute pose error (APE) in rotation."""
+    return rotation_angle_rad(rotation_errors(estimated, reference))
 
 
 def relative_errors(estimated: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,33 +85,22 @@ def relative_errors(estimated: np.ndarray, reference: np.ndarray, pairs: np.ndar
     return np.linalg.norm(error[:, :3, 3], axis=1), rotation_angle_rad(error[:, :3, :3])
 
 
-def frame_pairs(count: int, step: int, *, consecutive: bool = False) -> np.ndarray:
-    """Return row pairs (M, 2) that lie `step` rows apart: all of them, or only those that follow one another."""
-    first = np.arange(0, count - step, step if consecutive else 1)
+def frame_pairs(count: int, step: int) -> np.ndarray:
+    """Return all row pairs (M, 2) that are `step` rows apart."""
+    first = np.arange(count - step)
     return np.stack([first, first + step], axis=1)
 
 
-def path_pairs(positions_mm: np.ndarray, length_mm: float, *, consecutive: bool = False) -> np.ndarray:
+def path_pairs(positions_mm: np.ndarray, length_mm: float) -> np.ndarray:
     """Return row pairs (M, 2) with `length_mm` of path between them, measured along `positions_mm` (N, 3).
 
-    All: for each row the later one that comes closest, kept within 10 %. Consecutive: a mark wherever the path since
-    the last mark reaches the length, beginning at the first row, and the pairs of successive marks.
+    For each row the later row that comes closest, kept within 10 %.
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions_mm, axis=0), axis=1))])
-    if consecutive:
-        return _successive_marks(travelled, length_mm)
+    path_mm = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions_mm, axis=0), axis=1))])
     pairs = []
-    for i in range(len(travelled) - 1):
-        miss = np.abs(travelled[i + 1 :] - travelled[i] - length_mm)
-        nearest = int(np.argmin(miss))
-        if miss[nearest] <= _PATH_TOLERANCE * length_mm:
-            pairs.append((i, i + 1 + nearest))
+    for row in range(len(path_mm) - 1):
+        miss_mm = np.abs(path_mm[row + 1 :] - path_mm[row] - length_mm)
+        nearest = int(np.argmin(miss_mm))
+        if miss_mm[nearest] <= _PATH_TOLERANCE * length_mm:
+            pairs.append((row, row + 1 + nearest))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
-
-
-def _successive_marks(travelled: np.ndarray, length_mm: float) -> np.ndarray:
-    marks = [0]
-    for i, distance in enumerate(travelled):
-        if distance - travelled[marks[-1]] >= length_mm:
-            marks.append(i)
-    return np.array(list(pairwise(marks)), dtype=np.int64).reshape(-1, 2)

@@ -1,13 +1,12 @@
-"""Trajectories against the truth: which frames belong together, alignment, and the figures.
+"""Pose errors of a trajectory against the reference: association of frames, alignment, and the figures.
 
-`match` does the first two once; each report is a function of what it returns: `pose_report` here, the paper's own
-figures in `paper`, other people's named protocols in `protocols`.
+`match` associates and aligns once. The reports take its result: `pose_report` here, the paper's figures in `paper`,
+published protocols in `protocols`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,11 +24,9 @@ from scopemap.evaluation.pose_errors import (
 from scopemap.geometry.align import AlignMode, Similarity, align_trajectories
 from scopemap.trajectory.trajectory import Trajectory, path_length_mm
 
-Association = Literal["auto", "index", "time"]
 MIN_MATCHED = 3
-
-# A hair beyond the limit counts as on it: decimal time stamps are not exact in binary.
-_TIME_HAIR_S = 1e-9
+# evo's 0.01 s, and a little over, since decimal time stamps are not exact in binary.
+_MOST_GAP_S = 0.01 + 1e-9
 
 
 @dataclass(frozen=True)
@@ -42,11 +39,8 @@ class MatchedTrajectories:
     aligned : (N, 4, 4) the same after the alignment, which is fitted on the tracked frames.
     reference : (N, 4, 4), mm.
     tracked : (N,) bool, False where the estimate is lost.
-    align : the mode; similarity : what it found.
-    fitted_frames : tracked frames that the alignment was taken from: 0 for `none`, 1 for `origin`.
-    associated_by : "index" or "time".
-    reference_frames, reference_in_span : frames whose true pose is known, and those of them that lie between the
-        estimate's first and last frame and so could be matched.
+    align : mode of the alignment; similarity : its result.
+    reference_frames, reference_in_span : reference poses, and those between the estimate's first and last frame.
     """
 
     estimated: np.ndarray
@@ -55,19 +49,13 @@ class MatchedTrajectories:
     tracked: np.ndarray
     align: AlignMode
     similarity: Similarity
-    fitted_frames: int
-    associated_by: Association
     reference_frames: int
     reference_in_span: int
 
     @property
     def coverage(self) -> float:
-        """Tracked frames over those that could be matched, 0..1; frames without an estimate count as lost do."""
+        """Tracked frames over reference poses in the estimate's span, 0..1; missing frames count as lost."""
         return float(np.count_nonzero(self.tracked) / self.reference_in_span)
-
-    def tracked_pairs(self, pairs: np.ndarray) -> np.ndarray:
-        """Return those of the row pairs (M, 2) of which both frames are tracked."""
-        return pairs[self.tracked[pairs].all(axis=1)]
 
 
 @dataclass(frozen=True)
@@ -83,11 +71,11 @@ class PoseReport:
     rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
     rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
     rpe_1_mm, rpe_1_deg, rpe_10_mm, rpe_10_deg : relative error over 1 and 10 frames, all pairs, RMSE, after scaling.
-    tlr : estimated over true path length, before the alignment.
-    rpe_10mm_path_mm, rpe_10mm_path_deg : relative error over 10 mm (within 10 %) of the true path, all pairs, RMSE.
+    tlr : trajectory length ratio, estimated over reference path length, before the alignment.
+    rpe_10mm_path_mm, rpe_10mm_path_deg : relative error over 10 mm (within 10 %) of reference path, all pairs, RMSE.
     ate_below_1_mm_percent, ... : share of frames with an absolute error strictly below 1, 2, 5 mm and 1, 2, 5 deg.
-    coverage, reference_frames : tracked frames over the true poses within the estimate's span, 0..1, and the number of
-        true poses in all; a run that ended early has full coverage and few frames.
+    coverage, reference_frames : tracked frames over the reference poses within the estimate's span, 0..1, and the
+        number of reference poses in all; a run that ended early has full coverage and few frames.
     longest_tracked : matched frames in the longest run without loss.
     frames_until_loss : matched frames before the first lost one; all where none is lost.
     """
@@ -124,63 +112,45 @@ class PoseReport:
     frames_until_loss: int
 
 
-def associate(
-    estimate: Trajectory, reference: Trajectory, *, by: Association = "auto", max_gap_s: float = 0.01
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of the estimate and of the reference that belong together, both (N,) int64, in time order.
+def associate(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Return matching rows of the estimate and of the reference, both (N,) int64, in time order.
 
-    By frame index where both have one (`auto`), else by the nearest time stamp, one to one, at most `max_gap_s` apart.
-    Raises `AlignmentError` where "index" is asked for and a trajectory has none.
+    By frame index where both have one, else by the nearest time stamp, one to one, at most 0.01 s apart (as evo).
     """
-    if _by_index(estimate, reference, by):
+    if estimate.has_indices and reference.has_indices:
         _, rows_estimate, rows_reference = np.intersect1d(estimate.indices, reference.indices, return_indices=True)
         return rows_estimate, rows_reference
-    return _associate_by_time(estimate.times_s, reference.times_s, max_gap_s)
-
-
-def _by_index(estimate: Trajectory, reference: Trajectory, by: Association) -> bool:
-    have_indices = estimate.has_indices and reference.has_indices
-    if by == "index" and not have_indices:
-        raise AlignmentError("cannot match by frame index: one of the trajectories gives only time stamps")
-    return by == "index" or (by == "auto" and have_indices)
-
-
-def _associate_by_time(times_s: np.ndarray, reference_s: np.ndarray, max_gap_s: float) -> tuple[np.ndarray, np.ndarray]:
-    if not len(times_s) or not len(reference_s):
+    if not len(estimate) or not len(reference):
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    gaps, nearest = cKDTree(reference_s[:, None]).query(times_s[:, None])
-    order = np.argsort(gaps, kind="stable")
-    # The first of the sorted rows that claims a reference frame is the nearest one; the others go empty.
+    gaps_s, nearest = cKDTree(reference.times_s[:, None]).query(estimate.times_s[:, None])
+    order = np.argsort(gaps_s, kind="stable")
+    # A reference frame goes to the estimated frame nearest to it, the first in this order.
     rows_reference, claim = np.unique(nearest[order], return_index=True)
     rows_estimate = order[claim]
-    near = gaps[rows_estimate] <= max_gap_s + _TIME_HAIR_S
+    near = gaps_s[rows_estimate] <= _MOST_GAP_S
     return rows_estimate[near], rows_reference[near]
 
 
 def match(
-    estimate: Trajectory,
-    reference: Trajectory,
-    align: AlignMode,
-    *,
-    first: int | None = None,
-    by: Association = "auto",
-    max_gap_s: float = 0.01,
+    estimate: Trajectory, reference: Trajectory, align: AlignMode, *, first: int | None = None
 ) -> MatchedTrajectories:
     """Associate, fill lost frames with the last tracked pose, and align on the tracked frames.
 
-    `first` fits the alignment on the first so many tracked frames only; `by` and `max_gap_s` as `associate` takes them.
-    Frames that the reference itself calls lost are left out. Raises `AlignmentError` where fewer than 3 tracked frames
-    match or the fit is degenerate.
+    `first` fits the alignment on that many tracked frames only. Frames that are lost in the reference are left out.
+    Raises `AlignmentError` where fewer than 3 tracked frames match or the fit is degenerate.
     """
     known = reference.rows(reference.tracked)
-    rows_estimate, rows_reference = associate(estimate, known, by=by, max_gap_s=max_gap_s)
+    rows_estimate, rows_reference = associate(estimate, known)
     tracked = estimate.tracked[rows_estimate]
     if np.count_nonzero(tracked) < MIN_MATCHED:
         raise AlignmentError(_too_few(estimate, known, int(np.count_nonzero(tracked))))
-    estimated = _held(estimate)[rows_estimate]
+    estimated = _with_last_pose(estimate)[rows_estimate]
     truth = known.T_world_camera[rows_reference]
     _, similarity = align_trajectories(estimated[tracked], truth[tracked], align, first=first)
-    by_index = _by_index(estimate, known, by)
+    stamps, reference_stamps, gap = estimate.times_s, known.times_s, _MOST_GAP_S
+    if estimate.has_indices and known.has_indices:
+        stamps, reference_stamps, gap = estimate.indices, known.indices, 0.0
+    in_span = (reference_stamps >= stamps.min() - gap) & (reference_stamps <= stamps.max() + gap)
     return MatchedTrajectories(
         estimated=estimated,
         aligned=similarity.transform_poses(estimated),
@@ -188,35 +158,15 @@ def match(
         tracked=tracked,
         align=align,
         similarity=similarity,
-        fitted_frames=_fitted(align, int(np.count_nonzero(tracked)), first),
-        associated_by="index" if by_index else "time",
         reference_frames=len(known),
-        reference_in_span=_in_span(estimate, known, None if by_index else max_gap_s),
+        reference_in_span=int(np.count_nonzero(in_span)),
     )
 
 
-def _fitted(align: AlignMode, tracked: int, first: int | None) -> int:
-    if align in ("none", "origin"):
-        return int(align == "origin")
-    return tracked if first is None else min(first, tracked)
-
-
-def _in_span(estimate: Trajectory, reference: Trajectory, max_gap_s: float | None) -> int:
-    """Count the reference frames between the estimate's first and last: by index, or by time where a gap is given."""
-    if max_gap_s is None:
-        inside = (reference.indices >= estimate.indices[0]) & (reference.indices <= estimate.indices[-1])
-    else:
-        first_s, last_s = estimate.times_s.min() - max_gap_s, estimate.times_s.max() + max_gap_s
-        inside = (reference.times_s >= first_s - _TIME_HAIR_S) & (reference.times_s <= last_s + _TIME_HAIR_S)
-    return int(np.count_nonzero(inside))
-
-
-def _held(trajectory: Trajectory) -> np.ndarray:
-    """Return all poses, lost ones replaced by the last tracked before them (by the first tracked at the start)."""
-    rows = np.where(trajectory.tracked, np.arange(len(trajectory)), -1)
-    last = np.maximum.accumulate(rows)
-    first_tracked = int(np.argmax(trajectory.tracked))
-    return trajectory.T_world_camera[np.where(last < 0, first_tracked, last)]
+def _with_last_pose(trajectory: Trajectory) -> np.ndarray:
+    """Return all poses (N, 4, 4); lost frames have the last tracked pose, at the start the first tracked one."""
+    last = np.maximum.accumulate(np.where(trajectory.tracked, np.arange(len(trajectory)), -1))
+    return trajectory.T_world_camera[np.where(last < 0, int(np.argmax(trajectory.tracked)), last)]
 
 
 def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
@@ -241,25 +191,28 @@ def evaluate_poses(
 def pose_report(matched: MatchedTrajectories) -> PoseReport:
     """Return the figures that `scopemap evaluate` prints."""
     ok = matched.tracked
-    distance = np.linalg.norm(translation_errors_mm(matched.aligned, matched.reference), axis=1)
-    ate = ErrorSummary.of(distance[ok])
-    turned_deg = np.degrees(rotation_errors_rad(matched.aligned[ok], matched.reference[ok]))
-    unaligned = ErrorSummary.of(np.degrees(_rotation_since_start_rad(matched)))
-    rpe_1_mm, rpe_1_rad = rpe_over_frames(matched, 1)
-    rpe_10_mm, rpe_10_rad = rpe_over_frames(matched, 10)
+    held_mm = translation_errors_mm(matched.aligned, matched.reference)
+    error_mm, error_deg = held_mm[ok], np.degrees(rotation_errors_rad(matched.aligned[ok], matched.reference[ok]))
+    ate, rotation = ErrorSummary.of(error_mm), ErrorSummary.of(error_deg)
+    rows = np.flatnonzero(ok)
+    since_first = np.stack([np.full(len(rows), rows[0]), rows], axis=1)
+    unaligned_rad = ErrorSummary.of(relative_errors(matched.estimated, matched.reference, since_first)[1])
+    (rpe_1_mm, rpe_1_rad), (rpe_10_mm, rpe_10_rad) = rpe_over_frames(matched, 1), rpe_over_frames(matched, 10)
     rpe_path_mm, rpe_path_rad = rpe_over_path(matched, 10.0)
+    below_mm = {f"ate_below_{limit}_mm_percent": below_percent(error_mm, limit) for limit in (1, 2, 5)}
+    below_deg = {f"rotation_below_{limit}_deg_percent": below_percent(error_deg, limit) for limit in (1, 2, 5)}
     return PoseReport(
         frames=len(ok),
         tracked=int(np.count_nonzero(ok)),
         align=matched.align,
         scale=matched.similarity.scale,
         ate_rmse_mm=ate.rmse,
-        ate_hold_rmse_mm=ErrorSummary.of(distance).rmse,
+        ate_hold_rmse_mm=ErrorSummary.of(held_mm).rmse,
         ate_mean_mm=ate.mean,
-        rotation_mean_deg=ErrorSummary.of(turned_deg).mean,
-        rotation_max_deg=ErrorSummary.of(turned_deg).max,
-        rotation_unaligned_mean_deg=unaligned.mean,
-        rotation_unaligned_max_deg=unaligned.max,
+        rotation_mean_deg=rotation.mean,
+        rotation_max_deg=rotation.max,
+        rotation_unaligned_mean_deg=float(np.degrees(unaligned_rad.mean)),
+        rotation_unaligned_max_deg=float(np.degrees(unaligned_rad.max)),
         rpe_1_mm=rpe_1_mm.rmse,
         rpe_1_deg=float(np.degrees(rpe_1_rad.rmse)),
         rpe_10_mm=rpe_10_mm.rmse,
@@ -269,16 +222,12 @@ def pose_report(matched: MatchedTrajectories) -> PoseReport:
         ate_max_mm=ate.max,
         rpe_10mm_path_mm=rpe_path_mm.rmse,
         rpe_10mm_path_deg=float(np.degrees(rpe_path_rad.rmse)),
-        ate_below_1_mm_percent=below_percent(distance[ok], 1.0),
-        ate_below_2_mm_percent=below_percent(distance[ok], 2.0),
-        ate_below_5_mm_percent=below_percent(distance[ok], 5.0),
-        rotation_below_1_deg_percent=below_percent(turned_deg, 1.0),
-        rotation_below_2_deg_percent=below_percent(turned_deg, 2.0),
-        rotation_below_5_deg_percent=below_percent(turned_deg, 5.0),
         coverage=matched.coverage,
         reference_frames=matched.reference_frames,
         longest_tracked=longest_run(ok),
         frames_until_loss=frames_until_loss(ok),
+        **below_mm,
+        **below_deg,
     )
 
 
@@ -288,22 +237,25 @@ def rpe_over_frames(matched: MatchedTrajectories, step: int) -> tuple[ErrorSumma
 
 
 def rpe_over_path(matched: MatchedTrajectories, length_mm: float) -> tuple[ErrorSummary, ErrorSummary]:
-    """Return the relative error over `length_mm` of the true path, all pairs of tracked frames: mm and rad.
+    """Return the relative error over `length_mm` of reference path, all pairs of tracked frames: mm and rad.
 
-    The pairs come from the reference: a wrong scale must not choose its own.
+    The pairs are chosen on the reference: on the estimate a wrong scale would change them.
     """
     return _rpe(matched, path_pairs(matched.reference[:, :3, 3], length_mm))
 
 
 def _rpe(matched: MatchedTrajectories, pairs: np.ndarray) -> tuple[ErrorSummary, ErrorSummary]:
-    translation, rotation = relative_errors(matched.aligned, matched.reference, matched.tracked_pairs(pairs))
+    tracked = pairs[matched.tracked[pairs].all(axis=1)]
+    translation, rotation = relative_errors(matched.aligned, matched.reference, tracked)
     return ErrorSummary.of(translation), ErrorSummary.of(rotation)
 
 
-def _rotation_since_start_rad(matched: MatchedTrajectories) -> np.ndarray:
-    rows = np.flatnonzero(matched.tracked)
-    pairs = np.stack([np.full(len(rows), rows[0]), rows], axis=1)
-    return relative_errors(matched.estimated, matched.reference, pairs)[1]
+def length_ratio(matched: MatchedTrajectories) -> float:
+    """Return the estimated over the reference path length through the tracked frames, before any alignment (TLR)."""
+    ok = matched.tracked
+    reference_mm = path_length_mm(matched.reference[ok][:, :3, 3])
+    estimated_mm = path_length_mm(matched.estimated[ok][:, :3, 3])
+    return estimated_mm / reference_mm if reference_mm > 0 else float("nan")
 
 
 def longest_run(tracked: np.ndarray) -> int:
@@ -312,14 +264,6 @@ def longest_run(tracked: np.ndarray) -> int:
     return int(np.max(np.diff(breaks)) - 1)
 
 
-def length_ratio(matched: MatchedTrajectories) -> float:
-    """Return the estimated over the true path length through the tracked frames, before any alignment (TLR)."""
-    ok = matched.tracked
-    reference_mm = path_length_mm(matched.reference[ok][:, :3, 3])
-    estimated_mm = path_length_mm(matched.estimated[ok][:, :3, 3])
-    return estimated_mm / reference_mm if reference_mm > 0 else float("nan")
-
-
 def frames_until_loss(tracked: np.ndarray) -> int:
-    """Return how many of the frames (N,) bool come before the first that is False; N where none is."""
+    """Return the number of frames (N,) bool before the first that is False; N where none is."""
     return len(tracked) if tracked.all() else int(np.argmin(tracked))

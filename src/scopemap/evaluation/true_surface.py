@@ -1,6 +1,6 @@
-"""The true surface of a data set, what of it the camera saw, and all figures of a predicted surface against it.
+"""The true surface of a data set, its observed part, and all figures of a predicted surface against it.
 
-| data | the true surface | what of it was seen |
+| data | the true surface | observed part |
 |---|---|---|
 | phantom | `mesh_truth.ply`: the shape at rest wherever a ray met it, and a rim of 2 voxels | `TrueSurface.seen_by` |
 | C3VD | `coverage_mesh.obj`: the whole model, world mm | in the file, face by face |
@@ -8,7 +8,7 @@
 | 7-Scenes | none | |
 
 Tissue of a phantom may breathe. The shape at rest is that of frame 0 and of every whole breath; a method that takes the
-tissue as rigid is measured against this one shape, and its errors contain the breath.
+tissue as rigid is measured against this one shape, and its errors include the breath.
 """
 
 from __future__ import annotations
@@ -24,61 +24,42 @@ from scopemap.cameras.camera import CameraModel
 from scopemap.errors import InputError, check_shape
 from scopemap.evaluation.registration import refine
 from scopemap.evaluation.surface import (
-    THRESHOLDS_MM,
     DistanceSummary,
     Surface,
     compare_surfaces,
     distances_mm,
+    is_empty,
     normal_consistency,
-    report_of_nothing,
-    surface_figures,
     surface_points,
 )
-from scopemap.evaluation.visibility import View, pixels_near, seen_samples, visible_from
+from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, visible_from
 from scopemap.io.decoding import read_decoded
 
 _PHANTOM, _PHANTOM_FRAMES = "mesh_truth.ply", "mesh_truth"
-# The second is the name that the data set's page gives.
+# The second is the name on the data set's page.
 _C3VD = ("coverage_mesh.obj", "outputMesh.obj")
 _SCARED_DEPTH, _SCARED_CLOUD = "left_depth_map.tiff", "point_cloud.obj"
 _OBSERVED, _MISSED = 1, 2
-_MISSING = float("nan")
-_ICP_MISSING = DistanceSummary(*[_MISSING] * 4).figures("accuracy_icp") | {
-    "icp_rms_before_mm": _MISSING,
-    "icp_rms_after_mm": _MISSING,
-}
-
-
-@dataclass(frozen=True)
-class SingleView:
-    """The one view that a truth was taken from.
-
-    Attributes
-    ----------
-    T_world_camera : (4, 4) float64, mm.
-    reach_px : a pixel has a truth if a true point falls within this distance of it; larger for loose points.
-    """
-
-    T_world_camera: np.ndarray
-    reach_px: float = 1.0
 
 
 @dataclass(frozen=True)
 class TrueSurface:
-    """What is known of the true surface, in the true world, mm.
+    """A true surface in the true world, mm.
 
     Attributes
     ----------
     surface : a mesh, or points (N, 3).
     seen : (F,) bool, the faces of the mesh that the camera saw; None: not known.
-    view : the view that the truth was taken from; None: it is of the whole scene.
     frames : where the tissue moves, the mesh file of every frame, with the faces of `surface`; empty: it is at rest.
+    T_view : (4, 4), world from camera, mm, of the one view that the truth was taken from; None: the whole scene.
+    reach_px : a pixel of that view has a truth if a true point falls within this distance; larger for sparse points.
     """
 
     surface: Surface
     seen: np.ndarray | None = None
-    view: SingleView | None = None
     frames: tuple[Path, ...] = ()
+    T_view: np.ndarray | None = None
+    reach_px: float = 1.0
 
     def __post_init__(self) -> None:
         if self.seen is not None:
@@ -92,19 +73,19 @@ class TrueSurface:
 
     @property
     def observed(self) -> Surface | None:
-        """The part that the camera saw; None where that is not known. A truth of one view was seen whole."""
+        """The part that the camera saw; None where that is not known. A truth of one view is all observed."""
         if self.seen is None:
-            return None if self.view is None else self.surface
+            return None if self.T_view is None else self.surface
         return trimesh.Trimesh(self._mesh.vertices, self._mesh.faces[self.seen], process=False)
 
     def seen_by(
-        self, camera: CameraModel, views: Iterable[View], *, indices: Sequence[int] | None = None
+        self, camera: CameraModel, views: Iterable[TrueView], *, indices: Sequence[int] | None = None
     ) -> TrueSurface:
-        """Return the mesh with `seen` found anew: the faces whose centre some view shows (`seen_samples`).
+        """Return the mesh with a new `seen`: the faces whose centre some view sees (`seen_samples`).
 
-        Views are (T_world_camera (4, 4), true depth (H, W) mm). Where the tissue moves, each is asked about the mesh of
-        its own frame; `indices` are the frame numbers of the views, None: 0, 1, 2 and so on. Raises `InputError` where
-        no face is seen, and where a frame's mesh is missing or has other faces.
+        Views are (T_world_camera (4, 4), true depth (H, W) mm). Where the tissue moves, each is compared with the mesh
+        of its own frame; `indices` are the frame numbers of the views, None: 0, 1, 2 and so on. Raises `InputError`
+        where no face is seen, and where a frame's mesh is missing or has other faces.
         """
 
         def centres_then(number: int) -> np.ndarray:
@@ -136,61 +117,54 @@ def read_true_surface(folder: Path) -> TrueSurface | None:
     """
     folder = Path(folder)
     if (folder / _PHANTOM).is_file():
-        frames = sorted((folder / _PHANTOM_FRAMES).glob("*.ply"))
-        return TrueSurface(_read_mesh(folder / _PHANTOM), frames=tuple(frames))
+        return TrueSurface(
+            _read_mesh(folder / _PHANTOM), frames=tuple(sorted((folder / _PHANTOM_FRAMES).glob("*.ply")))
+        )
     for name in _C3VD:
         if (folder / name).is_file():
             return _read_coverage(folder / name)
-    if (folder / _SCARED_DEPTH).is_file():
-        return _of_one_view(folder, _read_depth_points(folder / _SCARED_DEPTH))
-    if (folder / _SCARED_CLOUD).is_file():
-        return _of_one_view(folder, _read_cloud(folder / _SCARED_CLOUD))
+    for name, read in ((_SCARED_DEPTH, _read_depth_points), (_SCARED_CLOUD, _read_cloud)):
+        if (folder / name).is_file():
+            points_mm = read(folder / name)
+            with np.errstate(invalid="ignore"):
+                known = np.isfinite(points_mm).all(axis=1) & (points_mm[:, 2] > 0)
+            if not known.any():
+                raise InputError(f"the true points of the keyframe in {folder} are all missing")
+            return TrueSurface(points_mm[known].astype(np.float64), T_view=np.eye(4))
     return None
 
 
 def measure_surface(
-    predicted: Surface,
-    truth: TrueSurface,
-    *,
-    camera: CameraModel | None = None,
-    icp: bool = True,
-    thresholds_mm: Sequence[float] = THRESHOLDS_MM,
+    predicted: Surface, truth: TrueSurface, *, camera: CameraModel | None = None, icp: bool = True
 ) -> dict[str, float]:
-    """Return every figure of a predicted surface, which the fit of the camera paths has moved into the true world.
+    """Return every figure of a predicted surface, which the alignment of the trajectories has moved to the true world.
 
-    The names of `surface_figures`, and `normal_consistency` (NaN unless both are meshes); with `icp` also
+    The names of `SurfaceReport.figures`, and `normal_consistency` (NaN unless both are meshes); with `icp` also
     accuracy_icp_*, icp_rms_before_mm and icp_rms_after_mm (`registration.refine`). Where nothing was predicted, recall,
     F and coverage are 0 and all else that depends on a prediction is NaN.
 
-    Against a truth of one view only that part of the prediction is measured which the view sees on pixels that have a
-    truth. This needs the `camera` of the view, at any size, rectified or not; other truths do not use it.
+    Against a truth of one view, only the part of the prediction is measured that the view sees on pixels with a truth.
+    This needs the `camera` of the view, at any size, rectified or not; other truths do not use it.
     """
-    if truth.view is not None:
+    if truth.T_view is not None:
         if camera is None:
             raise ValueError("measure_surface: a truth of one view needs the camera of that view")
-        T_world_camera = truth.view.T_world_camera
-        valid = pixels_near(surface_points(truth.surface), camera, T_world_camera, radius_px=truth.view.reach_px)
-        predicted = visible_from(predicted, camera, T_world_camera, valid)
-    if len(predicted.faces if isinstance(predicted, trimesh.Trimesh) else predicted) == 0:
-        report = report_of_nothing(truth.surface, observed=truth.observed, thresholds_mm=thresholds_mm)
-        return surface_figures(report) | {"normal_consistency": _MISSING} | (_ICP_MISSING if icp else {})
-    report = compare_surfaces(predicted, truth.surface, observed=truth.observed, thresholds_mm=thresholds_mm)
-    consistency = {"normal_consistency": _normal_consistency(predicted, truth.surface)}
-    return surface_figures(report) | consistency | (_icp_figures(predicted, truth.surface) if icp else {})
-
-
-def _normal_consistency(predicted: Surface, truth: Surface) -> float:
-    if isinstance(predicted, trimesh.Trimesh) and isinstance(truth, trimesh.Trimesh):
-        return normal_consistency(predicted, truth)
-    return _MISSING
+        valid = pixels_near(surface_points(truth.surface), camera, truth.T_view, radius_px=truth.reach_px)
+        predicted = visible_from(predicted, camera, truth.T_view, valid)
+    figures = compare_surfaces(predicted, truth.surface, observed=truth.observed).figures
+    figures["normal_consistency"] = normal_consistency(predicted, truth.surface)
+    return figures | (_icp_figures(predicted, truth.surface) if icp else {})
 
 
 def _icp_figures(predicted: Surface, truth: Surface) -> dict[str, float]:
-    found = refine(predicted, truth)
-    moved = found.similarity.transform_points(surface_points(predicted))
-    accuracy = DistanceSummary.of(distances_mm(moved, truth))
-    rms = {"icp_rms_before_mm": found.rms_before_mm, "icp_rms_after_mm": found.rms_after_mm}
-    return accuracy.figures("accuracy_icp") | rms
+    before_mm = after_mm = float("nan")
+    distances = np.empty(0)
+    if not is_empty(predicted):
+        found = refine(predicted, truth)
+        before_mm, after_mm = found.rms_before_mm, found.rms_after_mm
+        distances = distances_mm(found.similarity.transform_points(surface_points(predicted)), truth)
+    rms = {"icp_rms_before_mm": before_mm, "icp_rms_after_mm": after_mm}
+    return DistanceSummary.of(distances).figures("accuracy_icp") | rms
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh:
@@ -206,47 +180,25 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
 def _read_coverage(path: Path) -> TrueSurface:
     """Read C3VD's mesh: `v x y z`, two `vt`, `f v/vt[/vn] ...`, all corners of a face with vt 1 = observed, 2 = missed.
 
-    Source: the data set's page and `RenderingModule.cpp`, `writeOBJ` (github.com/DurrLab/C3VD). Common readers of OBJ
-    give coordinates of texture, not their indices, and may reorder or split vertices: hence read here.
+    Source: the data set's page and `RenderingModule.cpp`, `writeOBJ` (github.com/DurrLab/C3VD). Readers of OBJ give
+    texture coordinates, not their indices, and may reorder or split vertices: hence read here.
     """
     lines = _read_lines(path)
-    vertices = _numbers(path, [line[2:] for line in lines if line.startswith("v ")])[:, :3]
-    corners, marks = _corners(path, [line[2:] for line in lines if line.startswith("f ")])
+    vertices = _numbers(path, [line[2:] for line in lines if line.startswith("v ")])
+    faces = [line.split()[1:] for line in lines if line.startswith("f ")]
+    try:
+        corners, marks = np.array([[c.split("/")[:2] for c in face] for face in faces], np.int64).transpose(2, 0, 1)
+        if corners.shape[1] != 3:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"cannot read the coverage in {path}: expected triangles `f v/vt v/vt v/vt`, as C3VD writes"
+        ) from None
     if corners.min() < 1 or corners.max() > len(vertices):
         raise InputError(f"cannot read the true surface {path}: a face names none of the {len(vertices)} vertices")
     if not np.isin(marks, (_OBSERVED, _MISSED)).all() or (marks != marks[:, :1]).any():
         raise InputError(f"cannot read the coverage in {path}: expected vt 1 (observed) or 2 (missed) on every face")
     return TrueSurface(trimesh.Trimesh(vertices, corners - 1, process=False), marks[:, 0] == _OBSERVED)
-
-
-def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertex and texture numbers (F, 3) each, as written, of the faces of an OBJ file."""
-    table = _numbers(path, [face.replace("/", " ") for face in faces])
-    per_corner = table.shape[1] // 3
-    # Without this count `v//vn` would pass for `v/vt`, and a hexagon for a triangle.
-    slashes = sum(face.count("/") for face in faces)
-    if table.shape[1] not in (6, 9) or slashes != 3 * (per_corner - 1) * len(table):
-        raise InputError(f"cannot read the coverage in {path}: expected triangles `f v/vt v/vt v/vt`, as C3VD writes")
-    corners, marks = table.astype(np.int64).reshape(-1, 3, per_corner)[..., :2].transpose(2, 0, 1)
-    return corners, marks
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot read the true surface {path}: {error.strerror or error}") from None
-
-
-def _numbers(path: Path, rows: list[str]) -> np.ndarray:
-    """Return rows of equally many numbers, (N, M) float64; `nan` is a number."""
-    try:
-        table = np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, 0))
-    except ValueError as error:
-        raise InputError(f"cannot read the true surface {path}: {error}") from None
-    if table.shape[1] < 3:
-        raise InputError(f"cannot read the true surface {path}: expected lines `v x y z` and `f v/vt v/vt v/vt`")
-    return table
 
 
 def _read_depth_points(path: Path) -> np.ndarray:
@@ -259,12 +211,22 @@ def _read_depth_points(path: Path) -> np.ndarray:
 
 def _read_cloud(path: Path) -> np.ndarray:
     """Return SCARED's points (N, 3), mm, one line each, `nan` where there is none."""
-    return _numbers(path, [line[2:] for line in _read_lines(path) if line.startswith("v ")])[:, :3]
+    return _numbers(path, [line[2:] for line in _read_lines(path) if line.startswith("v ")])
 
 
-def _of_one_view(folder: Path, points_mm: np.ndarray) -> TrueSurface:
-    with np.errstate(invalid="ignore"):
-        known = np.isfinite(points_mm).all(axis=1) & (points_mm[:, 2] > 0)
-    if not known.any():
-        raise InputError(f"the true points of the keyframe in {folder} are all missing")
-    return TrueSurface(points_mm[known].astype(np.float64), view=SingleView(np.eye(4)))
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise InputError(f"cannot read the true surface {path}: {error.strerror or error}") from None
+
+
+def _numbers(path: Path, rows: list[str]) -> np.ndarray:
+    """Return the first three numbers of each row, (N, 3) float64; `nan` is a number."""
+    try:
+        table = np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, 0))
+    except ValueError as error:
+        raise InputError(f"cannot read the true surface {path}: {error}") from None
+    if table.shape[1] < 3:
+        raise InputError(f"cannot read the true surface {path}: expected lines `v x y z`")
+    return table[:, :3]

@@ -1,4 +1,4 @@
-"""What a camera sees of a surface: of a true one, given its depth, and of a predicted one, given nothing but itself."""
+"""Visibility from a camera: of a true surface, given its depth, and of a predicted one, by hiding itself."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import trimesh
 
 from scopemap.cameras.camera import CameraModel
 from scopemap.errors import check_shape
-from scopemap.evaluation.surface import Surface, small_triangles
+from scopemap.evaluation.point_to_mesh import small_triangles
+from scopemap.evaluation.surface import Surface, is_empty
 from scopemap.geometry.se3 import inverse, transform
 
-View = tuple[np.ndarray, np.ndarray]
+TrueView = tuple[np.ndarray, np.ndarray]
 """One frame's pose (4, 4), camera to world, mm, and its true depth (H, W), mm, NaN = unknown."""
 
 _TOLERANCE = 0.02
@@ -25,19 +26,17 @@ _NEARER = 0.01
 def seen_samples(
     points_mm: np.ndarray,
     camera: CameraModel,
-    views: Iterable[View],
+    views: Iterable[TrueView],
     *,
     moved: Callable[[int], np.ndarray] | None = None,
-    tolerance: float = _TOLERANCE,
 ) -> np.ndarray:
     """Return which points (N, 3) of a surface, true world mm, were seen by at least one view: (N,) bool.
 
-    A view sees a point that projects onto a pixel whose true depth the point's own z matches to within `tolerance`
-    times that depth: what lies behind a fold is deeper than what the pixel shows, and what is behind the camera has no
-    pixel. 2 % leaves room for walls that slope within a pixel; a point that close behind an edge passes, too.
+    A view sees a point that projects onto a pixel whose true depth is within 2 % of the point's own z. 2 % allows for
+    walls that slope within a pixel; a point that close behind an edge passes, too.
 
-    `moved` tells where the points (N, 3) are in the k-th view, counted from 0, where the tissue moves. `views` may be a
-    generator; when all points are seen, no more views are taken.
+    `moved` gives the points (N, 3) at the time of the k-th view, counted from 0, where the tissue moves. `views` may be
+    a generator; when all points are seen, no more views are taken.
     """
     check_shape("points_mm", points_mm, (None, 3))
     seen = np.zeros(len(points_mm), dtype=bool)
@@ -46,9 +45,9 @@ def seen_samples(
         unseen = np.flatnonzero(~seen)
         now = (points_mm if moved is None else moved(number))[unseen]
         rows, columns, z_mm, inside = _pixels(now, camera, T_world_camera)
-        shown_mm = depth_mm[rows, columns]
+        true_mm = depth_mm[rows, columns]
         # Unknown depth is NaN and matches nothing.
-        seen[unseen[inside]] = np.abs(z_mm - shown_mm) <= tolerance * shown_mm
+        seen[unseen[inside]] = np.abs(z_mm - true_mm) <= _TOLERANCE * true_mm
         if seen.all():
             break
     return seen
@@ -59,10 +58,10 @@ def visible_from(
 ) -> Surface:
     """Return the part of a surface, world mm, that one view sees on its `valid` pixels (H, W), None: on all.
 
-    A mesh hides itself: its triangles, cut to 2 mm, are painted from far to near on a grid at least 1280 wide, and one
-    is kept unless the ray to its centre meets the triangle painted there more than 1 % nearer. Points hide nothing:
-    those in front of the camera that fall on valid pixels are kept. A mesh gives a mesh, points give points; either may
-    come back empty.
+    A mesh hides itself: its triangles, subdivided to 2 mm, are painted from far to near on a grid at least 1280 wide; a
+    triangle is kept unless the ray to its centre meets the triangle painted there more than 1 % nearer. Points hide
+    nothing: those in front of the camera on valid pixels are kept. A mesh gives a mesh, points give points; either may
+    be empty.
     """
     usable = np.ones((camera.height, camera.width), dtype=bool) if valid is None else valid
     check_shape("valid", usable, (camera.height, camera.width))
@@ -70,13 +69,13 @@ def visible_from(
         check_shape("surface", surface, (None, 3))
         rows, columns, _, inside = _pixels(surface, camera, T_world_camera)
         return surface[inside[usable[rows, columns]]]
-    if len(surface.faces) == 0:
+    if is_empty(surface):
         return surface
     triangles = small_triangles(surface)
     local = transform(inverse(T_world_camera), triangles.reshape(-1, 3)).reshape(triangles.shape)
     rows, columns, _, inside = _pixels(local.mean(axis=1), camera, np.eye(4))
-    facing = inside[usable[rows, columns]]
-    kept = facing[~_hidden(local, facing, camera)]
+    in_view = inside[usable[rows, columns]]
+    kept = in_view[~_hidden(local, in_view, camera)]
     corners = np.arange(3 * len(kept)).reshape(-1, 3)
     return trimesh.Trimesh(triangles[kept].reshape(-1, 3), corners, process=False)
 
@@ -84,10 +83,7 @@ def visible_from(
 def pixels_near(
     points_mm: np.ndarray, camera: CameraModel, T_world_camera: np.ndarray, *, radius_px: float
 ) -> np.ndarray:
-    """Return the pixels (H, W) bool within `radius_px` of where a point of (N, 3), world mm, falls.
-
-    The part of an image that a loose cloud of its true points covers.
-    """
+    """Return the pixels (H, W) bool within `radius_px` of the projection of any point (N, 3), world mm."""
     check_shape("points_mm", points_mm, (None, 3))
     hit = np.zeros((camera.height, camera.width), dtype=np.uint8)
     rows, columns, _, _ = _pixels(points_mm, camera, T_world_camera)
@@ -99,7 +95,7 @@ def pixels_near(
 def _pixels(
     points_mm: np.ndarray, camera: CameraModel, T_world_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, columns and z (M,) of the points that fall into the image, and which points (M,) these are."""
+    """Return rows, columns and z (M,) of the points inside the image, and their numbers (M,)."""
     local = transform(inverse(T_world_camera), points_mm)
     pixels = camera.project(local)
     with np.errstate(invalid="ignore"):
@@ -111,8 +107,8 @@ def _pixels(
 def _hidden(triangles: np.ndarray, chosen: np.ndarray, camera: CameraModel) -> np.ndarray:
     """Return which of the `chosen` (M,) triangles (F, 3, 3), in the camera and centred in the image, are hidden.
 
-    On each pixel the nearest triangle is painted, a little too wide. How near it is on the ray to a centre is read off
-    its plane, so that neighbours on a wall seen at a grazing angle do not hide each other.
+    The distance of the painted triangle on the ray to a centre is that of its plane, so that neighbours on a wall seen
+    at a grazing angle do not hide each other.
     """
     finer = -(-_PAINTED_PX // camera.width)
     grid = camera.resized(finer * camera.width, finer * camera.height)
