@@ -111,18 +111,18 @@ def test_what_is_seen_does_not_depend_on_where_the_world_begins(seed: int) -> No
 
 
 def test_a_phantom_is_seen_where_no_tissue_cuts_the_line_of_sight() -> None:
-    spec = PhantomSpec(frames=12, width=SIZE[0], height=SIZE[1], seed=3)
+    spec = PhantomSpec(frames=40, width=SIZE[0], height=SIZE[1], seed=3)
     phantom = prepare(spec)
     volume = phantom.scene.volume
     whole = surface_mesh(volume, np.ones(volume.coefficients.shape, bool))
-    points = whole.vertices[np.random.default_rng(0).permutation(len(whole.vertices))[:2000]]
+    points = whole.vertices[np.random.default_rng(0).permutation(len(whole.vertices))[:600]]
 
     def in_sight(T_world_camera: np.ndarray) -> np.ndarray:
         local = transform(inverse(T_world_camera), points)
         column, row = np.nan_to_num(spec.camera.project(local), nan=-9).T
         free = (column > -0.5) & (column < SIZE[0] - 0.5) & (row > -0.5) & (row < SIZE[1] - 0.5)
         # Tissue is where the shape is negative; the last 0.6 mm before the point itself do not count.
-        for share in np.linspace(0, 1, 900)[1:]:
+        for share in np.linspace(0, 1, 500)[1:]:
             there = points + share * (T_world_camera[:3, 3] - points)
             free &= (np.linalg.norm(there - points, axis=1) < 0.6) | (volume.values_at(there)[0] > 0)
         return free
