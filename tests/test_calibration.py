@@ -29,8 +29,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.calibration import Calibration
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.stated import Calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
@@ -202,6 +202,47 @@ def test_a_kannala_brandt_of_orb_slam_has_four_coefficients(tmp_path: Path) -> N
         read(tmp_path, ORB_SLAM3.replace('Camera.type: "KannalaBrandt8"\n', ""))
 
 
+# ---- numbers as typed
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("520.5 525.25 318 245", PINHOLE),
+        ("520.5, 525.25, 318, 245, -0.3, 0.1, 0.001, -0.0005", RADTAN),
+        ("520.5,525.25,318,245,-0.3,0.1,1e-3,-5e-4,-0.01", RADTAN5),
+    ],
+)
+def test_numbers_instead_of_a_file(typed: str, expected: CameraModel) -> None:
+    for camera in (typed, Path(typed)):  # a command line makes a path of it
+        found = read_calibration(camera, SIZE)
+        assert found.camera == expected
+        assert found.source == "camera of the numbers given (--camera)"
+    cropped = read_calibration(typed, (400, 300), "crop:150,100").camera.central
+    assert (cropped.cx, cropped.cy) == (168.0, 145.0)
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("520 525 318", r"camera '520 525 318': it holds 3 numbers: expected fx fy cx cy \[k1 k2 p1 p2 \[k3"),
+        ("520 525 318 245 0.1", "it holds 5 numbers"),
+        ("520 nan 318 245", "NaN or infinity"),
+        ("1000 1000 960 540", "the camera of the numbers given .* its principal point 960, 540 is outside"),
+        ("520 525 318 wide", "520 525 318 wide: there is no such file"),
+    ],
+)
+def test_numbers_that_are_no_camera(typed: str, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        read_calibration(typed, SIZE)
+
+
+def test_a_file_whose_name_is_numbers_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("1 2 3 4").write_text("520.5 525.25 318 245")
+    assert read_calibration("1 2 3 4", SIZE).camera == PINHOLE
+
+
 # ---- what is refused
 
 
@@ -215,8 +256,8 @@ def test_a_kannala_brandt_of_orb_slam_has_four_coefficients(tmp_path: Path) -> N
         ("nan 525 318 245", "NaN or infinity"),
         ("520 525 318 245\n1e999 0 0 0", "NaN or infinity"),
         ("", "0 numbers"),
-        ("hello there", "none of the forms that are read"),
-        ("- 1\n- x\n", "none of the forms that are read"),
+        ("hello there", "none of the formats that are read"),
+        ("- 1\n- x\n", "none of the formats that are read"),
         ("%YAML:1.0\n---\na: 1\n", "no 3x3 camera matrix"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: [0.1, 0.2]\n", "expected 4, 5 or 8"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0]\n", "no 3x3 camera matrix"),
@@ -230,7 +271,7 @@ def test_a_kannala_brandt_of_orb_slam_has_four_coefficients(tmp_path: Path) -> N
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nimage_size: [640.5, 480]\n", "640.5x480 px, which no image"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nimage_size: [-640, 480]\n", "which no image"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\ndepth_scale: -1\n", "depth_scale"),
-        ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nK: [1]\n", "'K' stands in it twice"),
+        ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nK: [1]\n", "'K' is there twice"),
         (f"K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: {[0.1] * 14}\n", "thin-prism"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: [1, 0, 0, 0]\nmodel: mei\n", "lens model 'mei'"),
         ("fx: 520\nfy: 520\ncx: 318\n", "it has no cy"),
@@ -240,14 +281,13 @@ def test_a_kannala_brandt_of_orb_slam_has_four_coefficients(tmp_path: Path) -> N
         ("520 0 318\n0 520 245\n0 9 1\n", "is no camera matrix"),
         ("<opencv_storage><K>1 2 3</K></opencv_storage>", "no 3x3 camera matrix"),
         ("<opencv_storage><K>1 2 3</opencv_storage>", "it is no XML"),
-        (kalibr("radtan", (0.1, 0.2)), "4 intrinsics and 2 distortion_coeffs, expected fu fv pu pv and 4"),
+        (kalibr("radtan", (0.1, 0.2)), "expected 4, 5 or 8 numbers, got 2"),
         (
             kalibr("radtan", RADTAN.distortion).replace("pinhole", "omni"),
-            "camera model 'omni', which has no counterpart",
+            "lens model 'omni radtan' has no counterpart",
         ),
-        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "ds"), "camera model 'ds'"),
-        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "eucm"), "camera model 'eucm'"),
-        (kalibr("thin", ()), "distortion model 'thin', expected one of radtan"),
+        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "ds"), "lens model 'ds radtan'"),
+        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "eucm"), "lens model 'eucm radtan'"),
         (kalibr("fov", (4.0,)), "between 0 and pi"),
         ("1 PINHOLE 640 480 520 520 318", "found 3 parameters where the model PINHOLE has 4"),
         ("1 THIN_PRISM_FISHEYE 640 480 1 2 3 4 5 6 7 8 9 1 2 3", "of the model THIN_PRISM_FISHEYE, which is not read"),

@@ -30,7 +30,6 @@ ENTITIES = (
 OUTSIDE = '<!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/hostname">]><opencv_storage><K>&e;</K></opencv_storage>'
 BOMBS = {
     "aliases": LAUGHS,
-    "alias of a mapping": "K: &k {data: [520, 0, 318, 0, 520, 245, 0, 0, 1]}\nM: *k\n",
     "aliases of a long list": f"a: &a {[1] * 5000}\nb: [{', '.join(['*a'] * 5000)}]\n",
     "merge key": "a: &a {K: [1]}\nb:\n  <<: *a\n",
     "alias of itself": "K: &k [*k]\n",
@@ -100,7 +99,7 @@ def test_binary_junk(junk: str, tmp_path: Path) -> None:
 
 
 def test_what_harms_is_named(tmp_path: Path) -> None:
-    for bomb, word in [("aliases", "alias"), ("entities", "entities"), ("brackets", "deeper"), ("elements", "deeper")]:
+    for bomb, word in [("entities", "entities"), ("brackets", "deeper"), ("dashes", "deeper")]:
         (tmp_path / "bomb").write_text(BOMBS[bomb])
         assert word in refused(tmp_path / "bomb")
 
@@ -126,7 +125,7 @@ def test_a_pipe_and_a_loop_are_not_waited_for(tmp_path: Path) -> None:
 def test_bombs_take_little_memory(bomb: str, tmp_path: Path) -> None:
     (tmp_path / "bomb").write_text(BOMBS[bomb])
     code = (
-        "import resource, sys\nfrom scopemap.cameras.formats import read_calibration\n"
+        "import resource, sys\nfrom scopemap.cameras.formats.reading import read_calibration\n"
         "from scopemap.errors import CalibrationError\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try:\n    read_calibration(sys.argv[1], (640, 480))\nexcept CalibrationError:\n"

@@ -11,9 +11,8 @@ from drawn_datasets import write_pictures
 from drawn_inputs import write_c3vd
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.fitting import fitted, fitted_to
+from scopemap.cameras.formats.calibration import Calibration, fitted, fitted_to
 from scopemap.cameras.formats.reading import read_calibration, stated_calibration
-from scopemap.cameras.formats.stated import Calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, SettingsError
@@ -63,7 +62,7 @@ def test_crop_keeps_the_view_of_every_model_and_says_so(camera: CameraModel, tmp
         ((400, 300), "crop:241,0", "640x480 px, but the images are 400x300 px: too large to have been cut out of it"),
         ((400, 300), "crop:0,181", "too large to have been cut out of it at 0,181 px"),
         ((640, 480), "crop:1,0", "too large to have been cut out"),
-        ((200, 100), "crop:0,0", "principal point 318, 245 lies outside"),
+        ((200, 100), "crop:0,0", "principal point 318, 245 is outside"),
     ],
 )
 def test_a_word_that_does_not_explain_the_size_is_refused(
@@ -88,7 +87,7 @@ def test_a_file_without_a_size_can_be_cut_but_not_scaled(tmp_path: Path) -> None
     found = read_calibration(file, (400, 300), "crop:150,100")
     assert found.camera == PinholeCamera(520.5, 525.25, 168.0, 145.0, 400, 300)
     assert found.source == "calibration file k.txt, cut out at 150,100 px"
-    with pytest.raises(CalibrationError, match="does not say for which size it was made"):
+    with pytest.raises(CalibrationError, match="does not state its image size"):
         read_calibration(file, (320, 240), "scale")
 
 
@@ -97,7 +96,7 @@ def test_shares_of_the_size_fit_any_size_and_cannot_be_cut(tmp_path: Path) -> No
     file.write_text("0.75 1.0 0.5 0.5")
     assert read_calibration(file, (400, 300)).camera == PinholeCamera(300.0, 300.0, 200.0, 150.0, 400, 300)
     assert read_calibration(file, (400, 300)).source.endswith("its numbers taken as shares of the size")
-    with pytest.raises(CalibrationError, match="shares of a size that it does not say"):
+    with pytest.raises(CalibrationError, match="shares of a size that it does not state"):
         read_calibration(file, (400, 300), "crop:1,1")
 
 

@@ -14,10 +14,10 @@ from drawn_inputs import number_in, picture
 from test_datasets_stereomis import write_frames
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.endomapper import read_calibu
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
 
@@ -149,11 +149,11 @@ def test_every_model_of_the_calibration(tmp_path: Path) -> None:
     file = tmp_path / "a_geometrical.xml"
     pinhole = PinholeCamera(*KB4[:4], *SIZE)
     file.write_text(xml(KB4[:4], "calibu_fu_fv_u0_v0"))
-    assert read_calibu(file) == pinhole
+    assert read_calibration(file, SIZE).camera == pinhole
     file.write_text(xml((*KB4[:4], -0.2, 0.05), "calibu_fu_fv_u0_v0_k1_k2"))
-    assert read_calibu(file) == OpenCvCamera(pinhole, (-0.2, 0.05, 0.0, 0.0))
+    assert read_calibration(file, SIZE).camera == OpenCvCamera(pinhole, (-0.2, 0.05, 0.0, 0.0))
     file.write_text(xml(tuple(2 * value for value in KB4[:4]) + KB4[4:], size=(320, 240)))
-    assert read_calibu(file).central.width == 320
+    assert read_calibration(file, (320, 240)).camera.central.width == 320
 
 
 def test_a_calibration_of_another_size_is_rescaled(tmp_path: Path) -> None:
@@ -277,15 +277,15 @@ def test_an_info_file_that_is_none_is_one_sentence(text: str, message: str, tmp_
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no element found"),
-        ("<rig><camera/></rig>", "it has no camera_model"),
-        ('<?xml version="1.0" encoding="none"?><rig/>', "cannot read the calibration"),
-        (xml(kind="calibu_fu_fv_u0_v0_w"), "the type 'calibu_fu_fv_u0_v0_w' is not known"),
-        (xml(KB4[:7]), "holds 7 parameters for 160x120 px, expected 8"),
+        ("", "it holds 0 numbers"),
+        ("<rig><camera/></rig>", "it has no 3x3 camera matrix"),
+        ('<?xml version="1.0" encoding="none"?><rig/>', "none of the formats"),
+        (xml(kind="calibu_fu_fv_u0_v0_w"), "the type 'calibu_fu_fv_u0_v0_w' of its camera_model is not known"),
+        (xml(KB4[:7]), "holds 7 parameters, expected 8"),
         (xml((float("nan"), *KB4[1:])), "expected 8 finite ones"),
         (xml(KB4).replace("79.8", "wide"), "could not convert"),
-        (xml(KB4).replace("<width> 160 </width>", ""), "invalid literal"),
-        (xml(size=(0, 0)), "for 0x0 px"),
+        (xml(KB4).replace("<width> 160 </width>", ""), "could not convert"),
+        (xml(size=(0, 0)), "its size is 0x0 px"),
         (xml(size=(200, 120)), "another aspect"),
         (xml((900.0, *KB4[1:])), "does not fit images of 160x120 px"),
         (xml((*KB4[:2], 300.0, *KB4[3:])), "principal point 300"),

@@ -285,7 +285,7 @@ def test_unreadable_images_are_left_out_and_equal_numbers_refused(tmp_path: Path
         open_sequence(organ)
 
 
-@pytest.mark.parametrize(("text", "message"), [("1,2,3", "hold 3 numbers"), ("46,0,400,0,46,40,0,0,1", "point 400")])
+@pytest.mark.parametrize(("text", "message"), [("1,2,3", "holds 3 numbers"), ("46,0,400,0,46,40,0,0,1", "point 400")])
 def test_cam_txt_that_is_none_is_a_calibration_error(text: str, message: str, tmp_path: Path) -> None:
     organ = write_unity(tmp_path / "UnityCam" / "Colon")
     (organ.parent / "Calibration" / "cam.txt").write_text(text)

@@ -10,7 +10,7 @@ import pytest
 from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
 from scopemap.errors import CalibrationError, InputError
@@ -112,20 +112,20 @@ def test_the_nearest_intrinsics_win(tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", MATRICES)
 def test_every_form_of_the_matrix_is_read(form: str, tmp_path: Path) -> None:
     np.savetxt(tmp_path / "K.txt", MATRICES[form])
-    np.testing.assert_allclose(read_intrinsics(tmp_path / "K.txt", SIZE).matrix, K)
+    np.testing.assert_allclose(read_calibration(tmp_path / "K.txt", SIZE).camera.central.matrix, K)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "hold 0 numbers"),
-        ("1 2 3 4", "hold 4 numbers"),
-        ("a b c", "could not convert"),
+        ("", "holds 0 numbers"),
+        ("1 2 3", "holds 3 numbers"),
+        ("a b c", "none of the formats"),
         ("70 0 400 0 70 30 0 0 1", "principal point 400, 30"),
-        ("0 0 40 0 70 30 0 0 1", "not those of images of 80x64 px"),
-        ("70 0 40 5 70 30 0 0 1", "is no camera matrix"),
-        ("70 0 40 0 70 30 0 0 7", "is no camera matrix"),
-        ("nan 0 40 0 70 30 0 0 1", "not those of images"),
+        ("0 0 40 0 70 30 0 0 1", "does not fit images of 80x64 px"),
+        ("70 0 40\n5 70 30\n0 0 1", "is no camera matrix"),
+        ("70 0 40\n0 70 30\n0 0 7", "is no camera matrix"),
+        ("nan 0 40 0 70 30 0 0 1", "NaN or infinity"),
     ],
 )
 def test_intrinsics_that_are_none_are_one_sentence(text: str, message: str, tmp_path: Path) -> None:

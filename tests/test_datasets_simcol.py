@@ -263,7 +263,7 @@ def test_two_images_of_one_number_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1 2 3 4", "hold 4 numbers"), ("45 0 500 0 45 47 0 0 1", "principal point 500"), ("f", "could not convert")],
+    [("1 2 3", "holds 3 numbers"), ("45 0 500 0 45 47 0 0 1", "principal point 500"), ("f", "none of the formats")],
 )
 def test_cam_txt_that_is_none_is_a_calibration_error(text: str, message: str, tmp_path: Path) -> None:
     folder = write_simcol(tmp_path)

@@ -231,9 +231,9 @@ def test_poses_that_are_none_are_one_sentence(text: str | bytes, message: str, t
     ("changed", "message"),
     [
         ({"fc_x": "wide"}, "could not convert"),
-        ({"fc_x": "nan"}, "NaN, infinity"),
-        ({"kc_3": "inf"}, "NaN, infinity"),
-        ({"res_x": 0}, "a size that is none"),
+        ({"fc_x": "nan"}, "NaN or infinity"),
+        ({"kc_3": "inf"}, "NaN or infinity"),
+        ({"res_x": 0}, "its size is 0x128 px"),
         ({"fc_x": 5000}, "does not fit images of 160x128 px"),
         ({"cc_y": 500}, "does not fit images of 160x128 px"),
         ({"res_x": 180}, "another aspect"),
@@ -250,8 +250,8 @@ def test_a_calibration_that_is_none_is_one_sentence(changed: dict[str, object], 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "'StereoLeft' is missing"),
-        ("res_x=3\n", "File contains no section headers"),
+        ("", "it holds 0 numbers"),
+        ("res_x=3\n", "it has no 3x3 camera matrix"),
         ("[StereoLeft]\nres_x=160\n", "'res_y' is missing"),
         ("[StereoLeft]\nres_x=160\nres_x=160\n", "already exists"),
         ("[StereoLeft]\nres_x=160\nres_y=128\nfc_x=130\nfc_y=130\ncc_x=80\ncc_y=64\nkc_0=1\n", "got 1"),

@@ -1,15 +1,17 @@
-"""Lenses that bend straight lines: OpenCV radial-tangential, Kannala-Brandt fisheye, FOV, Scaramuzza omnidirectional.
+"""Lenses with distortion: OpenCV radial-tangential, Kannala-Brandt fisheye, FOV, Scaramuzza omnidirectional.
 
-All are one increasing radial function, plus a small correction in the plane. The field of a lens ends where its
-radial function stops increasing (there two rays would share a pixel) or where rays no longer point forward; beyond it
-`project` and `unproject` answer NaN.
+Each is one increasing radial function, plus OpenCV's tangential terms. The field of a lens ends where its radial
+function stops increasing (there two rays would share a pixel) or where rays no longer point forward. Beyond the field
+`project` and `unproject` return NaN.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -25,39 +27,71 @@ _Radial = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class OpenCvCamera:
+class _RadialLens(ABC):
+    """A lens that moves points of the plane z = 1 and then sees them through the pinhole camera `plane`."""
+
+    plane: PinholeCamera
+
+    @property
+    def central(self) -> PinholeCamera:
+        """The pinhole camera that agrees with this one near its principal point."""
+        return self.plane
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.plane.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.plane.height
+
+    @abstractmethod
+    def _distorted(self, xy: np.ndarray) -> np.ndarray:
+        """Return where the lens moves points (..., 2) of the plane z = 1, NaN beyond its field."""
+
+    @abstractmethod
+    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
+        """Return the inverse of `_distorted`."""
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
+        xy = self._distorted(_on_plane(points))
+        return xy * np.array([self.plane.fx, self.plane.fy]) + np.array([self.plane.cx, self.plane.cy])
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
+        return _ray(self._undistorted(self.plane.unproject(pixels)[..., :2]))
+
+    def resized(self, width: int, height: int) -> Self:
+        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
+        return replace(self, plane=self.plane.resized(width, height))
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> Self:
+        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
+        return replace(self, plane=self.plane.cropped(x, y, width, height))
+
+
+@dataclass(frozen=True)
+class OpenCvCamera(_RadialLens):
     """OpenCV's radial-tangential lens, `cv2.projectPoints` (Brown 1966).
 
     Attributes
     ----------
-    central : focal lengths, principal point and image size, px.
+    plane : focal lengths, principal point and image size, px.
     distortion : k1 k2 p1 p2 [k3 [k4 k5 k6]] in OpenCV's order.
     """
 
-    central: PinholeCamera
     distortion: tuple[float, ...]
 
     def __post_init__(self) -> None:
         if len(self.distortion) not in (4, 5, 8):
             raise ValueError(f"OpenCvCamera.distortion: expected 4, 5 or 8 numbers, got {len(self.distortion)}")
 
-    @property
-    def width(self) -> int:
-        """Width of the image, px."""
-        return self.central.width
-
-    @property
-    def height(self) -> int:
-        """Height of the image, px."""
-        return self.central.height
-
-    @cached_property
-    def _coefficients(self) -> tuple[float, ...]:
-        return (*self.distortion, *[0.0] * (8 - len(self.distortion)))
-
     @cached_property
     def _fraction(self) -> tuple[Polynomial, Polynomial]:
-        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * (8 - len(self.distortion)))
         return Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
 
     @cached_property
@@ -75,68 +109,45 @@ class OpenCvCamera:
         return r * n / d, n / d + 2 * s * (above.deriv()(s) * d - n * below.deriv()(s)) / d**2
 
     def _tangential(self, xy: np.ndarray) -> np.ndarray:
-        p1, p2 = self._coefficients[2:4]
+        p1, p2 = self.distortion[2:4]
         x, y = xy[..., 0], xy[..., 1]
         s = x * x + y * y
         return np.stack([2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1)
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
-        xy = _on_plane(points)
+    def _distorted(self, xy: np.ndarray) -> np.ndarray:
         r = np.linalg.norm(xy, axis=-1)
         r = np.where(r <= self.field_radius, r, np.nan)
-        return _to_pixels(self.central, _with_radius(xy, self._radial(r)[0]) + self._tangential(xy))
+        return _with_radius(xy, self._radial(r)[0]) + self._tangential(xy)
 
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
-        bent = self.central.unproject(pixels)[..., :2]
-        shift = np.zeros_like(bent)
+    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
+        shift = np.zeros_like(xy)
         for _ in range(_MAX_STEPS):
-            straight = bent - shift
-            radius = _invert_increasing(self._radial, self._grid, np.linalg.norm(straight, axis=-1))
-            xy = _with_radius(straight, radius)
-            previous, shift = shift, self._tangential(xy)
+            radial = xy - shift
+            radius = _invert_increasing(self._radial, self._grid, np.linalg.norm(radial, axis=-1))
+            found = _with_radius(radial, radius)
+            previous, shift = shift, self._tangential(found)
             if not np.any(np.abs(shift - previous) > 1e-14):
                 break
-        return _ray(xy)
-
-    def resized(self, width: int, height: int) -> OpenCvCamera:
-        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
-        return replace(self, central=self.central.resized(width, height))
-
-    def cropped(self, x: int, y: int, width: int, height: int) -> OpenCvCamera:
-        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
-        return replace(self, central=self.central.cropped(x, y, width, height))
+        return found
 
 
 @dataclass(frozen=True)
-class FisheyeCamera:
+class FisheyeCamera(_RadialLens):
     """Kannala-Brandt fisheye lens, `cv2.fisheye` (IEEE PAMI 28(8), 2006, eq. 6 without its odd terms).
 
     The angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
 
     Attributes
     ----------
-    central : focal lengths, principal point and image size, px.
+    plane : focal lengths, principal point and image size, px.
     distortion : k1 k2 k3 k4.
     """
 
-    central: PinholeCamera
     distortion: tuple[float, ...]
 
     def __post_init__(self) -> None:
         if len(self.distortion) != 4:
             raise ValueError(f"FisheyeCamera.distortion: expected 4 numbers, got {len(self.distortion)}")
-
-    @property
-    def width(self) -> int:
-        """Width of the image, px."""
-        return self.central.width
-
-    @property
-    def height(self) -> int:
-        """Height of the image, px."""
-        return self.central.height
 
     @cached_property
     def _polynomial(self) -> Polynomial:
@@ -155,56 +166,31 @@ class FisheyeCamera:
     def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._polynomial(angle), self._polynomial.deriv()(angle)
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
-        xy = _on_plane(points)
+    def _distorted(self, xy: np.ndarray) -> np.ndarray:
         angle = np.arctan(np.linalg.norm(xy, axis=-1))
-        angle = np.where(angle <= self.field_rad, angle, np.nan)
-        return _to_pixels(self.central, _with_radius(xy, self._polynomial(angle)))
+        return _with_radius(xy, self._polynomial(np.where(angle <= self.field_rad, angle, np.nan)))
 
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
-        bent = self.central.unproject(pixels)[..., :2]
-        angle = _invert_increasing(self._radial, self._grid, np.linalg.norm(bent, axis=-1))
-        return _ray(_with_radius(bent, np.tan(angle)))
-
-    def resized(self, width: int, height: int) -> FisheyeCamera:
-        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
-        return replace(self, central=self.central.resized(width, height))
-
-    def cropped(self, x: int, y: int, width: int, height: int) -> FisheyeCamera:
-        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
-        return replace(self, central=self.central.cropped(x, y, width, height))
+    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
+        return _with_radius(xy, np.tan(_invert_increasing(self._radial, self._grid, np.linalg.norm(xy, axis=-1))))
 
 
 @dataclass(frozen=True)
-class FovCamera:
+class FovCamera(_RadialLens):
     """Lens of one parameter (Devernay and Faugeras, Machine Vision and Applications 13, 2001, section 3.2).
 
     The distance r from the axis on the plane z = 1 becomes atan(2 r tan(omega / 2)) / omega.
 
     Attributes
     ----------
-    plane : takes the bent plane to pixels: scales (fx, fy), principal point and image size, px.
+    plane : takes the distorted plane to pixels: scales (fx, fy), principal point and image size, px.
     omega : the lens' angle of view in the model, rad, 0 < omega < pi.
     """
 
-    plane: PinholeCamera
     omega: float
 
     def __post_init__(self) -> None:
         if not 0 < self.omega < np.pi:
             raise ValueError(f"FovCamera.omega: expected an angle between 0 and pi, got {self.omega:g}")
-
-    @property
-    def width(self) -> int:
-        """Width of the image, px."""
-        return self.plane.width
-
-    @property
-    def height(self) -> int:
-        """Height of the image, px."""
-        return self.plane.height
 
     @property
     def central(self) -> PinholeCamera:
@@ -215,27 +201,15 @@ class FovCamera:
     def _slope(self) -> float:
         return float(2 * np.tan(self.omega / 2) / self.omega)
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
-        xy = _on_plane(points)
+    def _distorted(self, xy: np.ndarray) -> np.ndarray:
         r = np.linalg.norm(xy, axis=-1)
         r = np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)
-        return _to_pixels(self.plane, _with_radius(xy, np.arctan(r * self._slope * self.omega) / self.omega))
+        return _with_radius(xy, np.arctan(r * self._slope * self.omega) / self.omega)
 
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
-        bent = self.plane.unproject(pixels)[..., :2]
-        angle = np.linalg.norm(bent, axis=-1) * self.omega
+    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
+        angle = np.linalg.norm(xy, axis=-1) * self.omega
         r = np.tan(np.where(angle < np.pi / 2, angle, np.nan)) / (self._slope * self.omega)
-        return _ray(_with_radius(bent, np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)))
-
-    def resized(self, width: int, height: int) -> FovCamera:
-        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
-        return replace(self, plane=self.plane.resized(width, height))
-
-    def cropped(self, x: int, y: int, width: int, height: int) -> FovCamera:
-        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
-        return replace(self, plane=self.plane.cropped(x, y, width, height))
+        return _with_radius(xy, np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan))
 
 
 @dataclass(frozen=True)
@@ -329,10 +303,6 @@ def _on_plane(points: np.ndarray) -> np.ndarray:
 
 def _ray(xy: np.ndarray) -> np.ndarray:
     return np.concatenate([xy, np.where(np.isfinite(xy[..., :1]), 1.0, np.nan)], -1)
-
-
-def _to_pixels(camera: PinholeCamera, xy: np.ndarray) -> np.ndarray:
-    return xy * np.array([camera.fx, camera.fy]) + np.array([camera.cx, camera.cy])
 
 
 def _with_radius(xy: np.ndarray, radius: np.ndarray) -> np.ndarray:

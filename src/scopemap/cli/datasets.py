@@ -60,7 +60,8 @@ def check(
         typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Calibration to check with, instead of the data set's.")
+        Path | None,
+        typer.Option(metavar="FILE|NUMBERS", help="Calibration, as for `run`, instead of the data set's."),
     ] = None,
     settings: SetPairs = None,
     as_json: AsJson = False,

@@ -43,7 +43,8 @@ def inspect(
         typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Calibration, for the mask that a run with it would find.")
+        Path | None,
+        typer.Option(metavar="FILE|NUMBERS", help="Calibration, as for `run`: for the mask that a run finds."),
     ] = None,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:5000, ::10.")

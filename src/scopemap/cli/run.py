@@ -65,7 +65,8 @@ def run(
     camera: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Calibration: OpenCV YAML, or text 'fx fy cx cy', then k1 k2 p1 p2 k3 if any."
+            metavar="FILE|NUMBERS",
+            help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 [k3]]', px of the input's images.",
         ),
     ] = None,
     camera_fit: Annotated[

@@ -9,9 +9,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from scopemap.cameras.formats.fitting import fitted
+from scopemap.cameras.formats.calibration import Calibration, fitted
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.stated import Calibration
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError

@@ -14,9 +14,8 @@ from pathlib import Path
 from struct import Struct
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, check_plausible
 from scopemap.cameras.formats.colmap_binary import opened_model
-from scopemap.cameras.formats.fitting import check_plausible
-from scopemap.cameras.formats.stated import LARGEST_SIDE_PX
 from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
 

@@ -1,79 +1,233 @@
-"""Which form a calibration file has, told by its content; what it says; and that fitted to the images."""
+"""Reading a camera: numbers as typed, or a calibration file, whose format is recognised by its content."""
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from scopemap.cameras.formats import colmap, kalibr, named_numbers, plain_numbers
-from scopemap.cameras.formats.calibu import of_calibu
-from scopemap.cameras.formats.contents import calibration_bytes, calibration_text
-from scopemap.cameras.formats.fitting import fitted
-from scopemap.cameras.formats.opencv import has_matrix, of_matrices
-from scopemap.cameras.formats.stated import Calibration, Size
-from scopemap.cameras.formats.stereo_ini import is_stereo_ini, of_stereo_ini
-from scopemap.cameras.formats.trees import read_tree
+import numpy as np
+
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats import colmap
+from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, Calibration, Size, check_size, fitted, pinhole_of
+from scopemap.cameras.formats.lens import lens_of, model_in
+from scopemap.cameras.formats.parsing import (
+    MOST_TERMS,
+    Fields,
+    calibration_bytes,
+    named_values,
+    number_rows,
+    read_tree,
+)
+from scopemap.cameras.formats.text_formats import intrinsics_of, is_stereo_ini, of_calibu, of_numbers, of_stereo_ini
+from scopemap.cameras.lenses import OmnidirectionalCamera
 from scopemap.errors import CalibrationError
 
-_SCARED = "camera-calibration"  # in frame_data*.json
-_FORMS = (
+_FORMATS = (
     "OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, OCamCalib, a camera matrix, lines `fx: 520`, or one line fx fy cx cy "
     "[k1 k2 p1 p2 [k3]]"
 )
+_SCARED = "camera-calibration"  # in frame_data*.json
+_KALIBR_CAMERA = re.compile(r"cam\d{1,3}")
+_MATRIX_NAMES = (
+    *("camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1"),
+    *("intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics"),
+)
+# Under these names some files put what others have at their top.
+_INNER = ("intrinsics", "projection_parameters", "camera_intrinsics", "intrinsic")
+_NERFSTUDIO = "fl_x"
+_INTRINSICS = {
+    "fx": ("fx", _NERFSTUDIO, "focal_x", "focal_length_x"),
+    "fy": ("fy", "fl_y", "focal_y", "focal_length_y"),
+    "cx": ("cx", "ppx"),
+    "cy": ("cy", "ppy"),
+}
+_CORNER_TO_CENTRE_PX = 0.5
+_SIZES = ("image_size", "img_size", "im_size", "resolution", "image_resolution", "frame_size", "image_shape")
+_SIDES = tuple((f"{of}_width", f"{of}_height") for of in ("image", "img", "im", "frame"))
+# Of the image, or of the calibration board, whose number of corners or squares has the same names.
+_UNSURE_SIDES = (("width", "height"), ("w", "h"), ("cols", "rows"))
+_SMALLEST_SIDE_PX = 16
 
 
-def read_calibration(file: Path | str, image_size: Size, fit: str = "exact") -> Calibration:
-    """Return the camera in `file` for images of `image_size` (width, height), px.
+def read_calibration(camera: Path | str, image_size: Size, fit: str = "exact") -> Calibration:
+    """Return the camera in a file, or of numbers `fx fy cx cy [k1 k2 p1 p2 [k3]]`, for images of `image_size`, px.
 
-    The file's form is told by its content. A calibration without a size is taken as made for the images. `fit` says
-    what another size means: exact: it is refused; scale: the images were resized from it (its aspect must agree within
-    1 %); crop:X,Y: they were cut out of it at that pixel. Raises `CalibrationError` where the file cannot be read or
-    does not fit.
+    `image_size` is (width, height). A calibration without a size is taken as made for the images. `fit` is the meaning
+    of another size: exact: it is refused; scale: the images were resized from it (aspects agree within 1 %); crop:X,Y:
+    they were cut out of it at that pixel. Raises `CalibrationError` where the camera cannot be read or does not fit.
     """
-    return fitted(stated_calibration(file, image_size), image_size, fit)
+    return fitted(stated_calibration(camera, image_size), image_size, fit)
 
 
-def stated_calibration(file: Path | str, image_size: Size) -> Calibration:
-    """Return the camera as it stands in `file`, at the file's own size, or that of the images where it has none.
+def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
+    """Return the camera at the file's own size, or that of the images where it has none.
 
-    Raises `CalibrationError` where the file cannot be read.
+    Raises `CalibrationError` where it cannot be read.
     """
-    file = Path(file)
+    typed, file = number_rows(str(camera)), Path(camera)
+    if typed and len(typed[0]) > 1 and not os.path.isfile(file):
+        try:
+            return replace(of_numbers(typed, image_size), source="camera of the numbers given (--camera)")
+        except ValueError as error:
+            raise CalibrationError(f"cannot use the camera '{str(camera)[:200]}': {error}") from None
     try:
-        calibration = _stated(file, image_size)
+        calibration = _read(file, image_size)
     except ValueError as error:
         raise CalibrationError(f"the calibration {file} cannot be used: {error}") from None
     shares = ", its numbers taken as shares of the size" if calibration.size_origin == "relative" else ""
     return replace(calibration, source=f"calibration file {file.name}{calibration.source}{shares}", file=file)
 
 
-def _stated(file: Path, image_size: Size) -> Calibration:
-    if colmap.is_cameras_binary(calibration_bytes(file)):
+def _read(file: Path, image_size: Size) -> Calibration:
+    content = calibration_bytes(file)
+    if colmap.is_cameras_binary(content):
         return Calibration(colmap.only_camera(file, binary=True), None, "")
-    text = calibration_text(file)
-    rows = plain_numbers.rows_in(text)
-    if rows is not None:
-        return plain_numbers.of_rows(rows, image_size)
+    if b"\0" in content:
+        raise ValueError("it is binary, not text")
+    text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
+    if (rows := number_rows(text)) is not None:
+        return of_numbers(rows, image_size)
     if colmap.is_cameras_text(text):
         return Calibration(colmap.only_camera(file, binary=False), None, "")
     if is_stereo_ini(text):
         return Calibration(of_stereo_ini(text), None, "")
     if "<camera_model" in text:
         return Calibration(of_calibu(text), None, "")
-    return _of_tree(text, image_size)
+    tree = (None if text.lstrip()[:1] in ("{", "[", "<") else named_values(text)) or read_tree(text)
+    if not isinstance(tree, Fields):
+        raise ValueError(f"it has none of the formats that are read: {_FORMATS}")
+    return of_fields(next(iter(tree.inner((_SCARED,))), tree), image_size)
 
 
-def _of_tree(text: str, image_size: Size) -> Calibration:
-    flat = None if text.lstrip()[:1] in ("{", "[", "<") else named_numbers.pairs_in(text)
-    tree = flat or read_tree(text)
-    if not isinstance(tree, dict):
-        raise ValueError(f"it has none of the forms that are read: {_FORMS}")
-    inner = tree.get(_SCARED)
-    if isinstance(inner, dict):
-        return of_matrices(inner, image_size)
-    cameras = kalibr.cameras_in(tree)
-    if cameras:
-        return kalibr.of_chain(tree, cameras, image_size)
-    if not has_matrix(tree) and named_numbers.has_names(tree):
-        return named_numbers.of_names(tree, image_size)
-    return of_matrices(tree, image_size)
+def of_fields(fields: Fields, image_size: Size) -> Calibration:
+    """Return the camera of a mapping: OpenCV, ROS, Kalibr, ORB-SLAM, VINS, nerfstudio, OneSLAM and their likes.
+
+    Raises `ValueError` where it holds none.
+    """
+    cameras = sorted(name for name, _ in fields.pairs if _KALIBR_CAMERA.fullmatch(name))
+    chain = fields.inner(cameras)
+    levels = [chain[0], fields] if chain else [fields, *fields.inner(_INNER)]
+    intrinsics, note = _intrinsics(levels)
+    size, size_note = _size_of(levels, intrinsics, image_size)
+    pinhole, origin = pinhole_of(intrinsics, size, image_size)
+    model = model_in(levels)
+    if "omnidirectional" in model and any(fields.nodes(("polynomial",))):
+        camera: CameraModel = _omnidirectional(fields, pinhole)
+        lens_note = ""
+    else:
+        camera, lens_note = lens_of(pinhole, levels, model)
+    depth_scale_mm = next((s for level in levels if (s := level.number(("depth_scale",))) is not None), None)
+    if depth_scale_mm is not None and depth_scale_mm <= 0:
+        raise ValueError(f"depth_scale, mm per unit of the depth files, must be positive, found {depth_scale_mm:g}")
+    chain_note = f", {cameras[0]} of {len(chain)} cameras" if len(chain) > 1 else ""
+    notes = chain_note + note + size_note + lens_note
+    return _read_out(fields, Calibration(camera, depth_scale_mm, notes, origin))
+
+
+def _intrinsics(levels: Sequence[Fields]) -> tuple[list[float], str]:
+    """Return fx fy cx cy, and a note: of a matrix, else by name, else of Kalibr's list."""
+    matrix = next((nine for level in levels if (nine := level.numbers(_MATRIX_NAMES, 9)) is not None), None)
+    if matrix is not None:
+        return intrinsics_of(np.reshape(matrix, (3, 3)))
+    for level in levels:
+        found = {name: level.number(spellings) for name, spellings in _INTRINSICS.items()}
+        intrinsics = [value for value in found.values() if value is not None]
+        if found["fx"] is None:
+            continue
+        if len(intrinsics) < 4:
+            raise ValueError(f"it has no {', '.join(name for name, value in found.items() if value is None)}")
+        if level.number((_NERFSTUDIO,)) is not None and max(intrinsics[2:]) > 1:
+            intrinsics[2:] = [value - _CORNER_TO_CENTRE_PX for value in intrinsics[2:]]
+            return intrinsics, ", its pixels counted from the corner, as in nerfstudio"
+        return intrinsics, ""
+    listed = next((four for level in levels if (four := level.numbers(("intrinsics",), 4)) is not None), None)
+    if listed is None:
+        raise ValueError("it has no 3x3 camera matrix under any usual name (camera_matrix, K), and no fx fy cx cy")
+    return listed, ""
+
+
+def _omnidirectional(fields: Fields, pinhole: PinholeCamera) -> OmnidirectionalCamera:
+    """Return Scaramuzza's lens as `write_calibration` writes it."""
+    polynomial, stretch = fields.numbers(("polynomial",)) or [], fields.numbers(("stretch",)) or [1.0, 0.0, 0.0]
+    if not 0 < len(polynomial) <= MOST_TERMS or len(stretch) != 3:
+        raise ValueError(f"expected a 'polynomial' of up to {MOST_TERMS} numbers and a 'stretch' of 3")
+    c, d, e = stretch
+    centre = (pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    return OmnidirectionalCamera(tuple(polynomial), *centre, (c, d, e))
+
+
+def _size_of(levels: Sequence[Fields], intrinsics: Sequence[float], image_size: Size) -> tuple[Size | None, str]:
+    """Return the size (width, height), px, that a tree states, None where it states none, and a note on it.
+
+    A `width` and the like that does not contain the principal point is the calibration board's and passed over. Zeros,
+    which ROS writes for an unknown size, are no size. Raises `ValueError` for half a size.
+    """
+    _, _, cx, cy = intrinsics
+    note = ""
+    for width, height, kind in _sizes_in(levels):
+        if not width and not height:
+            continue
+        if not width or not height:
+            raise ValueError("it states one of width and height, but not both")
+        if kind == "unsure" and not (min(width, height) >= _SMALLEST_SIDE_PX and cx < width and cy < height):
+            note = f", its size {width:g}x{height:g} passed over as no image's"
+            continue
+        size = check_size(width, height)
+        if kind == "list" and size != image_size and size[::-1] == image_size:
+            as_stated, swapped = ((cx - w / 2) ** 2 + (cy - h / 2) ** 2 for w, h in (size, image_size))
+            if swapped < as_stated:
+                return image_size, f", its size {size[0]}, {size[1]} taken as height, width"
+        return size, ""
+    return None, note
+
+
+def _sizes_in(levels: Sequence[Fields]) -> Iterator[tuple[float | None, float | None, str]]:
+    for level in levels:
+        if (pair := level.numbers(_SIZES, 2)) is not None:
+            yield pair[0], pair[1], "list"
+        for place in (level, *level.inner(_SIZES)):
+            for wide, high in _SIDES if place is level else (*_SIDES, *_UNSURE_SIDES):
+                yield place.number((wide,)), place.number((high,)), "sides"
+        if (pair := level.numbers(("size",), 2)) is not None:
+            yield pair[0], pair[1], "unsure"
+        for wide, high in _UNSURE_SIDES:
+            yield level.number((wide,)), level.number((high,)), "unsure"
+
+
+def read_out(camera: CameraModel, region: tuple[int, int, int, int], binning: tuple[int, int]) -> CameraModel:
+    """Return the camera of the images that ROS publishes of a sensor (sensor_msgs/CameraInfo): a region of it, binned.
+
+    `region` is x, y, width, height, px, of the sensor that `camera` sees; no width or height: all of it. `binning` is
+    columns and rows of a block; 0 stands for 1. Raises `ValueError` where the region is no part of the sensor.
+    """
+    x, y, width, height = region if region[2] and region[3] else (0, 0, camera.width, camera.height)
+    across, down = (max(1, count) for count in binning)
+    columns, rows = width // across, height // down
+    if x + width > camera.width or y + height > camera.height or not columns or not rows:
+        raise ValueError(f"its region, {width}x{height} px at {x},{y}, is no part of {camera.width}x{camera.height} px")
+    if (x, y, width, height, across, down) == (0, 0, camera.width, camera.height, 1, 1):
+        return camera
+    return camera.cropped(x, y, columns * across, rows * down).resized(columns, rows)
+
+
+def _read_out(fields: Fields, calibration: Calibration) -> Calibration:
+    def whole(place: Fields, name: str) -> int:
+        value = place.number((name,)) or 0.0
+        if value % 1 or not 0 <= value <= LARGEST_SIDE_PX:
+            raise ValueError(f"{name} must be a whole number of pixels, found {value:g}")
+        return int(value)
+
+    roi = next(iter(fields.inner(("roi",))), Fields([]))
+    region = (whole(roi, "x_offset"), whole(roi, "y_offset"), whole(roi, "width"), whole(roi, "height"))
+    sensor = calibration.camera
+    camera = read_out(sensor, region, (whole(fields, "binning_x"), whole(fields, "binning_y")))
+    if camera is sensor:
+        return calibration
+    if calibration.size_origin != "stated":
+        raise ValueError("it has a region or a binning, but not the size of the sensor (image_width, image_height)")
+    source = f"{calibration.source}, its region and binning of {sensor.width}x{sensor.height} px taken"
+    return replace(calibration, camera=camera, source=source)

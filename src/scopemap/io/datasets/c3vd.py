@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.fitting import fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.lenses import OmnidirectionalCamera
 from scopemap.errors import InputError
 from scopemap.io.decoding import read_decoded

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.formats.colmap import camera_model, read_cameras
-from scopemap.cameras.formats.fitting import fitted_to, rescaled_note
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse
 from scopemap.io.datasets.colmap_files import image_path, model_files, read_images

@@ -12,7 +12,7 @@ import json
 import re
 from pathlib import Path
 
-from scopemap.cameras.formats.calibu import read_calibu
+from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.colmap_archive import read_largest_model
@@ -44,7 +44,7 @@ class EndoMapperSequence(PosedVideo):
         if self.camera is None:
             file = self._calibration_file(path / f"{video.stem}_info.json")
             if file is not None:
-                self._calibrate(read_calibu(file), file)
+                self._calibrate(stated_calibration(file, (self.width, self.height)).camera, file)
         self._take_poses(path / "meta-data" / "colmap" / f"{video.stem}.zip")
 
     @staticmethod

@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.contents import calibration_text
-from scopemap.cameras.formats.fitting import fitted_to, rescaled_note
-from scopemap.cameras.formats.named_numbers import numbers_of_pairs
-from scopemap.errors import CalibrationError, InputError
+from scopemap.cameras.formats.calibration import check_plausible, fitted_to, rescaled_note
+from scopemap.cameras.formats.reading import stated_calibration
+from scopemap.errors import InputError
 from scopemap.io.datasets.exr import can_read_exr, read_exr_red
 from scopemap.io.datasets.unity import mirrored, numbers_of, poses_of_rows
 from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder
@@ -103,9 +102,11 @@ class EndoMapperSimFolder(ImageFolder):
 
     def _use_published(self) -> None:
         file = self.path / _CALIBRATION
-        camera = read_calibration_txt(file) if file.is_file() else CAMERA
+        camera = stated_calibration(file, (self.width, self.height)).camera if file.is_file() else CAMERA
         known = _CALIBRATION if file.is_file() else "published calibration of the simulated sequences"
-        self.camera = fitted_to(camera, (self.width, self.height), str(file) if file.is_file() else "shipped for it")
+        name = str(file) if file.is_file() else "shipped for it"
+        self.camera = fitted_to(camera, (self.width, self.height), name)
+        check_plausible(self.camera, f"the calibration {name}")
         self.camera_source = known + rescaled_note(camera, self.camera)
 
 
@@ -139,23 +140,6 @@ def read_trajectory_csv(file: Path) -> tuple[dict[int, np.ndarray], list[float],
     if not np.isfinite(times_s).all() or any(b <= a for a, b in pairwise(times_s)):
         times_s, fault = [], fault or f"{file}: the times do not increase and were left out"
     return dict(zip(np.flatnonzero(known).tolist(), mirrored(poses), strict=True)), times_s, fault
-
-
-def read_calibration_txt(file: Path) -> PinholeCamera:
-    """Return the camera of lines `fx: 472.6`, also fy, cx, cy, cols, rows; `CalibrationError` where one is missing."""
-    try:
-        values = numbers_of_pairs(calibration_text(file))
-        fx, fy, cx, cy, columns, rows = (values[key] for key in ("fx", "fy", "cx", "cy", "cols", "rows"))
-    except KeyError as error:
-        raise CalibrationError(f"cannot read the calibration in {file}: {error} is missing") from None
-    except ValueError as error:
-        raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
-    if not (fx > 0 and fy > 0 and 0 <= cx < columns <= _LARGEST_SIDE_PX and 0 <= cy < rows <= _LARGEST_SIDE_PX):
-        raise CalibrationError(
-            f"the calibration {file} is none: focal length {fx:g}, {fy:g}, principal point {cx:g}, {cy:g} px in "
-            f"images of {columns:g}x{rows:g} px"
-        )
-    return PinholeCamera(fx, fy, cx, cy, round(columns), round(rows))
 
 
 def _numbered(folder: Path, name: re.Pattern[str], suffix: str) -> dict[int, Path]:

@@ -14,7 +14,7 @@ from tokenize import TokenError
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.fitting import fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.decoding import read_decoded
 from scopemap.io.images import SUFFIXES, ImageFolder, frame_number, image_files

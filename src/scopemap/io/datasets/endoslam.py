@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError
 from scopemap.io.datasets.endoslam_poses import POSE_FILES, CameraPath, find_poses, read_camera_path
 from scopemap.io.decoding import read_decoded
@@ -109,7 +109,10 @@ class EndoSlamFolder(ImageFolder):
         around = (self.path.absolute(), *self.path.absolute().parents[:3])
         file = next((f for folder in around if (f := folder / "Calibration" / "cam.txt").is_file()), None)
         if file is not None:
-            self.camera, self.camera_source = read_intrinsics(file, size), f"intrinsics of the data set ({file})"
+            self.camera, self.camera_source = (
+                read_calibration(file, size).camera,
+                f"intrinsics of the data set ({file})",
+            )
             self.notes.append("cam.txt is used as it stands: pixel centres that count from 0, no distortion")
         elif rendered and size == (UNITY_CAMERA.width, UNITY_CAMERA.height):
             self.camera, self.camera_source = UNITY_CAMERA, "published UnityCam intrinsics"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.frame import TruthQuality
 from scopemap.io.images import ImageFolder, image_files, read_depth16
 
@@ -36,7 +36,7 @@ class HamlynFolder(ImageFolder):
         self.notes += [f"depth beside the images: {self._origin}", "no pose is known: the data set has none"]
         file = self._intrinsics_file()
         if self.camera is None and file is not None:
-            self.camera = read_intrinsics(file, (self.width, self.height))
+            self.camera = read_calibration(file, (self.width, self.height)).camera
             self.camera_source = f"published intrinsics ({file})"
 
     @staticmethod

@@ -8,6 +8,7 @@ Teufel et al., "OneSLAM to map them all", IJCARS 2024.
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.contents import calibration_text
+from scopemap.cameras.formats.parsing import calibration_bytes
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.trees import read_tree
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.tum import read_stamped_poses, unlikely_depth
 from scopemap.io.decoding import read_decoded
@@ -148,8 +148,8 @@ def _numbered(files: list[Path]) -> dict[int, Path]:
 
 def _read_calibration(file: Path) -> dict[str, Any]:
     try:
-        stated = read_tree(calibration_text(file))
-    except ValueError as error:
+        stated = json.loads(calibration_bytes(file))
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
     if not isinstance(stated, dict):
         raise CalibrationError(f'the calibration {file} is no object with "intrinsics"')

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.fitting import check_plausible, fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import check_plausible, fitted_to, rescaled_note
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.frame import TruthQuality
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth

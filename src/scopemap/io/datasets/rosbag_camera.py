@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.distortion import model_in
-from scopemap.cameras.formats.fields import Fields
-from scopemap.cameras.formats.lens_models import with_lens
-from scopemap.cameras.formats.opencv import read_out
-from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.formats.calibration import Calibration
+from scopemap.cameras.formats.lens import model_in, with_lens
+from scopemap.cameras.formats.parsing import Fields
+from scopemap.cameras.formats.reading import read_out
 from scopemap.errors import CalibrationError
 
 _OPENCV_TERMS = (4, 5, 8)
@@ -57,7 +56,7 @@ def _with_lens(info: Any, pinhole: PinholeCamera) -> tuple[CameraModel, str]:
     if not np.isfinite(terms).all():
         raise ValueError("its distortion is not finite")
     length = next((length for length in _OPENCV_TERMS if len(terms) <= length), len(terms))
-    model = model_in([Fields({"distortion_model": info.distortion_model})])
+    model = model_in([Fields([("distortion_model", info.distortion_model)])])
     try:
         return with_lens(pinhole, model, [*terms, *[0.0] * (length - len(terms))])
     except ValueError as error:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.opencv import of_matrices
+from scopemap.cameras.formats.parsing import Fields
+from scopemap.cameras.formats.reading import of_fields
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.geometry.se3 import inverse, orthonormalised
@@ -90,7 +91,7 @@ def calibration_camera(calibration: dict[str, Any], size: tuple[int, int], sourc
     `KL` is its matrix, `DL` holds k1 k2 p1 p2 k3. Raises `CalibrationError` where they are not there.
     """
     try:
-        return of_matrices(calibration, size).camera
+        return of_fields(Fields(calibration.items()), size).camera
     except ValueError as error:
         raise CalibrationError(f"the calibration in {source} cannot be used: {error}") from None
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.fitting import rescaled_note
-from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.calibration import rescaled_note
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, se3
@@ -71,7 +71,7 @@ class SevenScenesFolder(ImageFolder):
 
     def _use_camera(self) -> None:
         file = self.path / "camera-intrinsics.txt"
-        stated = read_intrinsics(file, (self.width, self.height)) if file.is_file() else None
+        stated = read_calibration(file, (self.width, self.height)).camera if file.is_file() else None
         if stated is None or stated == DEPTH_CAMERA.resized(self.width, self.height):
             self._check_aspect()
             self.camera = COLOUR_CAMERA.resized(self.width, self.height)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.plain_numbers import read_intrinsics
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError
 from scopemap.io.datasets.unity import mirrored, numbers_of, poses_of_rows
 from scopemap.io.decoding import read_decoded
@@ -45,7 +45,7 @@ class SimColFolder(ImageFolder):
         self._poses = self._read_poses()
         file = _beside(path, "cam.txt")
         if self.camera is None and file is not None:
-            self.camera = read_intrinsics(file, (self.width, self.height))
+            self.camera = read_calibration(file, (self.width, self.height)).camera
             self.camera_source = f"intrinsics of the data set ({file})"
             self.notes.append("cam.txt is used as it stands, for pixel centres that count from 0 (it does not say)")
 

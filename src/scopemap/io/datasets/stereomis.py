@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.stereo_ini import read_left_camera
+from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.io.datasets.posed_video import PosedVideo
 from scopemap.io.datasets.unity import numbers_of, poses_of_rows
@@ -38,7 +38,8 @@ class StereoMisFolder(PosedVideo):
 
     def __init__(self, path: Path) -> None:
         file = path / _CALIBRATION
-        camera = read_left_camera(file) if file.is_file() else None
+        # The file states its own size.
+        camera = stated_calibration(file, (1, 1)).camera if file.is_file() else None
         super().__init__(path, _video_in(path), _PUBLISHED_ASPECT if camera is None else camera.width / camera.height)
         if self.camera is None and camera is not None:
             self._calibrate(camera, file)

@@ -1,0 +1,184 @@
+"""A camera as a file states it, and the same camera for images of another size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.errors import CalibrationError, SettingsError
+
+Size: TypeAlias = tuple[int, int]
+SizeOrigin: TypeAlias = Literal["stated", "images", "relative"]
+
+LARGEST_SIDE_PX = 100_000
+_LONGEST_RELATIVE_FOCAL = 10.0
+_ASPECT_TOLERANCE = 0.01
+_CROP = re.compile(r"crop:(\d{1,6}),(\d{1,6})")
+_FOCAL_PER_WIDTH = (0.3, 5.0)
+_FOCAL_RATIO = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera and where it is from.
+
+    Attributes
+    ----------
+    camera : camera model.
+    depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it.
+    source : how the camera is known, one phrase.
+    size_origin : where the size of `camera` is from. stated: the file. images: the file has none, and that of the
+        images was taken. relative: as images, and the file's numbers are shares of the size.
+    file : the file, None where there is none.
+    """
+
+    camera: CameraModel
+    depth_scale_mm: float | None
+    source: str
+    size_origin: SizeOrigin = "stated"
+    file: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """The name in error messages."""
+        return f"the calibration {self.file}" if self.file else f"the {self.source}"
+
+
+def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Size) -> tuple[PinholeCamera, SizeOrigin]:
+    """Return the pinhole camera of fx fy cx cy, and where its size is from.
+
+    The size is `stated`, else that of the images. Numbers with cx and cy up to 1 and focal lengths below 10 are shares
+    of width and height.
+    """
+    fx, fy, cx, cy = intrinsics
+    width, height = check_size(*(stated or image_size))
+    if max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL:
+        camera = PinholeCamera(fx * width, fy * height, cx * width, cy * height, width, height)
+        return camera, "stated" if stated else "relative"
+    return PinholeCamera(fx, fy, cx, cy, width, height), "stated" if stated else "images"
+
+
+def check_size(width: float, height: float) -> Size:
+    """Return the size in whole pixels; `ValueError` where no image has it."""
+    if not (1 <= width <= LARGEST_SIDE_PX and 1 <= height <= LARGEST_SIDE_PX) or width % 1 or height % 1:
+        raise ValueError(f"its size is {width:g}x{height:g} px, which no image has")
+    return int(width), int(height)
+
+
+def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Calibration:
+    """Return the calibration for images of `image_size` (width, height), px.
+
+    `fit` is the setting `input.camera_fit`, the meaning of another size: exact, scale or crop:X,Y. Raises
+    `CalibrationError`, with both sizes, where the camera is not one of these images.
+    """
+    crop = _CROP.fullmatch(fit)
+    if crop is not None:
+        calibration = _cropped(calibration, image_size, (int(crop[1]), int(crop[2])))
+    elif fit == "scale":
+        calibration = _scaled(calibration, image_size)
+    elif fit != "exact":
+        raise SettingsError(f"fitting a calibration: expected exact, scale or crop:X,Y, found {fit[:40]!r}")
+    camera = calibration.camera
+    if (camera.width, camera.height) != image_size:
+        raise CalibrationError(
+            f"{_sizes(camera, image_size, calibration.name)}; give --camera-fit scale if the images were resized from "
+            "that size, --camera-fit crop:X,Y if they were cut out of it, else another calibration (--camera)"
+            f"{_swapped_note(camera, image_size)}"
+        )
+    check_plausible(camera, calibration.name)
+    return calibration
+
+
+def fitted_to(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
+    """Return `camera` resized for images of `image_size` (width, height), px; `name` is the calibration's in errors.
+
+    Raises `CalibrationError` unless the aspects agree within 1 %.
+    """
+    return _resized(camera, image_size, f"the calibration {name}")
+
+
+def _resized(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
+    if (camera.width, camera.height) == image_size:
+        return camera
+    if not _same_aspect(camera, image_size):
+        raise CalibrationError(
+            f"{_sizes(camera, image_size, name)}: another aspect, perhaps cropped; give --camera-fit crop:X,Y if the "
+            f"images were cut out of that size, else a calibration for these images (--camera)"
+            f"{_swapped_note(camera, image_size)}"
+        )
+    return camera.resized(*image_size)
+
+
+def rescaled_note(camera: CameraModel, scaled: CameraModel) -> str:
+    """Return what a `camera_source` adds where `scaled` is `camera` at another size, else ""."""
+    same = (camera.width, camera.height) == (scaled.width, scaled.height)
+    return "" if same else f", rescaled from {camera.width}x{camera.height} px"
+
+
+def check_plausible(camera: CameraModel, name: str) -> None:
+    """Raise `CalibrationError` where no endoscope has such a camera for images of its size."""
+    central = camera.central
+    width, height = camera.width, camera.height
+    least, most = (share * width for share in _FOCAL_PER_WIDTH)
+    narrow, wide = _FOCAL_RATIO
+    # Written so that NaN is refused, too.
+    if not least < central.fx < most or not narrow < central.fy / central.fx < wide:
+        raise CalibrationError(
+            f"{name} does not fit images of {width}x{height} px: focal length {central.fx:g}, {central.fy:g} px "
+            f"(plausible: {least:g} to {most:g})"
+        )
+    if not (0 <= central.cx < width and 0 <= central.cy < height):
+        raise CalibrationError(
+            f"{name} does not fit images of {width}x{height} px: its principal point {central.cx:g}, {central.cy:g} "
+            "is outside; it was made for larger images or for a crop"
+        )
+
+
+def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
+    camera = calibration.camera
+    if calibration.size_origin == "images":
+        raise CalibrationError(
+            f"{calibration.name} does not state its image size, so that it cannot be scaled (--camera-fit scale): add "
+            "image_width and image_height"
+        )
+    scaled = _resized(camera, image_size, calibration.name)
+    note = rescaled_note(camera, scaled) or ", of the images' size: nothing to scale"
+    return replace(calibration, camera=scaled, source=calibration.source + note)
+
+
+def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]) -> Calibration:
+    camera, (x, y) = calibration.camera, corner
+    if calibration.size_origin == "relative":
+        raise CalibrationError(
+            f"{calibration.name} holds shares of a size that it does not state, so that nothing can be cut out of it "
+            "(--camera-fit crop): add width and height"
+        )
+    of_size = ""
+    if calibration.size_origin == "stated":
+        of_size = f" of {camera.width}x{camera.height} px"
+        if x + image_size[0] > camera.width or y + image_size[1] > camera.height:
+            raise CalibrationError(
+                f"{_sizes(camera, image_size, calibration.name)}: too large to have been cut out of it at {x},{y} px "
+                f"(--camera-fit crop:{x},{y})"
+            )
+    source = f"{calibration.source}, cut out{of_size} at {x},{y} px"
+    return replace(calibration, camera=camera.cropped(x, y, *image_size), source=source)
+
+
+def _same_aspect(camera: CameraModel, image_size: Size) -> bool:
+    width, height = image_size
+    return abs(camera.width * height / (camera.height * width) - 1) <= _ASPECT_TOLERANCE
+
+
+def _swapped_note(camera: CameraModel, image_size: Size) -> str:
+    swapped = _same_aspect(camera, image_size[::-1]) and not _same_aspect(camera, image_size)
+    return "; its height and width may be swapped" if swapped else ""
+
+
+def _sizes(camera: CameraModel, image_size: Size, name: str) -> str:
+    width, height = image_size
+    return f"{name} is for {camera.width}x{camera.height} px, but the images are {width}x{height} px"

@@ -1,0 +1,148 @@
+"""Calibration files of one tool each: OCamCalib's text, Calibu's XML, StereoMIS' INI; and files of numbers alone."""
+
+from __future__ import annotations
+
+import configparser
+import re
+
+import numpy as np
+
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.calibration import Calibration, Size, check_size, pinhole_of
+from scopemap.cameras.formats.lens import with_lens
+from scopemap.cameras.formats.parsing import MOST_TERMS, xml_root
+from scopemap.cameras.lenses import FisheyeCamera, OmnidirectionalCamera
+
+_MATRIX_SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
+_LINE_COUNTS = (4, 8, 9, 12)
+# A skew is passed over up to the first share of the focal length, with a note up to the second.
+_SLIGHT_SKEW, _MOST_SKEW = 1e-3, 1e-2
+_CALIBU_PINHOLE = "calibu_fu_fv_u0_v0"
+_CALIBU_PARAMETERS = {_CALIBU_PINHOLE: 4, f"{_CALIBU_PINHOLE}_k1_k2": 6, f"{_CALIBU_PINHOLE}_kb4": 8}
+_STEREO_LEFT = "StereoLeft"
+
+
+def of_numbers(rows: list[list[float]], image_size: Size) -> Calibration:
+    """Return the camera of lines of numbers: a matrix, fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or OCamCalib's.
+
+    Raises `ValueError` for any other count.
+    """
+    values = [value for row in rows for value in row]
+    if not np.isfinite(values).all():
+        raise ValueError("it holds NaN or infinity")
+    if [len(row) for row in rows[2:]] == [2, 3, 2] and all(row[0] == len(row) - 1 for row in rows[:2]):
+        return Calibration(_of_ocamcalib(rows), None, "")
+    if _is_matrix(rows, values):
+        matrix = np.reshape(values, _MATRIX_SHAPES[len(values)])[:3, :3]
+        (intrinsics, note), coefficients = intrinsics_of(matrix), list[float]()
+    elif len(values) in _LINE_COUNTS:
+        note, intrinsics, coefficients = "", values[:4], values[4:]
+    else:
+        raise ValueError(
+            f"it holds {len(values)} numbers: expected fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or a camera matrix "
+            "of 3x3, 3x4 or 4x4"
+        )
+    pinhole, origin = pinhole_of(intrinsics, None, image_size)
+    return Calibration(with_lens(pinhole, "", coefficients)[0], None, note, origin)
+
+
+def intrinsics_of(K: np.ndarray) -> tuple[list[float], str]:
+    """Return fx fy cx cy of a camera matrix (3, 3), and a note on what was done; `ValueError` where it is none.
+
+    The transposed matrix, as MATLAB and Open3D write it, is transposed back. A skew of up to a hundredth of the focal
+    length is left out.
+    """
+    note = ""
+    if not K.any():
+        raise ValueError("its camera matrix is all zero, which ROS writes for a camera that was not calibrated")
+    if not _has_last_row(K) and _has_last_row(K.T):
+        K, note = K.T, ", its matrix transposed"
+    if not _has_last_row(K):
+        rows = "; ".join(" ".join(f"{value:g}" for value in row) for row in K)
+        raise ValueError(f"its matrix is no camera matrix [fx 0 cx; 0 fy cy; 0 0 1], found {rows}")
+    (fx, skew, cx), (_, fy, cy) = K[:2].tolist()
+    if abs(skew) > _MOST_SKEW * abs(fx):
+        raise ValueError(f"its camera matrix has a skew of {skew:g}, which no camera here has")
+    if abs(skew) > _SLIGHT_SKEW * abs(fx):
+        note += f", its skew of {skew:g} px left out"
+    return [fx, fy, cx, cy], note
+
+
+def _has_last_row(K: np.ndarray) -> bool:
+    return np.allclose([K[1, 0], *K[2]], [0, 0, 0, 1])
+
+
+def _is_matrix(rows: list[list[float]], values: list[float]) -> bool:
+    """Return whether the numbers are a matrix; 9 or 12 in one line may be fx fy cx cy k1 ... instead."""
+    if len(values) not in _MATRIX_SHAPES:
+        return False
+    height, width = _MATRIX_SHAPES[len(values)]
+    K = np.reshape(values, (height, width))[:3, :3]
+    return height == 4 or [len(row) for row in rows] == [width] * height or _has_last_row(K) or _has_last_row(K.T)
+
+
+def _of_ocamcalib(rows: list[list[float]]) -> OmnidirectionalCamera:
+    """Return the camera of the toolbox' `calib_results.txt` (Scaramuzza et al., IROS 2006).
+
+    Its lines: `n a0 a1 ...`, the polynomial from the pixel to the ray; `n b0 b1 ...`, its inverse, which is not used
+    here; `row column`, the centre, from 0; `c d e`, the affine part; `height width`. The toolbox' axes are x down, y
+    right, z backwards, and its affine matrix [[c, d], [e, 1]] takes (down, right) to (row, column). With right before
+    down it is [[1, e], [d, c]], and divided by its last entry what our camera has; rho, and with it the polynomial's
+    argument, is c times the toolbox' then.
+    """
+    (_, *polynomial), _, (row, column), (c, d, e), (height, width) = rows
+    size = check_size(width, height)
+    first = polynomial[0] if 0 < len(polynomial) <= MOST_TERMS else 0.0
+    if first >= 0 or not 0.5 < c < 2:
+        raise ValueError(
+            f"its polynomial begins with {first:g} and its affine part with {c:g}: the toolbox writes a negative "
+            "number and one near 1"
+        )
+    forward = tuple(-a * c ** (1 - power) for power, a in enumerate(polynomial))
+    return OmnidirectionalCamera(forward, column, row, *size, (1 / c, e / c, d / c))
+
+
+def of_calibu(text: str) -> CameraModel:
+    """Return the camera of Calibu's XML (EndoMapper): `rig` > `camera` > `camera_model type="calibu_..."`.
+
+    `calibu_fu_fv_u0_v0` is a pinhole, `..._k1_k2` has OpenCV's two radial terms, `..._kb4` is Kannala-Brandt's fisheye.
+    Raises `ValueError` for anything else.
+    """
+    model = xml_root(text).find(".//camera_model")
+    kind = "" if model is None else model.get("type", "")
+    if model is None or kind not in _CALIBU_PARAMETERS:
+        raise ValueError(f"the type {kind[:40]!r} of its camera_model is not known ({', '.join(_CALIBU_PARAMETERS)})")
+    values = [float(value) for value in re.findall(r"[^\s\[\];,]+", model.findtext("params", ""))]
+    if len(values) != _CALIBU_PARAMETERS[kind] or not np.isfinite(values).all():
+        raise ValueError(f"it holds {len(values)} parameters, expected {_CALIBU_PARAMETERS[kind]} finite ones")
+    size = check_size(float(model.findtext("width", "")), float(model.findtext("height", "")))
+    fx, fy, cx, cy, *lens = values
+    pinhole = PinholeCamera(fx, fy, cx, cy, *size)
+    if any(lens) and len(lens) == 4:
+        return FisheyeCamera(pinhole, tuple(lens))
+    return with_lens(pinhole, "", [*lens, 0.0, 0.0] if lens else [])[0]
+
+
+def is_stereo_ini(text: str) -> bool:
+    """Return whether a text is a da Vinci's `StereoCalibration.ini` (StereoMIS)."""
+    return any(line.strip() == f"[{_STEREO_LEFT}]" for line in text.splitlines())
+
+
+def of_stereo_ini(text: str) -> CameraModel:
+    """Return the left camera of `StereoCalibration.ini`; `ValueError` where a number of it is missing or none.
+
+    `[StereoLeft]` holds res_x, res_y, fc_x, fc_y, cc_x, cc_y and the lens kc_0 ... in OpenCV's order.
+    """
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(text)
+        left = parser[_STEREO_LEFT]
+        width, height, fx, fy, cx, cy = (float(left[key]) for key in ["res_x", "res_y", "fc_x", "fc_y", "cc_x", "cc_y"])
+        lens = [float(left[key]) for i in range(8) if (key := f"kc_{i}") in left]
+    except KeyError as error:
+        raise ValueError(f"{error} is missing") from None
+    except configparser.Error as error:
+        raise ValueError(str(error).partition("\n")[0]) from None
+    if not np.isfinite([fx, fy, cx, cy, *lens]).all():
+        raise ValueError(f"[{_STEREO_LEFT}] holds NaN or infinity")
+    return with_lens(PinholeCamera(fx, fy, cx, cy, *check_size(width, height)), "", lens)[0]
