@@ -269,9 +269,9 @@ def test_a_frame_without_a_pose_is_missed(tmp_path: Path) -> None:
     folder = write_sevenscenes(tmp_path / "rooms")
     np.savetxt(folder / "frame-000001.pose.txt", np.full((4, 4), np.nan))
     assert "1 of 3 frames have no pose" in faults(findings(folder))["pose-missing"]
-    np.savetxt(folder / "camera-intrinsics.txt", [[90, 0, 320], [0, 90, 240], [0, 0, 1]])
+    np.savetxt(folder / "camera-intrinsics.txt", [[590, 0, 320], [0, 700, 240], [0, 0, 1]])
     found = {finding.code: finding for finding in findings(folder)}
-    assert found["camera-focal"].severity == "error"
+    assert found["camera-aspect"].severity == "warning"
 
 
 def test_names_of_a_plain_folder(tmp_path: Path) -> None:
@@ -349,7 +349,7 @@ def test_few_frames_are_held_and_compared_over_three_lags() -> None:
 
 
 def test_the_documents_name_every_code() -> None:
-    room = ROOT / "src" / "scopemap" / "datasets"
+    room = ROOT / "src" / "scopemap" / "io" / "datasets"
     text = "".join((room / name).read_text() for name in ("checking.py", "pose_depth.py"))
     heads = "camera|depth|frame|number|pose|poses|reading|time|truth"
     codes = set(re.findall(rf'"((?:{heads})-[a-z-]+)"', text)) | {"refused", "source", "assumed"}

@@ -301,7 +301,7 @@ def test_a_trajectory_that_is_none_is_one_sentence(text: str | bytes, message: s
         ("fx: 500\nfy: 501\n", "it has no cx, cy"),
         ("fx: a\n", "fx must be a finite number, found 'a'"),
         ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: nan\nrows: 720\n", "cols must be a finite number"),
-        ("fx: 500\nfy: 501\ncx: 970\ncy: 350\ncols: 960\nrows: 720\n", "principal point 970"),
+        ("fx: 500\nfy: 501\ncx: 970\ncy: 350\ncols: 960\nrows: 720\n", "focal length 500, 501 px"),
         ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: 960\nrows: 960\n", "another aspect"),
     ],
 )

@@ -10,7 +10,7 @@ from typing import BinaryIO, Protocol
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.stated import Calibration
+from scopemap.cameras.formats.calibration import Calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import ScopemapError
 from scopemap.frame import TruthQuality
