@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -188,7 +185,7 @@ def test_without_a_decoder_there_is_no_depth_and_a_warning(tmp_path: Path, monke
     monkeypatch.setattr(endomapper_sim, "can_read_exr", lambda: False)
     sequence = open_sequence(write_sim(tmp_path / "Seq_0"))
     assert sequence.source.truth(0).depth_mm is None
-    assert any("depth is left out, since this FFmpeg (PyAV) has no decoder for OpenEXR" in w for w in sequence.warnings)
+    assert any("pip install 'scopemap[datasets]'" in warning for warning in sequence.warnings)
 
 
 # ---- OpenEXR
@@ -204,26 +201,6 @@ def test_the_red_channel_is_read_exactly(half: bool, names: str, tmp_path: Path)
     np.testing.assert_array_equal(read, values.astype(np.float32))
 
 
-def test_compressed_files_are_read_exactly(tmp_path: Path) -> None:
-    values = np.random.default_rng(2).integers(0, 1600, (72, 96, 4)) / np.float32(16384)
-    np.save(tmp_path / "v.npy", values.astype(np.float32))
-    # OpenCV has to be told before it is imported.
-    code = (
-        "import sys, cv2, numpy as np; v = np.load('v.npy'); K = cv2.IMWRITE_EXR_COMPRESSION\n"
-        "for k in (1, 2, 3, 4):\n    assert cv2.imwrite(f'{k}.exr', v, [K, k])"
-    )
-    environment = os.environ | {"OPENCV_IO_ENABLE_OPENEXR": "1"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, check=False)
-    if done.returncode:
-        pytest.skip("this OpenCV writes no OpenEXR")
-    for kind in (1, 2, 3, 4):
-        np.testing.assert_array_equal(read_exr_red(tmp_path / f"{kind}.exr"), values[..., 2])
-        whole = (tmp_path / f"{kind}.exr").read_bytes()
-        (tmp_path / f"{kind}.exr").write_bytes(whole[:-5])
-        with pytest.raises(InputError, match="it breaks off"):
-            read_exr_red(tmp_path / f"{kind}.exr")
-
-
 def test_an_exr_file_that_is_none_is_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "a.exr"
     whole = write_exr(file, {"R": buffer(), "G": buffer(), "B": buffer()})
@@ -232,29 +209,22 @@ def test_an_exr_file_that_is_none_is_one_sentence(tmp_path: Path) -> None:
         "empty": b"",
         "text": b"no picture at all",
         "cut in the header": whole[:60],
-        "cut in the table": whole[:500],
         "cut in the lines": whole[: len(whole) // 2],
         "cut at the end": whole[:-1],
         "of no size": whole.replace(window, struct.pack("<4i", 0, 0, -1, 71)),
         "without a window": whole.replace(b"dataWindow", b"dataWindov"),
-        "of an unknown compression": whole.replace(
-            b"compression\0compression\0\1\0\0\0\0", b"compression\0compression\0\1\0\0\0\x63"
-        ),
-        "in tiles": whole[:5] + b"\x02" + whole[6:],
     }
     for name, content in damaged.items():
         file.write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.exr: it is damaged or no OpenEXR") as caught:
+        with pytest.raises(InputError, match=r"a\.exr: no OpenEXR image") as caught:
             read_exr_red(file)
         assert "\n" not in str(caught.value), name
     file.write_bytes(whole.replace(window, large))
     with pytest.raises(InputError, match=r"a\.exr: .*more than 64 million pixels"):
         read_exr_red(file)
-    write_exr(file, {"R": buffer()})
-    with pytest.raises(InputError, match="no OpenEXR image that FFmpeg reads"):
+    write_exr(file, {"G": buffer()})
+    with pytest.raises(InputError, match="with a channel R or Y"):
         read_exr_red(file)
-    with pytest.raises(InputError, match=r"b\.exr"):
-        read_exr_red(tmp_path / "b.exr")
 
 
 # ---- faults

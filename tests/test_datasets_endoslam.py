@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import openpyxl
 import pytest
 from drawn_inputs import number_in, picture, save
 
@@ -58,30 +59,13 @@ def write_unity(organ: Path, numbers: tuple[int, ...] = (0, 1, 2, 3), again: boo
     return organ
 
 
-def cell(place: str, value: object, strings: list[str]) -> str:
-    if value is None:
-        return f'<c r="{place}"/>'
-    if isinstance(value, str):
-        strings.append(value)
-        return f'<c r="{place}" t="s"><v>{len(strings) - 1}</v></c>'
-    return f'<c r="{place}"><v>{float(value)!r}</v></c>'
-
-
 def write_xlsx(file: Path, rows: list[list[object]]) -> Path:
-    """Write what pandas' `to_excel` does: texts apart from the sheet, its unnamed index in column A."""
-    strings: list[str] = []
-    lines = []
-    for number, row in enumerate(rows, start=1):
-        cells = [cell(f"{chr(ord('A') + j)}{number}", value, strings) for j, value in enumerate(row)]
-        lines.append(f'<row r="{number}">{"".join(cells)}</row>')
-    main = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
-    texts = "".join(f"<si><t>{text}</t></si>" for text in strings)
+    """Write what pandas' `to_excel` does, its unnamed index in column A."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(
-            "xl/worksheets/sheet1.xml", f"<worksheet {main}><sheetData>{''.join(lines)}</sheetData></worksheet>"
-        )
-        archive.writestr("xl/sharedStrings.xml", f"<sst {main}>{texts}</sst>")
+    workbook = openpyxl.Workbook()
+    for row in rows:
+        workbook.worksheets[0].append(row)
+    workbook.save(file)
     return file
 
 

@@ -206,16 +206,15 @@ def test_a_data_sets_own_xml_that_grows_is_refused(tmp_path: Path) -> None:
         open_sequence(folder)
 
 
-@pytest.mark.parametrize("member", ["xl/worksheets/sheet1.xml", "xl/sharedStrings.xml"])
 @pytest.mark.parametrize("how", ["entities", "zeros"])
-def test_a_workbook_that_grows_is_refused(member: str, how: str, tmp_path: Path) -> None:
+def test_a_workbook_that_grows_is_refused(how: str, tmp_path: Path) -> None:
     folder = write_real(tmp_path / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1")
     (file,) = folder.rglob("*.xlsx")
     with zipfile.ZipFile(file) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    bomb = f"{ENTITIES}<sst><si><t>&a9;</t></si></sst>".encode() if how == "entities" else b" " * (64 << 20)
+    bomb = f"{ENTITIES}<worksheet>&a9;</worksheet>".encode() if how == "entities" else b" " * (64 << 20)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in (members | {member: bomb}).items():
+        for name, data in (members | {"xl/worksheets/sheet1.xml": bomb}).items():
             archive.writestr(name, data)
     assert file.stat().st_size < 100_000
     with pytest.raises(InputError, match=r"poses\.xlsx"):

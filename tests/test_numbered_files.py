@@ -12,13 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_scared import Files, write_loose, write_tar
-from hypothesis import given
-from hypothesis import strategies as st
 
 from scopemap.errors import InputError
-from scopemap.io.datasets import numbered, seekable_gzip
+from scopemap.io.datasets import numbered
 from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
-from scopemap.io.datasets.seekable_gzip import SeekableGzip
 
 MB = 1 << 20
 
@@ -35,21 +32,6 @@ def find(folder: Path) -> NumberedFiles:
     found = find_numbered(folder, ("points",), "point", (".bin",))
     assert found is not None
     return found
-
-
-class Counter:
-    """Counts the bytes that are decompressed."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.bytes = 0
-        original = SeekableGzip._decompressed
-
-        def counted(stream: SeekableGzip, most: int) -> bytes:
-            data = original(stream, most)
-            self.bytes += len(data)
-            return data
-
-        monkeypatch.setattr(SeekableGzip, "_decompressed", counted)
 
 
 # ---- places
@@ -85,75 +67,29 @@ def test_an_archive_in_any_order_is_read_by_number(tmp_path: Path) -> None:
     assert found.numbers() == list(range(9))
 
 
-# ---- bounds
-
-
-def test_reading_on_decompresses_everything_once_and_keeps_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("installed", [True, False])
+def test_going_back_reads_the_same_with_and_without_an_index(
+    installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(numbered, "_SPACING_BYTES", 1 << 18)
+    if not installed:
+        monkeypatch.setattr(numbered, "find_spec", lambda name: None)
+    write_tar(tmp_path / "points.tar.gz", members(8, MB // 4))
+    found = find(tmp_path)
+    assert found.numbers() == list(range(8))
+    for number in (6, 1, 7, 0):
+        assert found.read(number) == noise(number, MB // 4)
+
+
+def test_reading_keeps_nothing_in_memory_and_writes_nothing(tmp_path: Path) -> None:
     write_tar(tmp_path / "points.tar.gz", members(16, MB))
-    counter = Counter(monkeypatch)
     found = find(tmp_path)
     tracemalloc.start()
     assert all(found.read(number) == noise(number, MB) for number in range(16))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert counter.bytes <= 17 * MB
     assert peak < 8 * MB
     assert [file.name for file in tmp_path.iterdir()] == ["points.tar.gz"]
-
-
-def test_only_what_lies_before_the_wanted_file_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_tar(tmp_path / "points.tar.gz", members(16, MB // 4))
-    counter = Counter(monkeypatch)
-    found = find(tmp_path)
-    assert counter.bytes == 0, "nothing is read before it is asked for"
-    found.read(3)
-    assert counter.bytes <= 2.5 * MB
-
-
-def test_going_back_costs_one_stretch_between_restart_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seekable_gzip, "SPACING_BYTES", 2 * MB)
-    write_tar(tmp_path / "points.tar.gz", members(16, MB))
-    counter = Counter(monkeypatch)
-    found = find(tmp_path)
-    found.numbers()
-    for number in (13, 2, 9):
-        counter.bytes = 0
-        assert found.read(number) == noise(number, MB)
-        assert counter.bytes <= 6 * MB
-
-
-def test_restart_points_are_thinned_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seekable_gzip, "SPACING_BYTES", 100_000)
-    monkeypatch.setattr(seekable_gzip, "MOST_POINTS", 8)
-    content = noise(0, 6 * MB)
-    (tmp_path / "a.gz").write_bytes(gzip.compress(content, 1))
-    stream = SeekableGzip(tmp_path / "a.gz")
-    assert io.BufferedReader(stream).read() == content
-    stream = SeekableGzip(tmp_path / "a.gz")
-    while stream.read(MB):
-        assert len(stream._points) <= 8
-    assert len(stream._points) >= 4
-    for position in (5 * MB, 2 * MB + 7, 0):
-        stream.seek(position)
-        assert stream.read(50) == content[position : position + 50]
-
-
-@given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 300)), max_size=20))
-def test_seeking_is_as_in_the_plain_content(
-    tmp_path_factory: pytest.TempPathFactory, moves: list[tuple[int, int]]
-) -> None:
-    content = noise(1, 2000) + bytes(2000) + noise(2, 500)
-    folder = tmp_path_factory.getbasetemp()
-    # Two streams one after the other, and zeros that fill the file up.
-    (folder / "a.gz").write_bytes(gzip.compress(content[:1500]) + gzip.compress(content[1500:]) + bytes(40))
-    stream = io.BufferedReader(SeekableGzip(folder / "a.gz"), 64)
-    plain = io.BytesIO(content)
-    for position, count in moves:
-        stream.seek(position)
-        plain.seek(position)
-        assert stream.read(count) == plain.read(count)
 
 
 # ---- what is wrong with archives
@@ -162,20 +98,11 @@ def test_seeking_is_as_in_the_plain_content(
 def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numbered, "LARGEST_FILE_BYTES", MB)
     write_tar(tmp_path / "points.tar.gz", {"point1.bin": bytes(9 * MB)})
-    counter = Counter(monkeypatch)
     with pytest.raises(InputError, match=r"points\.tar\.gz, point1\.bin: it holds 9 MB, expected 1 MB at most"):
         find(tmp_path).read(1)
-    assert counter.bytes <= 2 * MB
     write_loose(tmp_path / "points", {"point1.bin": bytes(2 * MB)})
     with pytest.raises(InputError, match=r"point1\.bin: it holds 2 MB"):
         find(tmp_path).read(1)
-
-
-def test_an_archive_of_endless_small_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbered, "MOST_MEMBERS", 20)
-    write_tar(tmp_path / "points.tar.gz", members(30, 1))
-    with pytest.raises(InputError, match="holds more than 20 files"):
-        find(tmp_path).numbers()
 
 
 def test_links_and_paths_that_lead_outside_do_no_harm(tmp_path: Path) -> None:
@@ -199,12 +126,13 @@ def test_links_and_paths_that_lead_outside_do_no_harm(tmp_path: Path) -> None:
     assert sorted(tmp_path.parent.rglob("*")) == before
 
 
-@pytest.mark.parametrize("kept", [0.02, 0.5, 0.97])
-def test_an_archive_that_breaks_off_is_said(kept: float, tmp_path: Path) -> None:
-    file = write_tar(tmp_path / "points.tar.gz", members(10))
+@pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("ending", [".tar", ".tar.gz"])
+def test_an_archive_that_breaks_off_is_reported(kept: float, ending: str, tmp_path: Path) -> None:
+    file = write_tar(tmp_path / f"points{ending}", members(100))
     data = file.read_bytes()
     file.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(InputError, match=r"points\.tar\.gz: the archive is damaged or incomplete") as caught:
+    with pytest.raises(InputError, match=r"points\.tar.*: the archive is damaged or incomplete") as caught:
         find(tmp_path).numbers()
     assert "\n" not in str(caught.value)
 
@@ -230,12 +158,12 @@ def test_headers_that_lead_back_are_not_read_for_ever(tmp_path: Path) -> None:
 
 
 def test_any_damage_ends_in_one_kind_of_error(tmp_path: Path) -> None:
-    """300 mutated archives: bytes changed in the tar or in the gzip around it."""
+    """100 mutated archives: bytes changed in the tar or in the gzip around it."""
     plain = write_tar(tmp_path / "source.tar", members(4, 200)).read_bytes()
     rng = np.random.default_rng(0)
     file = tmp_path / "points.tar.gz"
     refused = 0
-    for trial in range(300):
+    for trial in range(100):
         data = bytearray(plain if trial % 2 else gzip.compress(plain, 1))
         for position in rng.integers(0, len(data), rng.integers(1, 5)):
             data[position] = rng.integers(256)
@@ -244,4 +172,4 @@ def test_any_damage_ends_in_one_kind_of_error(tmp_path: Path) -> None:
             assert len(list(find(tmp_path))) <= 4
         except InputError:
             refused += 1
-    assert 30 < refused < 300
+    assert 10 < refused < 100

@@ -1,7 +1,7 @@
-"""Decoding images from files that anyone may have written: none whose header claims more pixels than a limit.
+"""Decoding of images and archives from files of unknown origin: limits of pixels and bytes, checked before decoding.
 
-A few hundred bytes can claim to be gigabytes of picture. The limit is 64 million pixels; the environment variable
-`SCOPEMAP_MAX_MEGAPIXELS` sets another (where it is no TIFF, up to what Pillow opens: 178 million).
+The limit is 64 million pixels an image; the environment variable `SCOPEMAP_MAX_MEGAPIXELS` sets another (up to what
+Pillow opens, 178 million, but for TIFF and PNG).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Return the image in a file's `content` as OpenCV has it, channels turned round; None where it holds none.
+    """Return the image in a file's `content` as OpenCV decodes it (BGR); None where it holds none.
 
-    Raises `InputError` where it claims more pixels than the limit.
+    Raises `InputError` where its header claims more pixels than the limit.
     """
     claimed = _claimed_pixels(content)
     check_pixels(claimed)
@@ -41,17 +41,25 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
 
 
 def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Return the image in a file as `decoded` does, None also where there is no file to read; the error names the file.
-
-    Reading first and decoding then also works for names that OpenCV cannot open on some systems.
-    """
+    """Return the image in a file as `decoded` does; None also where no file can be read. Errors name the file."""
     try:
-        # Whoever opens a pipe waits forever.
+        # Opening a pipe would wait forever.
         return decoded(file.read_bytes(), flags) if file.is_file() else None
     except OSError:
         return None
     except InputError as error:
         raise InputError(f"reading {file}: {error}") from None
+
+
+def first_bytes(file: Path, count: int) -> bytes:
+    """Return the first bytes of a file; none of a pipe, and none where it cannot be read."""
+    try:
+        if not file.is_file():
+            return b""
+        with file.open("rb") as stream:
+            return stream.read(count)
+    except OSError:
+        return b""
 
 
 def check_pixels(claimed: float) -> None:
@@ -60,13 +68,21 @@ def check_pixels(claimed: float) -> None:
         raise InputError(f"decoding an image: its header claims {limit_in_words()}")
 
 
+def check_bytes(what: str, claimed: int, most: int) -> None:
+    """Raise `InputError` where `what`, a file or a member of an archive, holds more than `most` bytes unpacked."""
+    if claimed > most:
+        raise InputError(
+            f"reading {what}: it holds {claimed >> 20} MB, expected {most >> 20} MB at most; is it damaged?"
+        )
+
+
 def limit_in_words() -> str:
-    """Return the limit, and how to set another, as the end of a sentence."""
+    """Return the limit of pixels, and how to set another, as the end of a sentence."""
     return f"more than {most_pixels() / 1e6:g} million pixels; if it is sound, set the environment variable {_VARIABLE}"
 
 
 def most_pixels() -> float:
-    """Return the limit, pixels. Raises `InputError` where the environment variable is no number."""
+    """Return the limit of pixels. Raises `InputError` where the environment variable is no number."""
     text = os.environ.get(_VARIABLE, "")
     try:
         return 1e6 * (float(text) if text else _MOST_MEGAPIXELS)
@@ -75,14 +91,13 @@ def most_pixels() -> float:
 
 
 def _claimed_pixels(content: bytes) -> float:
-    """Return how many pixels the header claims; 0 where nothing that can be decoded is known to be there."""
+    """Return how many pixels the header claims; 0 for formats that Pillow does not know and damaged headers."""
     if content[:8] == _PNG:
         return _png_pixels(content)
-    # Only who reads images waits for the import.
+    # Only reading of images waits for the import.
     from PIL import Image, TiffImagePlugin
 
     file = io.BytesIO(content)
-    # Damaged headers end in anything at all.
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -96,15 +111,12 @@ def _claimed_pixels(content: bytes) -> float:
                 return image.width * image.height
     except Image.DecompressionBombError:
         return math.inf
-    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, SyntaxError, struct.error, AttributeError):
+    except Exception:  # damaged headers end in exceptions of any kind
         return 0
 
 
 def _png_pixels(content: bytes) -> int:
-    """As `_claimed_pixels`, of a PNG; by itself, as Pillow refuses pictures beside which a comment is damaged.
-
-    A chunk that claims to be longer than the file is not decoded either: OpenCV would take the memory first.
-    """
+    """Return the pixels of a PNG; 0 where a chunk is longer than the file: OpenCV would allocate its claim first."""
     place, pixels = len(_PNG), 0
     while place + 8 <= len(content):
         (length,) = struct.unpack(">I", content[place : place + 4])

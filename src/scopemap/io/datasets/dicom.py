@@ -1,13 +1,13 @@
 """DICOM: endoscopic video (MPEG), multi-frame images, and folders with one of these or one series of single frames.
 
-DICOM PS3.3, A.32.5 (video endoscopic image). Frames are called by their numbers: file names and everything else in a
+DICOM PS3.3, A.32.5 (video endoscopic image). Frames are named by their numbers: file names and everything else in a
 DICOM file may be about a patient.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from collections.abc import Sequence as Several
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
@@ -15,70 +15,65 @@ from typing import BinaryIO
 import numpy as np
 
 from scopemap.errors import InputError
-from scopemap.io.datasets.dicom_files import Header, is_dicom, is_index, is_installed, read_header, require_pydicom
-from scopemap.io.datasets.dicom_pictures import pictures
-from scopemap.io.datasets.dicom_video import EncapsulatedVideo
+from scopemap.io.datasets.dicom_files import EncapsulatedVideo, Header, images, read_header
+from scopemap.io.decoding import first_bytes
 from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
-_COMPARED, _CLOCKS_APART = 25, 0.005
+_PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
+# The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
+_DIRECTORY = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
 
 
 class Dicom(SourceDefaults):
-    """The pictures of one DICOM file, or of one series in a folder.
+    """The images of one DICOM file, or of one series in a folder.
 
-    Time stamps are a video's own, else those that the file states (FrameTimeVector, FrameTime, CineRate,
-    RecommendedDisplayFrameRate), else frame number / 30 s. Grey pictures show the levels that the file wants shown.
-    Frames count from 0; those of a series have their instances' numbers. Raises `InputError` for what holds no pictures
-    or several series, and where `pydicom` is not installed.
+    Time stamps are a video's own, else those of the header (FrameTimeVector, FrameTime, CineRate,
+    RecommendedDisplayFrameRate), else frame number / 30 s. Frames count from 0; those of a series have the numbers of
+    their instances. Raises `InputError` for what holds no images or several series, and without `pydicom`.
     """
 
     name = "dicom"
 
     def __init__(self, path: Path) -> None:
+        if not self.is_installed():
+            raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'")
         self.path = path
         self.notes: list[str] = []
         self.warnings: list[str] = []
-        require_pydicom(path)
         self._headers = self._in_folder(path) if path.is_dir() else [read_header(path)]
         first = self._headers[0]
-        self._video: EncapsulatedVideo | None = None
         self.numbers = range(first.frames) if len(self._headers) == 1 else self._instances()
         self.count: int | None = len(self.numbers)
-        self.width, self.height, self.pixel_aspect = first.columns, first.rows, first.pixel_aspect or 1.0
-        self._window = first.window
-        self._vector_s, self._rate_hz, clock = first.clock()
+        self.width, self.height = int(first.fields.Columns), int(first.fields.Rows)
+        self.pixel_aspect = first.pixel_aspect or 1.0
+        self._times_s, self._rate_hz, clock = first.clock()
+        self._video: EncapsulatedVideo | None = None
+        self.stamped = bool(clock)
         if first.is_video:
             self._video = EncapsulatedVideo(first, self._rate_hz)
             self.warnings = self._video.warnings
             self.width, self.height, self.count = self._video.width, self._video.height, self._video.count
             self.pixel_aspect = first.pixel_aspect or self._video.pixel_aspect
-        self.stamped = bool(clock) or self._is_stamped
-        if self._video is not None:
-            clock = self._clock_of(self._video, clock)
-        if not clock:
-            clock = f"frame number / {FOLDER_RATE_HZ:g} s (the file states none)"
-        self.notes.append(f"time stamps: {clock}")
-        if self._vector_s is None and not self._is_stamped and first.fields.get("FrameTimeVector"):
-            self._warn("its FrameTimeVector does not increase, or not once for each picture, and was left out")
-        stored = int(first.fields.get("BitsStored") or 8)
-        if self._window is not None:
-            self.notes.append("grey levels: those that the file wants shown (WindowCenter, WindowWidth), as 8 bit")
-        elif stored > 8:
-            self.notes.append(f"levels: the upper 8 of the {stored} bits that the file says are stored (BitsStored)")
-        if first.missing:
-            self._warn(f"it claims {first.frames + first.missing} pictures, {first.frames} are there; these were used")
-        if any(header.may_show_patient for header in self._headers):
-            self._warn("it says that notes, perhaps a patient's name, are burned into the pictures")
+            if self._video.stamped:
+                # Rates in headers are rounded.
+                self._times_s, self._rate_hz, clock = None, None, "the video's"
+            self.stamped = bool(clock)
+            clock = clock or f"frame number / {self._video.rate_hz:g} s (neither the file nor the stream has stamps)"
+        self.notes.append(f"time stamps: {clock or f'frame number / {FOLDER_RATE_HZ:g} s (the file states none)'}")
+        self._report_header(first)
 
-    is_installed = staticmethod(is_installed)
+    @staticmethod
+    def is_installed() -> bool:
+        """Whether the package `pydicom` is there."""
+        return find_spec("pydicom") is not None
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether `path` is a DICOM file, or a folder of these and no other images."""
         if path.is_dir():
             return not image_files(path) and bool(_files(path))
-        return is_dicom(path)
+        return _is_dicom(path)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; one that cannot be decoded is left out with a warning."""
@@ -88,11 +83,11 @@ class Dicom(SourceDefaults):
             return
         for number, rgb in self._selected(range(len(self.numbers))[selection]):
             if rgb is None:
-                self._warn(f"picture {number} cannot be decoded and was left out")
+                self._warn(f"image {number} cannot be decoded and was left out")
                 continue
             if rgb.shape[:2] != (self.height, self.width):
                 raise InputError(
-                    f"reading {self.path}: picture {number} is {rgb.shape[1]}x{rgb.shape[0]} px, those before it are "
+                    f"reading {self.path}: image {number} is {rgb.shape[1]}x{rgb.shape[0]} px, those before it are "
                     f"{self.width}x{self.height} px; a sequence needs frames of one size"
                 )
             yield SourceFrame(number, self._time_s(number), rgb, str(number))
@@ -108,46 +103,42 @@ class Dicom(SourceDefaults):
         return None if self._video is None else self._video.media()
 
     def pose(self, index: int) -> np.ndarray | None:
-        """DICOM knows no pose of an endoscope."""
+        """DICOM holds no pose of an endoscope."""
         return None
 
     def truth(self, index: int) -> SourceTruth | None:
-        """DICOM knows no truth."""
+        """DICOM holds no truth."""
         return None
 
     def _selected(self, positions: range) -> Iterator[tuple[int, np.ndarray | None]]:
         if len(self._headers) == 1:
-            yield from pictures(self._headers[0], positions, self._window)
+            yield from images(self._headers[0], positions)
             return
         for position in positions:
-            for _, rgb in pictures(self._headers[position], range(1), self._window):
+            for _, rgb in images(self._headers[position], range(1)):
                 yield self.numbers[position], rgb
 
-    def _time_s(self, number: int, otherwise_s: float | None = None) -> float:
-        if self._vector_s is not None and number < len(self._vector_s):
-            return float(self._vector_s[number])
+    def _time_s(self, number: int, own_s: float | None = None) -> float:
+        """Return the time by the header, else `own_s`, else by the assumed rate."""
+        if self._times_s is not None and number < len(self._times_s):
+            return float(self._times_s[number])
         if self._rate_hz:
             return number / self._rate_hz
-        return number / FOLDER_RATE_HZ if otherwise_s is None else otherwise_s
+        return number / FOLDER_RATE_HZ if own_s is None else own_s
 
-    @property
-    def _is_stamped(self) -> bool:
-        return self._video is not None and self._video.stamped
-
-    def _clock_of(self, video: EncapsulatedVideo, stated: str) -> str:
-        """Return what tells the time of a video's pictures: the stream where it does, as headers round."""
-        if not video.stamped:
-            return stated or f"frame number / {video.rate_hz:g} s (neither the file nor the pictures have stamps)"
-        own_s = [frame.time_s for frame in video.frames(slice(_COMPARED))]
-        said_s = [self._time_s(number, time_s) for number, time_s in enumerate(own_s)]
-        ratio = (said_s[-1] - said_s[0]) / (own_s[-1] - own_s[0])
-        if abs(ratio - 1) > _CLOCKS_APART:
-            self._warn(
-                f"its header ({stated}) makes the video {ratio:.3g} times as long as its own time stamps do: these "
-                "were used"
-            )
-        self._vector_s = self._rate_hz = None
-        return "the video's"
+    def _report_header(self, first: Header) -> None:
+        """Add the notes and warnings on levels, time steps, missing images and burned-in notes."""
+        stored = int(first.fields.get("BitsStored") or 8)
+        if first.window is not None:
+            self.notes.append("grey levels: the window of the file (WindowCenter, WindowWidth), as 8 bit")
+        elif stored > 8 and self._video is None:
+            self.notes.append(f"levels: all {stored} stored bits (BitsStored), scaled to 8 bit")
+        if first.fields.get("FrameTimeVector") and self._times_s is None and self._video is None:
+            self._warn("its FrameTimeVector does not increase, or not once for each image, and was left out")
+        if first.missing:
+            self._warn(f"it claims {first.frames + first.missing} images, {first.frames} are there; these were used")
+        if any(str(header.fields.get("BurnedInAnnotation", "")).upper() == "YES" for header in self._headers):
+            self._warn("by its header notes, perhaps a patient's name, are burned into the images")
 
     def _in_folder(self, path: Path) -> list[Header]:
         """Return the headers of the one series in a folder, sorted."""
@@ -162,17 +153,17 @@ class Dicom(SourceDefaults):
             raise InputError(fault or f"reading {path}: it holds no DICOM file")
         if len(headers) < len(files):
             left_out = f"{len(files) - len(headers)} of {len(files)} DICOM files"
-            self._warn(f"{left_out} hold no pictures or cannot be read, and were left out")
-        several = [header for header in headers if header.is_several]
-        series = {header.series for header in headers if not header.is_several}
-        if len(several) + len(series) > 1:
+            self._warn(f"{left_out} hold no images or cannot be read, and were left out")
+        single = [header for header in headers if not header.is_video and header.frames + header.missing == 1]
+        several, series = len(headers) - len(single), {str(h.fields.get("SeriesInstanceUID", "")) for h in single}
+        if several + len(series) > 1:
             raise InputError(
-                f"reading {path}: it holds {len(several)} videos or multi-frame images and {len(series)} series of "
-                "single frames; give one file, or a folder with one series"
+                f"reading {path}: it holds {several} videos or multi-frame images and {len(series)} series of single "
+                "frames; give one file, or a folder with one series"
             )
         return sorted(headers, key=lambda header: header.instance or 0)
 
-    def _instances(self) -> Several[int]:
+    def _instances(self) -> Sequence[int]:
         numbers = [header.instance for header in self._headers if header.instance is not None]
         if len(numbers) == len(self._headers) and all(a < b for a, b in pairwise(numbers)):
             return numbers
@@ -184,7 +175,14 @@ class Dicom(SourceDefaults):
             self.warnings.append(message)
 
 
+def _is_dicom(file: Path) -> bool:
+    """Whether a file is DICOM by its magic word or its ending, and not the directory of a medium."""
+    start = first_bytes(file, _META_BYTES)
+    is_directory = file.name.upper() == "DICOMDIR" or _DIRECTORY in start
+    has_magic = start[_PREAMBLE : _PREAMBLE + 4] == _MAGIC
+    return bool(start) and not is_directory and (has_magic or file.suffix.lower() == ".dcm")
+
+
 def _files(folder: Path) -> list[Path]:
-    """Return the DICOM files in a folder, but for the list of what a medium holds."""
-    files = (file for file in folder.iterdir() if not file.name.startswith(".") and is_dicom(file))
-    return sorted((file for file in files if not is_index(file)), key=numeric_order)
+    files = (file for file in folder.iterdir() if not file.name.startswith(".") and _is_dicom(file))
+    return sorted(files, key=numeric_order)

@@ -63,7 +63,7 @@ class EndoMapperSimFolder(ImageFolder):
             self._warn(f"{path / _TRAJECTORY}: {without} of {self.count} images have no pose in it")
         if self._depth_files and not can_read_exr():
             self._depth_files = {}
-            self._warn(f"{path}: depth is left out, since this FFmpeg (PyAV) has no decoder for OpenEXR, exr")
+            self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install 'scopemap[datasets]'")
         if self.camera is None:
             self._use_published()
 

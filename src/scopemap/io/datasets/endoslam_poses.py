@@ -117,16 +117,15 @@ def _without_gaps(times_s: np.ndarray) -> np.ndarray | None:
 
 def _read_sheet(file: Path) -> CameraPath:
     sheet = read_sheet(file)
-    header = {text.lower().replace("quat_", "quot_"): column for column, text in sheet[0][1].items()} if sheet else {}
-    missing = [name for name in ("imageframe", *_COLUMNS) if name not in header]
+    names = [name.lower().replace("quat_", "quot_") for name in sheet[0][1]] if sheet else []
+    missing = [name for name in ("imageframe", *_COLUMNS) if name not in names]
     if missing:
-        raise InputError(
-            f"{file}: the first sheet has no column {', '.join(missing)}, found {', '.join(header) or '-'}"
-        )
-    wanted = [header["imageframe"], *(header[name] for name in _COLUMNS)]
-    filled = [(number, cells) for number, cells in sheet[1:] if any(column in cells for column in wanted)]
+        found = ", ".join(filter(None, names)) or "-"
+        raise InputError(f"{file}: the first sheet has no column {', '.join(missing)}, found {found}")
+    wanted = [names.index(name) for name in ("imageframe", *_COLUMNS)]
+    filled = [(number, row) for number, row in sheet[1:] if any(row[column] for column in wanted)]
     where = [f"{file}, row {number}" for number, _ in filled]
-    cells = [[row.get(column, "nan") for column in wanted] for _, row in filled]
+    cells = [[row[column] or "nan" for column in wanted] for _, row in filled]
     rows = np.array([numbers_of(c, len(wanted), place) for c, place in zip(cells, where, strict=True)])
     if not len(rows):
         raise InputError(f"reading {file}: it holds no pose")

@@ -1,8 +1,9 @@
 """ROS recordings: `FILE.bag` (ROS 1), a folder with `metadata.yaml` and `.db3` or `.mcap` files (ROS 2), `FILE.mcap`.
 
 Images are those of one topic, `sensor_msgs/Image` or `CompressedImage`; the camera is that of its `camera_info`. Depth
-is used where its topic's name says that it is aligned to the colour images. Poses are not: which of a recording's
-frames is the camera's, no message says.
+is used where its topic's name says that it is aligned to the colour images. Poses are not used: no message says which
+of a recording's frames is the camera's. Bags are read by the package `rosbags` (the extra `ros`); messages are those
+of the ROS distributions, definitions inside a bag are not used.
 """
 
 from __future__ import annotations
@@ -10,39 +11,73 @@ from __future__ import annotations
 import re
 import threading
 from bisect import bisect_left
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from posixpath import commonpath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.frame import TruthQuality
-from scopemap.io.datasets.rosbag_camera import calibration_of
-from scopemap.io.datasets.rosbag_files import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    Message,
-    Recording,
-    Topic,
-    is_installed,
-    is_recording,
+from scopemap.io.datasets.rosbag_messages import (
+    bit_depth,
+    calibration_of,
+    depth_of,
+    eight_bit,
+    encoding_of,
+    image_of,
+    is_depth,
+    is_grey,
 )
-from scopemap.io.datasets.rosbag_pictures import bare, bits_of, depth_of, eight_bit, encoding_of, is_depth, picture_of
+from scopemap.io.decoding import first_bytes
+from scopemap.io.images import image_files, numeric_order
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
+_IMAGE, _COMPRESSED, _CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+_MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
+_METADATA = "metadata.yaml"
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
 _ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)")
 _ALIGNED_TO = re.compile(r"aligned_depth_to_([a-z0-9]+)")
-_MONO = ("mono8", "mono16", "8UC1")
 _LEFT, _RIGHT = (re.compile(rf"(?<![a-z]){side}(?![a-z])") for side in ("left", "right"))
 _LARGEST_GAP_S = 0.02
-_NS_PER_S = 1e9
+_NS_PER_S = 10**9
+
+
+class _Topic(NamedTuple):
+    """A topic: its name, the type and number of its messages, and the encoding of its first image, else ""."""
+
+    name: str
+    kind: str
+    count: int
+    encoding: str
+
+
+class _Message(NamedTuple):
+    """One message: its topic, when it was recorded, and its deserialized fields, None where it is damaged."""
+
+    topic: str
+    bag_ns: int
+    fields: Any
+
+    @property
+    def content(self) -> Any:
+        """The fields as attributes; `InputError` where the message is damaged."""
+        if self.fields is None:
+            raise InputError("the message is damaged")
+        return self.fields
+
+    @property
+    def header_ns(self) -> int:
+        """The stamp in its header, 0 where it has none."""
+        stamp = None if self.fields is None else self.fields.header.stamp
+        return 0 if stamp is None else int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
 
 
 class RosBag(SourceDefaults):
@@ -50,7 +85,7 @@ class RosBag(SourceDefaults):
 
     path : the bag. topic : the topic of the images; None: one with a `camera_info`, in colour, of the left camera and
     with the most messages, in this order. A frame's index is its number among the topic's messages, its time the stamp
-    in its header, or when it was recorded where the first message has no stamp.
+    in its header, or the time of recording where the first message has no stamp.
 
     Raises `InputError` for what cannot be read, holds no images, or needs the package `rosbags`.
     """
@@ -60,44 +95,51 @@ class RosBag(SourceDefaults):
     quality: TruthQuality = "registered"
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
+        if not self.is_installed():
+            raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'")
         self.path = path
         self.notes: list[str] = []
-        self._recording = Recording(path)
-        self.warnings = self._recording.warnings
+        self.warnings: list[str] = []
+        self._storage = _storage_of(path)
         self._lock = threading.Lock()
-        self._held = ExitStack()
-        self._depth_readers: list[Any] = []
-        self._grey: set[str] = set()
+        self._depth_reader: Any = None
+        self._open_readers = ExitStack()
         self._bits = 0
-        with self._recording.opened() as readers:
-            pictures, depths = self._image_topics(readers)
-            self._topic = self._chosen(pictures, topic)
-            first = next(self._recording.messages(readers, [self._topic.name]), None)
+        with self._opened() as reader:
+            self._topics = self._topics_in(reader)
+            self._topic = self._chosen(topic)
+            first = next(self._messages(reader, [self._topic.name]), None)
             self._stamped = first is not None and first.header_ns != 0
-            self.height, self.width = self._size(readers)
-            self._take_camera(readers)
-        self.count = self._recording.believed(self._topic.total)
-        self._depth_topic = self._aligned(depths)
+            self.height, self.width = self._size(reader)
+            self._take_camera(reader)
+        # A count that the files have no room for is the claim of a damaged bag.
+        files = self._storage.iterdir() if self._storage.is_dir() else [self._storage]
+        self.count = min(self._topic.count, sum(file.stat().st_size for file in files))
+        self._depth_topic = self._aligned()
         clock = "stamps in the headers" if self._stamped else "when they were recorded, as headers hold no stamp"
-        self.notes += [
-            f"time stamps: {clock}",
-            "poses in a bag (odometry, tf) are not used: whose they are is not said",
-        ]
+        self.notes += [f"time stamps: {clock}", "poses in a bag (odometry, tf) are not used"]
 
-    is_installed = staticmethod(is_installed)
+    @staticmethod
+    def is_installed() -> bool:
+        """Whether the package `rosbags` is there."""
+        return find_spec("rosbags") is not None
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` is a ROS bag or MCAP file, or a folder of such files and no images."""
-        return is_recording(path)
+        """Whether `path` is a bag by ending and first bytes, or a folder with a bag's files and no images."""
+        if not path.is_dir():
+            magic = _MAGIC.get(path.suffix)
+            return magic is not None and first_bytes(path, len(magic)) == magic
+        files = _storages_in(path)
+        is_bag = bool(files) and ((path / _METADATA).is_file() or any(RosBag.recognises(file) for file in files))
+        return is_bag and not image_files(path)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; an unreadable one is left out with a warning, another size is an `InputError`."""
         last_s = -np.inf
-        with self._recording.opened() as readers:
-            for number, message in islice(
-                enumerate(self._messages(readers, [self._topic.name])), *self._bounds(selection)
-            ):
+        with self._opened() as reader:
+            messages = enumerate(self._as_far_as_read(reader, [self._topic.name]))
+            for number, message in islice(messages, *selection.indices(self.count)):
                 try:
                     rgb = self._picture(message)
                 except InputError as error:
@@ -116,7 +158,7 @@ class RosBag(SourceDefaults):
                 yield SourceFrame(number, time_s, rgb, f"{self._topic.name}[{number}]")
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time of the selected frames, of images that turn out unreadable, too; decodes none."""
+        """Return number and time of the selected frames, also of unreadable images; decodes none."""
         return list(enumerate(time_s for time_s, _ in self._clock[self._topic.name]))[selection]
 
     def pose(self, index: int) -> np.ndarray | None:
@@ -131,70 +173,116 @@ class RosBag(SourceDefaults):
         depths = self._clock[self._depth_topic.name]
         after = bisect_left(depths, (times[index][0],))
         around = depths[max(after - 1, 0) : after + 1]
-        near = min(around, key=lambda depth: abs(depth[0] - times[index][0]), default=None)
-        if near is None or abs(near[0] - times[index][0]) > _LARGEST_GAP_S:
+        nearest = min(around, key=lambda depth: abs(depth[0] - times[index][0]), default=None)
+        if nearest is None or abs(nearest[0] - times[index][0]) > _LARGEST_GAP_S:
             return None
-        return SourceTruth(None, self._depth_mm(self._depth_topic, near), self.quality)
+        return SourceTruth(None, self._depth_mm(self._depth_topic.name, nearest[1]), self.quality)
 
-    def _depth_mm(self, topic: Topic, stamp: tuple[float, int]) -> np.ndarray:
-        time_s, bag_ns = stamp
-        # Frames are read ahead in a thread of their own; a bag that is open for depth is one.
+    def _depth_mm(self, topic: str, bag_ns: int) -> np.ndarray:
+        # Frames are read ahead in a thread of their own; one reader of depth stays open for all others.
         with self._lock:
-            if not self._depth_readers:
-                self._depth_readers = self._held.enter_context(self._recording.opened())
-            found = self._recording.messages(self._depth_readers, [topic.name], bag_ns, bag_ns + 1)
-            message = next((message for message in found if self._time_s(message) == time_s), None)
-        if message is None:
-            raise InputError(f"reading {self.path}: depth at {time_s:.3f} s in {topic.name} is not found again")
+            if self._depth_reader is None:
+                self._depth_reader = self._open_readers.enter_context(self._opened())
+            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1), None)
         try:
-            return depth_of(self._recording.unpacked(message))
+            if message is None:
+                raise InputError("it is not found again")
+            return depth_of(message.content)
         except InputError as error:
-            raise InputError(f"reading {self.path}: depth at {time_s:.3f} s in {topic.name}: {error}") from None
+            raise InputError(f"reading {self.path}: depth recorded at {bag_ns} ns in {topic}: {error}") from None
 
     @cached_property
     def _clock(self) -> dict[str, list[tuple[float, int]]]:
-        """Time, s, and moment of recording, ns, of all messages, by topic; depth sorted. No image is decoded."""
+        """Time, s, and time of recording, ns, of all messages, by topic; depth sorted. No image is decoded."""
         names = [self._topic.name, *([self._depth_topic.name] if self._depth_topic else [])]
         clock: dict[str, list[tuple[float, int]]] = {name: [] for name in names}
-        with self._recording.opened() as readers:
-            for message in self._messages(readers, names):
+        with self._opened() as reader:
+            for message in self._as_far_as_read(reader, names):
                 clock[message.topic].append((self._time_s(message), message.bag_ns))
         for name in names[1:]:
             clock[name].sort()
         return clock
 
-    def _time_s(self, message: Message) -> float:
+    def _time_s(self, message: _Message) -> float:
         stamp_ns = message.header_ns if self._stamped else 0
         if self._stamped and not stamp_ns:
             self._warn(f"some messages of {message.topic} hold no stamp: the time of recording is used for them")
         return (stamp_ns or message.bag_ns) / _NS_PER_S
 
-    def _messages(self, readers: list[Any], topics: list[str]) -> Iterator[Message]:
-        """Yield messages as far as the bag goes; a warning says where it breaks off."""
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """Open the bag with the reader of `rosbags` for its version."""
+        from rosbags import rosbag1, rosbag2
+
+        with self._reporting():
+            reader = (rosbag1 if self._storage.suffix == ".bag" else rosbag2).Reader(self._storage)
+            reader.open()
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+    def _messages(
+        self, reader: Any, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[_Message]:
+        """Yield the messages of `topics` recorded in [start_ns, stop_ns); `InputError` where the bag breaks off."""
+        from rosbags.typesys import Stores, get_typestore
+
+        connections = [connection for connection in _readable(reader) if connection.topic in topics]
+        found = reader.messages(connections, start_ns, stop_ns) if connections else iter(())
+        ros1 = self._storage.suffix == ".bag"
+        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
+        deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+        while True:
+            with self._reporting():
+                item = next(found, None)
+            if item is None:
+                return
+            connection, bag_ns, raw = item
+            fields = None
+            with suppress(Exception):  # damaged bytes end in exceptions of any kind
+                fields = deserialize(raw, connection.msgtype)
+            yield _Message(connection.topic, bag_ns, fields)
+
+    def _as_far_as_read(self, reader: Any, topics: list[str]) -> Iterator[_Message]:
+        """Yield messages up to where the bag breaks off; a warning says so."""
         read = 0
         try:
-            for message in self._recording.messages(readers, topics):
+            for message in self._messages(reader, topics):
                 yield message
                 read += 1
         except InputError as error:
             self._warn(f"after {read} messages the bag breaks off, those were used: {error}")
 
-    def _picture(self, message: Message) -> np.ndarray:
-        """Return the picture (h, w, 3) uint8; the first of 16 bits decides for all of them how many of these count."""
-        rgb = picture_of(self._recording.unpacked(message))
+    @contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Turn the exceptions of `rosbags` into `InputError`."""
+        try:
+            yield
+        except ScopemapError:
+            raise
+        except Exception as error:  # damaged bytes end in exceptions of any kind
+            raise InputError(
+                f"reading {self.path}: the bag is damaged or was not closed ({error or type(error).__name__}); 'rosbag "
+                "reindex', 'ros2 bag reindex' or 'mcap recover' may mend it"
+            ) from None
+
+    def _picture(self, message: _Message) -> np.ndarray:
+        """Return the image (h, w, 3) uint8; the first one of 16 bits decides how many bits are used of all."""
+        rgb = image_of(message.content)
         if rgb.dtype == np.uint8:
             return rgb
         if not self._bits:
-            self._bits = bits_of(rgb)
-            self.notes.append(f"samples of 16 bits: {self._bits} of them count, by the brightest of the first image")
-        if bits_of(rgb) > self._bits:
-            self._warn(f"images of {self._topic.name} are brighter than the {self._bits} bits of the first: cut off")
+            self._bits = bit_depth(rgb)
+            self.notes.append(f"samples of 16 bits: {self._bits} are used, by the brightest of the first image")
+        if bit_depth(rgb) > self._bits:
+            self._warn(f"images of {self._topic.name} are brighter than the {self._bits} bits of the first: clipped")
         return eight_bit(rgb, self._bits)
 
-    def _size(self, readers: list[Any]) -> tuple[int, int]:
+    def _size(self, reader: Any) -> tuple[int, int]:
         """Return height and width of the first image that can be decoded."""
         fault = f"{self._topic.name} holds no message"
-        for message in self._messages(readers, [self._topic.name]):
+        for message in self._as_far_as_read(reader, [self._topic.name]):
             try:
                 height, width = self._picture(message).shape[:2]
             except InputError as error:
@@ -203,90 +291,83 @@ class RosBag(SourceDefaults):
             return height, width
         raise InputError(f"reading {self.path}: no image of {self._topic.name} can be read ({fault})")
 
-    def _image_topics(self, readers: list[Any]) -> tuple[list[Topic], list[Topic]]:
-        """Return the topics of pictures and those of depth, by their first messages."""
-        pictures: list[Topic] = []
-        depths: list[Topic] = []
-        for topic in self._recording.topics.values():
-            if topic.kind not in (IMAGE, COMPRESSED):
-                continue
+    def _topics_in(self, reader: Any) -> dict[str, _Topic]:
+        """Return the topics of images and cameras that hold messages; a warning names those that cannot be read."""
+        counts: Counter[tuple[str, str]] = Counter()
+        for connection in _readable(reader):
+            counts[connection.topic, connection.msgtype] += connection.msgcount
+        topics: dict[str, _Topic] = {}
+        for (name, kind), count in counts.items():
             try:
-                message = next(self._recording.messages(readers, [topic.name]), None)
-                encoding = None if message is None else encoding_of(self._recording.unpacked(message))
+                message = next(self._messages(reader, [name]), None) if count > 0 else None
+                if message is not None:
+                    encoding = "" if kind == _CAMERA_INFO else encoding_of(message.content)
+                    topics[name] = _Topic(name, kind, count, encoding)
             except InputError as error:
-                self._warn(f"{topic.name} cannot be read: {error}")
-                continue
-            if encoding is not None:
-                if bare(encoding) in _MONO:
-                    self._grey.add(topic.name)
-                (depths if is_depth(encoding) else pictures).append(topic)
-        return pictures, depths
+                self._warn(f"{name} cannot be read: {error}")
+        return topics
 
-    def _chosen(self, pictures: list[Topic], name: str | None) -> Topic:
-        names = ", ".join(topic.name for topic in pictures)
+    def _chosen(self, name: str | None) -> _Topic:
+        images = [topic for topic in self._topics.values() if topic.encoding and not is_depth(topic.encoding)]
+        names = ", ".join(topic.name for topic in images) or "none"
         if name is not None:
-            for topic in pictures:
-                if topic.name.strip("/") == name.strip("/"):
-                    return topic
-            raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names or 'none'}")
-        if not pictures:
-            topics = ", ".join(self._recording.topics) or "none"
-            foreign = ", ".join(self._recording.foreign)
-            fault = f"; of its messages, those serialised as {foreign} are not read, only cdr is" if foreign else ""
-            fault += "".join(f"; {warning}" for warning in self.warnings[:1])
+            found = next((topic for topic in images if topic.name.strip("/") == name.strip("/")), None)
+            if found is None:
+                raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
+            return found
+        if not images:
+            fault = "".join(f"; {warning}" for warning in self.warnings[:1])
             raise InputError(
-                f"reading {self.path}: it holds no pictures (looked for sensor_msgs/Image and CompressedImage; topics "
-                f"of these kinds and camera_info are {topics}){fault}"
+                f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage; topics of "
+                f"these kinds and camera_info are {', '.join(self._topics) or 'none'}){fault}"
             )
-        chosen = max(pictures, key=self._preference)
-        others = [topic.name for topic in pictures if topic is not chosen]
-        if others:
-            self.notes.append(
-                f"images of {chosen.name}; also there: {', '.join(others)} (--dataset {self.name}:TOPIC takes another)"
-            )
+        chosen = max(images, key=self._preference)
+        if len(images) > 1:
+            self.notes.append(f"images of {chosen.name}, one of {names} (--dataset {self.name}:TOPIC takes another)")
         return chosen
 
-    def _preference(self, topic: Topic) -> tuple[bool, bool, bool, bool, int, bool]:
+    def _preference(self, topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
         left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
-        colour = topic.name not in self._grey
-        return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == IMAGE
+        colour = not is_grey(topic.encoding)
+        return self._own_info(topic) is not None, colour, left, not right, topic.count, topic.kind == _IMAGE
 
-    def _own_info(self, topic: Topic) -> str | None:
+    def _own_info(self, topic: _Topic) -> str | None:
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
         parts = topic.name.split("/")
-        # A transport, as in /camera/image_raw/compressed, is one step more.
-        places = ["/".join([*parts[:depth], "camera_info"]) for depth in (-1, -2) if len(parts) >= -depth]
-        kinds = {place: self._recording.topics.get(place) for place in places}
-        return next((place for place, found in kinds.items() if found and found.kind == CAMERA_INFO), None)
+        # A transport, as in /camera/image_raw/compressed, is one level more.
+        names = ["/".join([*parts[:depth], "camera_info"]) for depth in (-1, -2) if len(parts) >= -depth]
+        topics = (self._topics.get(name) for name in names)
+        return next((found.name for found in topics if found and found.kind == _CAMERA_INFO), None)
 
-    def _take_camera(self, readers: list[Any]) -> None:
-        infos = [topic.name for topic in self._recording.topics.values() if topic.kind == CAMERA_INFO]
-        name = self._own_info(self._topic) or (infos[0] if len(infos) == 1 else None)
-        if name is None:
-            if infos:
-                self.notes.append(f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}")
-            return
-        if name != self._own_info(self._topic):
+    def _take_camera(self, reader: Any) -> None:
+        infos = [topic.name for topic in self._topics.values() if topic.kind == _CAMERA_INFO]
+        name = self._own_info(self._topic)
+        if name is None and len(infos) == 1:
+            name = infos[0]
             self.notes.append(f"the only camera_info, {name}, is taken as that of {self._topic.name}")
+        if name is None:
+            self.notes += [f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}"] if infos else []
+            return
         rectified = bool(_RECTIFIED.search(self._topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]))
         try:
-            for message in islice(self._recording.messages(readers, [name]), 1):
-                info = self._recording.unpacked(message)
+            for message in islice(self._messages(reader, [name]), 1):
+                info = message.content
                 self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
             return
         if self.calibration is None:
-            self.notes.append(f"{name} says that the camera is not calibrated (K is zero)")
+            self.notes.append(f"the camera of {name} is not calibrated (K is zero)")
         else:
             self.camera, self.camera_source = self.calibration.camera, self.calibration.source
 
-    def _aligned(self, depths: list[Topic]) -> Topic | None:
-        """Return the depth that is aligned to the pictures, by its topic's name."""
-        aligned = [topic for topic in depths if _ALIGNED.search(topic.name) and self._is_meant(topic)]
+    def _aligned(self) -> _Topic | None:
+        """Return the depth topic that is aligned to the images, by its name."""
+        depths = [topic for topic in self._topics.values() if is_depth(topic.encoding)]
+        aligned = [topic for topic in depths if _ALIGNED.search(topic.name) and self._names_the_images(topic)]
         # Of several cameras' depth, that of the same camera has the most of its name in common.
-        near = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
-        chosen = max(aligned, key=lambda topic: (near[topic.name], topic.total), default=None)
+        common = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
+        chosen = max(aligned, key=lambda topic: (common[topic.name], topic.count), default=None)
         others = [topic.name for topic in depths if topic is not chosen]
         if chosen is not None:
             self.notes.append(f"depth: {chosen.name}, taken as aligned to {self._topic.name}; whole numbers mm, else m")
@@ -294,19 +375,34 @@ class RosBag(SourceDefaults):
             self.notes.append(f"depth that no name says to be aligned is not used: {', '.join(others)}")
         return chosen
 
-    def _is_meant(self, depth: Topic) -> bool:
-        """Whether depth that names the pictures it is aligned to names these."""
+    def _names_the_images(self, depth: _Topic) -> bool:
+        """Whether depth that names the images it is aligned to names these."""
         named = _ALIGNED_TO.search(depth.name)
         return named is None or named[1] in self._topic.name
-
-    def _bounds(self, selection: slice) -> tuple[int | None, int | None, int | None]:
-        """Return bounds that count from the start; the bag's own count serves only those from the end."""
-        if all(bound is None or bound >= 0 for bound in (selection.start, selection.stop)):
-            return selection.start, selection.stop, selection.step
-        if self.count is None:
-            raise InputError(f"reading {self.path}: its length is unknown, so count frames from the start")
-        return selection.indices(self.count)
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
             self.warnings.append(message)
+
+
+def _storages_in(folder: Path) -> list[Path]:
+    files = (file for file in folder.iterdir() if file.name.removesuffix(".zstd").endswith(tuple(_MAGIC)))
+    return sorted((file for file in files if file.is_file()), key=numeric_order)
+
+
+def _storage_of(path: Path) -> Path:
+    """Return what `rosbags` opens: a file, or a folder with `metadata.yaml`."""
+    if not path.is_dir() or (path / _METADATA).is_file():
+        return path
+    files = _storages_in(path)
+    if len(files) != 1:
+        some = ", ".join(file.name for file in files[:5])
+        raise InputError(f"reading {path}: {len(files)} bags and no {_METADATA} that joins them ({some}); give one")
+    return files[0]
+
+
+def _readable(reader: Any) -> list[Any]:
+    """Return the connections of the types that are read; `rosbags` deserializes ROS 1 and CDR."""
+    wanted = (_IMAGE, _COMPRESSED, _CAMERA_INFO)
+    found = [connection for connection in reader.connections if connection.msgtype in wanted]
+    return [connection for connection in found if getattr(connection.ext, "serialization_format", "cdr") == "cdr"]

@@ -1,70 +1,36 @@
-"""The first sheet of an Excel workbook (`.xlsx`), as a zip of XML; nothing is calculated."""
+"""The first sheet of an Excel workbook (`.xlsx`), read by the package `openpyxl` (the extra `datasets`)."""
 
 from __future__ import annotations
 
-import lzma
-import re
 import zipfile
-import zlib
+from importlib.util import find_spec
 from pathlib import Path
-from xml.etree import ElementTree
 
 from scopemap.errors import InputError
+from scopemap.io.decoding import check_bytes
 
-_SHEET, _STRINGS = "xl/worksheets/sheet1.xml", "xl/sharedStrings.xml"
-# Some hundred thousand cells; as a tree they take many times as much.
-_LARGEST_MEMBER_BYTES = 16 << 20
-_DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, ElementTree.ParseError),
-    *(OSError, EOFError, LookupError, RuntimeError, ValueError),
-)
+# Some hundred thousand cells; in memory they take many times as much.
+_MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
 
 
-def read_sheet(file: Path) -> list[tuple[int, dict[str, str]]]:
-    """Return the rows of the first sheet that hold anything: row number from 1, and the text of each cell by column.
+def read_sheet(file: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of the first sheet that hold anything: row number from 1, and the text of each cell, "" if empty.
 
-    Columns are named as in Excel ("A", "B", ...); empty cells are left out. Raises `InputError` for any other file.
+    Raises `InputError` for any other file, for one that unpacks to more than 32 MB, and without `openpyxl`.
     """
+    if find_spec("openpyxl") is None:
+        raise InputError(f"reading {file}: it is a spreadsheet; install its reader: pip install 'scopemap[datasets]'")
+    import openpyxl
+
     try:
         with zipfile.ZipFile(file) as archive:
-            names = archive.namelist()
-            if _SHEET not in names:
-                raise InputError(f"reading {file}: this workbook has no first sheet ({_SHEET})")
-            strings = _strings(_xml(archive, _STRINGS, file)) if _STRINGS in names else []
-            rows = [_row(row, strings) for row in _xml(archive, _SHEET, file).iterfind("{*}sheetData/{*}row")]
-    except _DAMAGE as error:
+            check_bytes(str(file), sum(member.file_size for member in archive.infolist()), _MOST_BYTES)
+        sheet = openpyxl.load_workbook(file, data_only=True).worksheets[0]
+        if sheet.max_row * sheet.max_column > _MOST_CELLS:
+            raise InputError(f"reading {file}: its first sheet claims {sheet.max_row}x{sheet.max_column} cells")
+        rows = [["" if cell is None else str(cell).strip() for cell in row] for row in sheet.values]
+    except InputError:
+        raise
+    except Exception as error:  # damaged bytes end in exceptions of any kind
         raise InputError(f"reading {file}: no Excel workbook, or damaged ({error}); download it again") from None
-    return [(number, cells) for number, cells in rows if cells]
-
-
-def _xml(archive: zipfile.ZipFile, name: str, file: Path) -> ElementTree.Element:
-    size = archive.getinfo(name).file_size
-    if size > _LARGEST_MEMBER_BYTES:
-        raise InputError(
-            f"reading {file}: its {name} holds {size >> 20} MB, expected {_LARGEST_MEMBER_BYTES >> 20} at most"
-        )
-    return ElementTree.fromstring(archive.read(name))
-
-
-def _strings(root: ElementTree.Element) -> list[str]:
-    return [_text(item) for item in root.iterfind("{*}si")]
-
-
-def _text(item: ElementTree.Element) -> str:
-    """Return a text, which may be split into runs of different type."""
-    return "".join(part.text or "" for part in item.iterfind(".//{*}t"))
-
-
-def _row(row: ElementTree.Element, strings: list[str]) -> tuple[int, dict[str, str]]:
-    cells: dict[str, str] = {}
-    for cell in row.iterfind("{*}c"):
-        column = re.match(r"[A-Z]+", cell.get("r", ""))
-        if column is None:
-            raise ValueError("a cell does not say where it stands")
-        kind, value = cell.get("t", "n"), cell.findtext("{*}v") or ""
-        text = _text(cell) if kind == "inlineStr" else value
-        if kind == "s":
-            text = strings[int(value)]
-        if text.strip():
-            cells[column[0]] = text.strip()
-    return int(row.get("r", "")), cells
+    return [(number, row) for number, row in enumerate(rows, start=1) if any(row)]
