@@ -231,7 +231,7 @@ def _check_decoder(file: Path, syntax: str) -> None:
     try:
         if get_decoder(UID(syntax)).is_available:
             return
-    except NotImplementedError:
+    except RuntimeError:  # it is unknown
         pass
     # A UID that is unknown is not quoted: it may hold anything.
     name = UID(syntax).name if syntax in UID_dictionary else "an unknown transfer syntax"

@@ -43,8 +43,7 @@ _IMAGE, _COMPRESSED, _CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Ima
 _MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _METADATA = "metadata.yaml"
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
-_ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)")
-_ALIGNED_TO = re.compile(r"aligned_depth_to_([a-z0-9]+)")
+_ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)(?:_depth_to_([a-z0-9]+))?")
 _LEFT, _RIGHT = (re.compile(rf"(?<![a-z]){side}(?![a-z])") for side in ("left", "right"))
 _LARGEST_GAP_S = 0.02
 _NS_PER_S = 10**9
@@ -55,7 +54,7 @@ class _Topic(NamedTuple):
 
     name: str
     kind: str
-    count: int
+    total: int
     encoding: str
 
 
@@ -114,7 +113,7 @@ class RosBag(SourceDefaults):
             self._take_camera(reader)
         # A count that the files have no room for is the claim of a damaged bag.
         files = self._storage.iterdir() if self._storage.is_dir() else [self._storage]
-        self.count = min(self._topic.count, sum(file.stat().st_size for file in files))
+        self.count: int | None = min(self._topic.total, sum(file.stat().st_size for file in files))
         self._depth_topic = self._aligned()
         clock = "stamps in the headers" if self._stamped else "when they were recorded, as headers hold no stamp"
         self.notes += [f"time stamps: {clock}", "poses in a bag (odometry, tf) are not used"]
@@ -139,7 +138,7 @@ class RosBag(SourceDefaults):
         last_s = -np.inf
         with self._opened() as reader:
             messages = enumerate(self._as_far_as_read(reader, [self._topic.name]))
-            for number, message in islice(messages, *selection.indices(self.count)):
+            for number, message in islice(messages, *selection.indices(self.count or 0)):
                 try:
                     rgb = self._picture(message)
                 except InputError as error:
@@ -329,7 +328,7 @@ class RosBag(SourceDefaults):
     def _preference(self, topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
         left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
         colour = not is_grey(topic.encoding)
-        return self._own_info(topic) is not None, colour, left, not right, topic.count, topic.kind == _IMAGE
+        return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == _IMAGE
 
     def _own_info(self, topic: _Topic) -> str | None:
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
@@ -364,21 +363,20 @@ class RosBag(SourceDefaults):
     def _aligned(self) -> _Topic | None:
         """Return the depth topic that is aligned to the images, by its name."""
         depths = [topic for topic in self._topics.values() if is_depth(topic.encoding)]
-        aligned = [topic for topic in depths if _ALIGNED.search(topic.name) and self._names_the_images(topic)]
+        aligned = [
+            topic
+            for topic in depths
+            if (match := _ALIGNED.search(topic.name)) and (match[2] is None or match[2] in self._topic.name)
+        ]
         # Of several cameras' depth, that of the same camera has the most of its name in common.
         common = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
-        chosen = max(aligned, key=lambda topic: (common[topic.name], topic.count), default=None)
+        chosen = max(aligned, key=lambda topic: (common[topic.name], topic.total), default=None)
         others = [topic.name for topic in depths if topic is not chosen]
         if chosen is not None:
             self.notes.append(f"depth: {chosen.name}, taken as aligned to {self._topic.name}; whole numbers mm, else m")
         if others:
             self.notes.append(f"depth that no name says to be aligned is not used: {', '.join(others)}")
         return chosen
-
-    def _names_the_images(self, depth: _Topic) -> bool:
-        """Whether depth that names the images it is aligned to names these."""
-        named = _ALIGNED_TO.search(depth.name)
-        return named is None or named[1] in self._topic.name
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
