@@ -118,10 +118,24 @@ class SourceDefaults:
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
+    warnings: list[str]
 
     def media(self) -> str | BinaryIO | None:
         """Nothing: no video."""
         return None
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """No pose is known."""
+        return None
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """No truth is known."""
+        return None
+
+    def _warn(self, message: str) -> None:
+        """Add a warning, once."""
+        if message not in self.warnings:
+            self.warnings.append(message)
 
     def _use_calibration(self, calibration: Calibration) -> None:
         """Use the calibration beside the frames, which comes before a data set's own; opening fits it."""

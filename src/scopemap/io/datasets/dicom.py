@@ -18,7 +18,7 @@ from scopemap.errors import InputError
 from scopemap.io.datasets.dicom_files import EncapsulatedVideo, Header, images, read_header
 from scopemap.io.decoding import first_bytes
 from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
-from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame
 
 _PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
 # The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
@@ -40,7 +40,7 @@ class Dicom(SourceDefaults):
             raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'")
         self.path = path
         self.notes: list[str] = []
-        self.warnings: list[str] = []
+        self.warnings = []
         self._headers = self._in_folder(path) if path.is_dir() else [read_header(path)]
         first = self._headers[0]
         self.numbers = range(first.frames) if len(self._headers) == 1 else self._instances()
@@ -102,14 +102,6 @@ class Dicom(SourceDefaults):
         """Return the video's stream; None where there is none."""
         return None if self._video is None else self._video.media()
 
-    def pose(self, index: int) -> np.ndarray | None:
-        """DICOM holds no pose of an endoscope."""
-        return None
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """DICOM holds no truth."""
-        return None
-
     def _selected(self, positions: range) -> Iterator[tuple[int, np.ndarray | None]]:
         if len(self._headers) == 1:
             yield from images(self._headers[0], positions)
@@ -169,10 +161,6 @@ class Dicom(SourceDefaults):
             return numbers
         self._warn("not every file of the series has a number of its own: they are counted in the order of their names")
         return range(len(self._headers))
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)
 
 
 def _is_dicom(file: Path) -> bool:

@@ -98,7 +98,7 @@ class RosBag(SourceDefaults):
             raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'")
         self.path = path
         self.notes: list[str] = []
-        self.warnings: list[str] = []
+        self.warnings = []
         self._storage = _storage_of(path)
         self._lock = threading.Lock()
         self._depth_reader: Any = None
@@ -159,10 +159,6 @@ class RosBag(SourceDefaults):
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
         """Return number and time of the selected frames, also of unreadable images; decodes none."""
         return list(enumerate(time_s for time_s, _ in self._clock[self._topic.name]))[selection]
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """A bag's poses are not used."""
-        return None
 
     def truth(self, index: int) -> SourceTruth | None:
         """Return the aligned depth nearest in time, at most 0.02 s away; None where there is none."""
@@ -377,10 +373,6 @@ class RosBag(SourceDefaults):
         if others:
             self.notes.append(f"depth that no name says to be aligned is not used: {', '.join(others)}")
         return chosen
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)
 
 
 def _storages_in(folder: Path) -> list[Path]:
