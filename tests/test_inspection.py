@@ -34,9 +34,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.errors import InputError
-from scopemap.inspection.finding import Finding, covered, stretches_of
+from scopemap.inspection.clip import VideoFinding, covered, stretches_of
 from scopemap.inspection.inspecting import Inspection, inspect
-from scopemap.inspection.masks import write_mask
+from scopemap.inspection.picture import write_mask
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles
 
@@ -96,7 +96,7 @@ def inspected(tmp_path_factory: pytest.TempPathFactory) -> Inspect:
     return one
 
 
-def by_code(inspection: Inspection) -> dict[str, Finding]:
+def by_code(inspection: Inspection) -> dict[str, VideoFinding]:
     return {finding.code: finding for finding in inspection.findings}
 
 
@@ -225,7 +225,7 @@ def test_positions_count_unreadable_images_as_frames_does(tmp_path: Path) -> Non
     assert set(found) == {"source", "not-tissue"}
     assert found["not-tissue"].stretches == ((25, 39),)
     assert found["not-tissue"].advice.endswith("--frames :25")
-    assert [view.figures.position for view in inspection.samples][-1] > 30
+    assert [view.measures.position for view in inspection.samples][-1] > 30
     told = [finding.message for finding in inspection.findings if finding.code == "source"]
     assert (len(told), told[-1]) == (4, "and 3 more warnings of the reader")
     part = by_code(inspect(tmp_path, frames=slice(10, None, 2)))["not-tissue"]

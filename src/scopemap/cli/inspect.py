@@ -62,8 +62,7 @@ def inspect(
     _refuse(file, masks, overwrite)
 
     from scopemap.inspection.inspecting import inspect as inspection_of
-    from scopemap.inspection.masks import MASK_NAME, write_mask
-    from scopemap.inspection.picture import draw_inspection
+    from scopemap.inspection.picture import MASK_NAME, draw_inspection, write_mask
 
     with count_progress("inspecting", "inspected", silent=quiet or as_json) as listener:
         selection = parse_slice(frames) if frames else None
@@ -85,7 +84,7 @@ def inspect(
 
 
 def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
-    from scopemap.inspection.masks import MASK_NAME
+    from scopemap.inspection.picture import MASK_NAME
 
     if file.suffix.lower() != ".png":
         raise InputError(f"cannot write the picture {file}: its name must end in .png")

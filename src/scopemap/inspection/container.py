@@ -1,4 +1,4 @@
-"""What a video file's header says: codec, size, rate, shape of pixels, bits, range, rotation, fields, length."""
+"""Facts in a video file's header: codec, size, rate, shape of pixels, bits, range, rotation, fields, length."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import BinaryIO
 
 import av
 
-from scopemap.inspection.finding import Finding
+from scopemap.inspection.clip import VideoFinding
 
 _FULL_RANGE = 2
 # FFmpeg's numbers for the order of fields: 0 unknown, 1 progressive, then the four kinds of interlaced.
@@ -16,12 +16,12 @@ _PROGRESSIVE = 1
 
 @dataclass(frozen=True)
 class Container:
-    """Facts of a video file; None: the header does not say.
+    """Facts of a video file; None: not in the header.
 
     Attributes
     ----------
     pixel_aspect : width of a pixel over its height. bits : per colour channel. full_range : whether levels use 0..255
-    (as opposed to 16..235). rotation_deg : by which a player turns the picture. interlaced : whether it says so.
+    (as opposed to 16..235). rotation_deg : by which a player rotates the picture. interlaced : by the header.
     """
 
     container: str
@@ -38,16 +38,32 @@ class Container:
     frames: int | None
     length_s: float | None
 
+    def findings(self) -> list[VideoFinding]:
+        """Return what in the header is unusual."""
+        found = []
+        if abs(self.pixel_aspect - 1) > 1e-3:
+            message = f"pixels are {self.pixel_aspect:.4g} times as wide as high; runs reckon with it"
+            found.append(VideoFinding("info", "pixel-aspect", message))
+        if self.bits > 8:
+            found.append(VideoFinding("info", "bit-depth", f"{self.bits} bits per channel; runs work on 8"))
+        if self.rotation_deg:
+            message = f"players turn the picture by {self.rotation_deg} deg"
+            found.append(
+                VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see")
+            )
+        if self.interlaced:
+            message = "the header says that the pictures are interlaced"
+            found.append(VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too"))
+        return found
+
 
 def read_container(media: str | BinaryIO) -> Container | None:
-    """Return what the header and first picture of a video say, None for what is no video that can be opened."""
+    """Return the facts in the header and first picture of a video, None where it cannot be opened."""
     try:
         with av.open(media, "r", metadata_errors="replace") as container:
             stream = next(iter(container.streams.video), None)
-            if stream is None or stream.codec_context is None:
-                return None
-            first = next(container.decode(stream), None)
-            if first is None:
+            first = None if stream is None or stream.codec_context is None else next(container.decode(stream), None)
+            if stream is None or first is None:
                 return None
             length_s = container.duration / av.time_base if container.duration else None
             if stream.duration and stream.time_base:
@@ -69,22 +85,3 @@ def read_container(media: str | BinaryIO) -> Container | None:
             )
     except (av.FFmpegError, OSError, ValueError):
         return None
-
-
-def check_container(facts: Container) -> list[Finding]:
-    """Return what in the header is unusual."""
-    found = []
-    if abs(facts.pixel_aspect - 1) > 1e-3:
-        message = f"pixels are {facts.pixel_aspect:.4g} times as wide as high; runs reckon with it"
-        found.append(Finding("info", "pixel-aspect", message))
-    if facts.bits > 8:
-        found.append(Finding("info", "bit-depth", f"{facts.bits} bits per channel; runs work on 8"))
-    if facts.rotation_deg:
-        message = (
-            f"players turn the picture by {facts.rotation_deg} deg; a calibration must fit the picture that runs see"
-        )
-        found.append(Finding("info", "rotation", message))
-    if facts.interlaced:
-        message = "the header says that the pictures are interlaced"
-        found.append(Finding("info", "field-order", message, "--deinterlace, where combs are found, too"))
-    return found

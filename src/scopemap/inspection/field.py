@@ -8,19 +8,27 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from scopemap.inspection.finding import Finding
-from scopemap.inspection.view import View
+from scopemap.inspection.clip import VideoFinding
+from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.field_of_view import hull_of_largest
 
 Shape = Literal["full", "bars", "circle", "cut corners", "rounded corners"]
+Box = tuple[float, float, float, float]
 
+_WORDS: dict[Shape, str] = {
+    "circle": "a circle",
+    "cut corners": "a rectangle with cut corners",
+    "rounded corners": "a rectangle with rounded corners",
+}
 _FULL_SHARE, _BAR_SHARE = 0.995, 0.01
-# Of a circle's radius: how far its outline may lie off it.
+# Shares of a circle's radius: deviation of its outline, and least part of the outline.
 _ROUND_TOLERANCE, _LEAST_ARC = 0.02, 0.3
 _LEAST_CORNER, _LEAST_CORNER_PX, _INSIDE_PX = 0.03, 6, 2
 # Height of an arc over its chord: a quarter of a circle has 0.2, what is left of it at the size of a pixel 0.07.
 _LEAST_BULGE = 0.04
-_WINDOW, _MOST_WINDOWS, _LIT_SHARE = 25, 400, 0.1
+_WINDOW, _MOST_WINDOWS = 25, 400
+# Pixels lit less often are coding artefacts beside a bright rim.
+_LIT_SHARE = 0.1
 _MOVED, _FAR = 0.006, 0.04
 _EDGE_PX = 2
 
@@ -41,23 +49,23 @@ class Field:
     share: float
     outline: np.ndarray
     moved: float
-    box: tuple[float, float, float, float]
+    box: Box
 
 
 class FieldWatcher:
-    """Learns the field from all pictures, and from 25 after 25 of them."""
+    """Finds the field from all frames, and its motion from the fields of 25 frames each."""
 
     def __init__(self) -> None:
         self._times = self._window = np.zeros((0, 0), np.int32)
         self._count = self._in_window = 0
         self._latest: np.ndarray | None = None
-        self._sides: list[tuple[float, float, float, float]] = []
+        self._sides: list[Box] = []
 
-    def add(self, view: View) -> None:
-        """Look at the next picture; those that show nothing tell nothing."""
-        if view.figures.blank:
+    def add(self, item: InspectedFrame) -> None:
+        """Add the next frame; blank ones do not count."""
+        if item.measures.blank:
             return
-        lit = cv2.morphologyEx(view.lit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+        lit = cv2.morphologyEx(item.lit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
         if self._times.shape != lit.shape:
             self._times, self._window = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
             self._count = self._in_window = 0
@@ -65,14 +73,26 @@ class FieldWatcher:
         self._window += lit
         self._count, self._in_window = self._count + 1, self._in_window + 1
         if self._in_window == _WINDOW:
-            self._close_window()
+            self._latest = hull_of_largest(self._window > _LIT_SHARE * self._in_window)
+            left, top, right, bottom = _box(self._latest)
+            self._sides.append((left, right, top, bottom))
+            self._window, self._in_window = np.zeros_like(self._window), 0
 
-    def _close_window(self) -> None:
-        self._latest = hull_of_largest(_often(self._window, self._in_window))
-        height, width = self._latest.shape
-        x, y, across, down = cv2.boundingRect(self._latest.astype(np.uint8))
-        self._sides.append((x / width, (x + across) / width, y / height, (y + down) / height))
-        self._window, self._in_window = np.zeros_like(self._window), 0
+    def field(self) -> Field:
+        """Return the field of the frames so far; the whole picture where all were blank."""
+        if not self._count:
+            corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+            return Field("full", 1.0, corners, 0.0, (0.0, 0.0, 1.0, 1.0))
+        hull = hull_of_largest(self._times > _LIT_SHARE * self._count)
+        height, width = hull.shape
+        points = _points(hull)
+        # From pixel centres to the pixels' outer edges.
+        centre = (points.min(0) + points.max(0)) / 2
+        outline = (points + 0.5 + 0.5 * np.sign(points - centre)) / (width, height)
+        moved = self._moved()
+        # The union of the places of a field that moves has another shape than each.
+        shape = _shape(self._latest if moved > _MOVED and self._latest is not None else hull)
+        return Field(shape, float(hull.mean()), outline, moved, _box(hull))
 
     def _moved(self) -> float:
         """Return by how much opposite sides moved alike, between any two windows; a dark rim moves one of them only."""
@@ -82,54 +102,32 @@ class FieldWatcher:
         alike = np.where(np.sign(apart[..., 0]) == np.sign(apart[..., 1]), np.abs(apart).min(-1), 0.0)
         return float(alike.max()) if alike.size else 0.0
 
-    def field(self) -> Field:
-        """Return the field of what was seen so far; the whole picture where nothing was."""
-        if not self._count:
-            corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-            return Field("full", 1.0, corners, 0.0, (0.0, 0.0, 1.0, 1.0))
-        hull = hull_of_largest(_often(self._times, self._count))
-        height, width = hull.shape
-        points = _points(hull)
-        # From pixel centres to the pixels' outer edges.
-        centre = (points.min(0) + points.max(0)) / 2
-        outline = (points + 0.5 + 0.5 * np.sign(points - centre)) / (width, height)
-        left, top, across, down = cv2.boundingRect(points.astype(np.int32))
-        box = left / width, top / height, (left + across) / width, (top + down) / height
-        moved = self._moved()
-        # All places of a field that moves have another shape than each.
-        shape = _shape(self._latest if moved > _MOVED and self._latest is not None else hull)
-        return Field(shape, float(hull.mean()), outline, moved, box)
-
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[VideoFinding]:
         """Return shape and motion of a field that does not fill the picture."""
         field = self.field()
         if field.shape == "full":
             return []
         left, top, right, bottom = field.box
         margins = f"left {left:.1%}, right {1 - right:.1%}, top {top:.1%}, bottom {1 - bottom:.1%}"
-        words = {
-            "bars": f"a rectangle inside black borders ({margins})",
-            "circle": "a circle",
-            "cut corners": "a rectangle with cut corners",
-            "rounded corners": "a rectangle with rounded corners",
-        }[field.shape]
-        code = f"field-{field.shape.replace(' ', '-')}"
+        words = _WORDS.get(field.shape, f"a rectangle inside black borders ({margins})")
         message = f"the field of view is {words}, {field.share:.0%} of the picture; runs leave the rest out"
-        found = [Finding("info", code, message)]
+        found = [VideoFinding("info", f"field-{field.shape.replace(' ', '-')}", message)]
         if field.moved > _MOVED:
             message = (
                 f"the field of view moves in the picture, by {field.moved:.1%} of its size; runs take all that was "
                 "ever lit for it, less what is black in a frame"
             )
             advice = "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
-            large = field.moved > _FAR
-            found.append(Finding("warning" if large else "info", "field-moves", message, advice if large else ""))
+            severity, advice = ("warning", advice) if field.moved > _FAR else ("info", "")
+            found.append(VideoFinding(severity, "field-moves", message, advice))  # type: ignore[arg-type]
         return found
 
 
-def _often(times: np.ndarray, count: int) -> np.ndarray:
-    """Return what was lit often enough not to be an artefact of coding beside a bright rim."""
-    return times > _LIT_SHARE * count
+def _box(mask: np.ndarray) -> Box:
+    """Return left, top, right, bottom of a mask as shares of its width and height."""
+    height, width = mask.shape
+    x, y, across, down = cv2.boundingRect(mask.astype(np.uint8))
+    return x / width, y / height, (x + across) / width, (y + down) / height
 
 
 def _points(hull: np.ndarray) -> np.ndarray:
@@ -139,23 +137,21 @@ def _points(hull: np.ndarray) -> np.ndarray:
 
 
 def _shape(hull: np.ndarray) -> Shape:
-    height, width = hull.shape
-    points = _points(hull)
     if hull.mean() >= _FULL_SHARE:
         return "full"
-    if _is_round(points, width, height):
+    if _is_round(_points(hull), hull.shape[1], hull.shape[0]):
         return "circle"
-    left, top, across, down = cv2.boundingRect(points.astype(np.int32))
-    inside = hull[top : top + down, left : left + across]
+    x, y, across, down = cv2.boundingRect(hull.astype(np.uint8))
+    inside = hull[y : y + down, x : x + across]
     cut = [is_cut for corner in _corners(inside) if (is_cut := _is_cut(corner)) is not None]
     if cut:
         return "cut corners" if 2 * sum(cut) >= len(cut) else "rounded corners"
-    margins = max(left / width, top / height, 1 - (left + across) / width, 1 - (top + down) / height)
-    return "bars" if margins > _BAR_SHARE else "full"
+    left, top, right, bottom = _box(hull)
+    return "bars" if max(left, top, 1 - right, 1 - bottom) > _BAR_SHARE else "full"
 
 
 def _is_round(points: np.ndarray, width: int, height: int) -> bool:
-    """Whether the part of the outline (N, 2) that is not the picture's edge lies on one circle."""
+    """Return whether the part of the outline (N, 2) that is not the picture's edge is on one circle."""
     x, y = points.T
     free = (x > _EDGE_PX) & (x < width - 1 - _EDGE_PX) & (y > _EDGE_PX) & (y < height - 1 - _EDGE_PX)
     x, y = x[free], y[free]
@@ -165,12 +161,12 @@ def _is_round(points: np.ndarray, width: int, height: int) -> bool:
     (a, b, c), *_ = np.linalg.lstsq(np.column_stack([2 * x, 2 * y, np.ones_like(x)]), x * x + y * y, rcond=None)
     radius = np.sqrt(max(c + a * a + b * b, 0.0))
     off = np.abs(np.hypot(x - a, y - b) - radius)
-    # Corners of a rounded rectangle lie on circles, too, but not on one.
+    # Corners of a rounded rectangle are on circles, too, but not on one.
     return bool(radius < max(width, height) and np.percentile(off, 95) < max(_ROUND_TOLERANCE * radius, 1.0))
 
 
 def _corners(inside: np.ndarray) -> list[np.ndarray]:
-    """Return the four quarters of a mask, turned so that the corner comes first."""
+    """Return the four quarters of a mask, flipped so that the corner comes first."""
     middle, centre = inside.shape[0] // 2, inside.shape[1] // 2
     upper, lower = inside[:middle], inside[::-1][:middle]
     return [half[:, ::step][:, :centre] for half in (upper, lower) for step in (1, -1)]
@@ -186,6 +182,5 @@ def _is_cut(quarter: np.ndarray) -> bool | None:
     # Where cut or arc meets the sides, both are round at the size of a pixel.
     points = points[len(points) // 8 : len(points) - len(points) // 8]
     chord = points[-1] - points[0]
-    length = float(np.hypot(*chord))
-    bulge = np.abs((points - points[0]) @ [-chord[1], chord[0]]).max() / max(length, 1e-9) ** 2
+    bulge = np.abs((points - points[0]) @ [-chord[1], chord[0]]).max() / max(float(np.hypot(*chord)), 1e-9) ** 2
     return bool(bulge < _LEAST_BULGE)

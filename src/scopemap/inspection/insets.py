@@ -1,4 +1,4 @@
-"""Pictures in the picture: a rectangle whose sides stay where they are while its content and all around it move."""
+"""Pictures in the picture: a rectangle with static sides while its content and its surroundings move."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from scopemap.inspection.finding import Finding
-from scopemap.inspection.view import View
+from scopemap.inspection.clip import VideoFinding
+from scopemap.inspection.frame_measures import InspectedFrame
 
 Box = tuple[int, int, int, int]
 
-# An edge that stays is this much stronger, on average, than what passes beside it.
+# A static edge is this much stronger, on average, than the image beside it.
 _RIDGE, _RIDGE_LEVELS, _BESIDE_PX = 1.6, 4.0, 9
 _LEAST_SIDE, _LARGEST_SHARE, _COVERED = 0.08, 0.45, 0.85
 _LEAST_CHANGE, _LEAST_PICTURES, _MOST_LINES = 2.0, 12, 12
@@ -20,7 +20,7 @@ _MOVED_PX = 0.004
 
 
 class InsetWatcher:
-    """Sums up the edges of all pictures in which something moves."""
+    """Accumulates the edges of all frames in which something moves."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -28,19 +28,19 @@ class InsetWatcher:
         self._across = self._down = self._change = np.zeros((0, 0), np.float32)
         self._field: np.ndarray = np.zeros((0, 0), bool)
 
-    def add(self, view: View) -> None:
-        """Look at the next picture."""
-        grey = cv2.cvtColor(view.small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    def add(self, item: InspectedFrame) -> None:
+        """Add the next frame."""
+        grey = cv2.cvtColor(item.small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         if self._last is None or self._last.shape != grey.shape:
             self._count, self._last = 0, grey
             self._across, self._down, self._change = (np.zeros_like(grey) for _ in range(3))
-        if view.figures.blank or view.figures.motion < _MOVED_PX:
+        if item.measures.blank or item.measures.motion < _MOVED_PX:
             return
         self._count += 1
         self._across[:, 1:] += np.abs(np.diff(grey, axis=1))
         self._down[1:] += np.abs(np.diff(grey, axis=0))
         self._change += cv2.absdiff(grey, self._last)
-        self._last, self._field = grey, view.field
+        self._last, self._field = grey, item.field
 
     def boxes(self) -> list[Box]:
         """Return the insets: left, top, right, bottom in px of the small pictures, right and bottom excluded."""
@@ -50,15 +50,13 @@ class InsetWatcher:
         upright = _lines(self._across / self._count, round(_LEAST_SIDE * height))
         level = _lines((self._down / self._count).T, round(_LEAST_SIDE * width)).T
         columns, rows = _strongest(upright.sum(0)), _strongest(level.sum(1))
-        found = []
-        for left, right in combinations(sorted({0, *columns, width}), 2):
-            for top, bottom in combinations(sorted({0, *rows, height}), 2):
-                box = left, top, right, bottom
-                if self._is_inset(box, upright, level):
-                    found.append(box)
-        return _largest_first(found)
+        across, down = (
+            list(combinations(sorted({0, *sides, end}), 2)) for sides, end in ((columns, width), (rows, height))
+        )
+        boxes = [(left, top, right, bottom) for left, right in across for top, bottom in down]
+        return _largest_first([box for box in boxes if self._is_inset(box, upright, level)])
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[VideoFinding]:
         """Return a finding where there is an inset."""
         boxes = self.boxes()
         if not boxes:
@@ -70,7 +68,7 @@ class InsetWatcher:
         )
         message = f"picture in picture: {places} shows something else"
         advice = "leave it out: --masks FOLDER of this command writes a mask, --set mask.files=FOLDER of a run reads it"
-        return [Finding("warning", "inset", message, advice)]
+        return [VideoFinding("warning", "inset", message, advice)]
 
     def _is_inset(self, box: Box, upright: np.ndarray, level: np.ndarray) -> bool:
         left, top, right, bottom = box
@@ -90,7 +88,7 @@ class InsetWatcher:
 
 
 def _lines(strength: np.ndarray, least_px: int) -> np.ndarray:
-    """Return where upright edges stay, (H, W) bool, each at least `least_px` long and widened by a pixel."""
+    """Return static upright edges, (H, W) bool, each at least `least_px` long and widened by a pixel."""
     beside = cv2.blur(strength, (_BESIDE_PX, 1))
     ridge = (strength > _RIDGE * (beside * _BESIDE_PX - strength) / (_BESIDE_PX - 1)) & (strength > _RIDGE_LEVELS)
     closed = cv2.morphologyEx(ridge.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 1), np.uint8))

@@ -14,20 +14,20 @@ import numpy as np
 from scopemap.config import InputSettings
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
-from scopemap.inspection.blank import check_blank
-from scopemap.inspection.blurred import check_blurred
-from scopemap.inspection.burned_in import Overlay, OverlayWatcher
-from scopemap.inspection.clip import Clip
-from scopemap.inspection.colour import check_colour
-from scopemap.inspection.container import Container, check_container, read_container
-from scopemap.inspection.exposure import check_exposure, exposure_figures
+from scopemap.inspection.checks import (
+    check_frames,
+    check_packing,
+    check_repeats,
+    check_timing,
+    exposure_figures,
+    repeated,
+)
+from scopemap.inspection.clip import Clip, VideoFinding
+from scopemap.inspection.container import Container, read_container
 from scopemap.inspection.field import Field, FieldWatcher
-from scopemap.inspection.finding import Finding
+from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
 from scopemap.inspection.insets import InsetWatcher
-from scopemap.inspection.packed import interlacing_findings, stereo_findings
-from scopemap.inspection.repeats import check_repeats, repeated
-from scopemap.inspection.timing import check_timing
-from scopemap.inspection.view import View, Viewer
+from scopemap.inspection.overlays import Overlay, OverlayWatcher
 from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import UNKNOWN_MAKE
@@ -63,8 +63,8 @@ class Inspection:
     field: Field
     overlays: tuple[Overlay, ...]
     insets: tuple[tuple[float, float, float, float], ...]
-    findings: tuple[Finding, ...]
-    samples: tuple[View, ...]
+    findings: tuple[VideoFinding, ...]
+    samples: tuple[InspectedFrame, ...]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -143,11 +143,11 @@ def _positions(sequence: Sequence) -> Callable[[int, int], int]:
     return lambda number, index: positions.get(index, start + step * number)
 
 
-def _of_source(warnings: list[str]) -> list[Finding]:
+def _of_source(warnings: list[str]) -> list[VideoFinding]:
     """Return a finding for each of the reader's warnings, those after the third counted."""
-    found = [Finding("warning", "source", warning) for warning in warnings[:_NAMED]]
+    found = [VideoFinding("warning", "source", warning) for warning in warnings[:_NAMED]]
     if len(warnings) > _NAMED:
-        found.append(Finding("warning", "source", f"and {len(warnings) - _NAMED} more warnings of the reader"))
+        found.append(VideoFinding("warning", "source", f"and {len(warnings) - _NAMED} more warnings of the reader"))
     return found
 
 
@@ -156,9 +156,9 @@ class _Sampled:
 
     def __init__(self, most: int) -> None:
         self._most, self._step, self._seen = most, 1, 0
-        self.kept: list[View] = []
+        self.kept: list[InspectedFrame] = []
 
-    def add(self, view: View) -> None:
+    def add(self, view: InspectedFrame) -> None:
         if self._seen % self._step == 0 and len(self.kept) == self._most:
             self.kept = self.kept[::2]
             self._step *= 2
@@ -181,7 +181,7 @@ class _Pass:
         figures, stopped = [], ""
         try:
             for view in self._views():
-                figures.append(view.figures)
+                figures.append(view.measures)
                 if listener is not None:
                     listener(len(figures), sequence.count)
         except ScopemapError as error:
@@ -206,8 +206,8 @@ class _Pass:
             samples=samples,
         )
 
-    def _views(self) -> Iterator[View]:
-        viewer, sequence, position_of = Viewer(), self._sequence, _positions(self._sequence)
+    def _views(self) -> Iterator[InspectedFrame]:
+        viewer, sequence, position_of = FrameInspector(), self._sequence, _positions(self._sequence)
         for number, item in enumerate(sequence.source.frames(sequence.selection)):
             rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
             frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
@@ -216,21 +216,18 @@ class _Pass:
                 watcher.add(view)
             yield view
 
-    def _findings(self, clip: Clip, stopped: str) -> list[Finding]:
-        pictures = [view.rgb for view in self._sampled.kept if not view.figures.blank]
+    def _findings(self, clip: Clip, stopped: str) -> list[VideoFinding]:
+        container = self._container
+        pictures = [view.rgb for view in self._sampled.kept if not view.measures.blank]
         return [
-            *([Finding("error", "reading-stopped", stopped)] if stopped else []),
+            *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
             *_of_source(self._sequence.warnings),
-            *(check_container(self._container) if self._container is not None else []),
-            *check_timing(clip, self._container.length_s if self._container is not None else None),
-            *stereo_findings(self._packed),
-            *interlacing_findings(pictures),
+            *(container.findings() if container is not None else []),
+            *check_timing(clip, container.length_s if container is not None else None),
+            *check_packing(self._packed, pictures),
             *check_repeats(clip),
             *self._field.findings(),
             *self._overlays.findings(),
             *self._insets.findings(),
-            *check_blank(clip),
-            *check_blurred(clip),
-            *check_colour(clip),
-            *check_exposure(clip),
+            *check_frames(clip),
         ]

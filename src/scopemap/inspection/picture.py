@@ -1,20 +1,22 @@
-"""What was found, as one picture: a few frames with what is drawn on them, the mask of a run, and a time line."""
+"""An inspection as a picture (frames, the mask of a run, a time line), and as a mask for `mask.files`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
+from scopemap.inspection.checks import repeated
+from scopemap.inspection.frame_measures import InspectedFrame, smaller
 from scopemap.inspection.inspecting import Inspection
-from scopemap.inspection.repeats import repeated
-from scopemap.inspection.view import View, smaller
 from scopemap.report.canvas import headline, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MASK_NAME = "mask.png"
 _SHOWN, _SHOWN_PX = 4, 640
 _WIDTH_IN, _LINE_IN, _BANDS_IN = 13.0, 1.0, 0.22
 _FIELD_COLOUR, _OVERLAY_COLOUR, _INSET_COLOUR = "#00e5ff", "#ffea00", "#ff00ff"
@@ -75,9 +77,27 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     figure.savefig(file)
 
 
-def _chosen(samples: tuple[View, ...]) -> list[View]:
+def write_mask(inspection: Inspection, folder: Path) -> bool:
+    """Write a PNG, white on overlays and pictures in the picture, for all frames; False, and nothing, without any.
+
+    These are what a run does not find by itself. Raises `OSError` where the folder cannot be written.
+    """
+    boxes = [*inspection.insets, *(overlay.box for overlay in inspection.overlays if overlay.in_field)]
+    if not boxes:
+        return False
+    width, height = inspection.size
+    mask = np.zeros((height, width), np.uint8)
+    for left, top, right, bottom in boxes:
+        rows = slice(int(np.floor(top * height)), int(np.ceil(bottom * height)))
+        mask[rows, int(np.floor(left * width)) : int(np.ceil(right * width))] = 255
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / MASK_NAME).write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+    return True
+
+
+def _chosen(samples: tuple[InspectedFrame, ...]) -> list[InspectedFrame]:
     """Return four views, evenly spread, of those that show something where there are any."""
-    shown = [view for view in samples if not view.figures.blank] or list(samples)
+    shown = [view for view in samples if not view.measures.blank] or list(samples)
     places = np.unique(np.linspace(0, len(shown) - 1, _SHOWN).round().astype(int))
     return [shown[place] for place in places]
 
@@ -86,7 +106,7 @@ def _height_share(rgb: np.ndarray) -> float:
     return float(rgb.shape[0] / rgb.shape[1])
 
 
-def _draw_found(axes: Axes, view: View, inspection: Inspection) -> None:
+def _draw_found(axes: Axes, view: InspectedFrame, inspection: Inspection) -> None:
     from matplotlib.patches import Polygon
 
     picture = smaller(view.rgb, _SHOWN_PX)
@@ -100,15 +120,15 @@ def _draw_found(axes: Axes, view: View, inspection: Inspection) -> None:
     for (left, top, right, bottom), colour in boxes:
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         axes.add_patch(Polygon(corners * size - 0.5, fill=False, color=colour, linewidth=1.4))
-    axes.set_title(f"frame {view.figures.position}, {view.figures.time_s:.2f} s", fontsize=8)
+    axes.set_title(f"frame {view.measures.position}, {view.measures.time_s:.2f} s", fontsize=8)
     axes.set_axis_off()
 
 
-def _draw_masked(axes: Axes, view: View) -> None:
+def _draw_masked(axes: Axes, view: InspectedFrame) -> None:
     rgb = view.frame.rgb.astype(np.float64)
     rgb[~view.frame.valid] = 0.4 * rgb[~view.frame.valid] + 0.6 * _MASK_TINT
     axes.imshow(rgb.round().astype(np.uint8))
-    axes.set_title(f"in a run: {view.figures.usable:.0%} usable", fontsize=8)
+    axes.set_title(f"in a run: {view.measures.usable:.0%} usable", fontsize=8)
     axes.set_axis_off()
 
 
@@ -120,11 +140,11 @@ def _draw_bands(axes: Axes, bands: list[tuple[str, tuple[tuple[int, int], ...]]]
     axes.set_ylim(len(bands) - 0.5, -0.5)
 
 
-def _finish(axes: Axes, inspection: Inspection, views: list[View]) -> None:
+def _finish(axes: Axes, inspection: Inspection, views: list[InspectedFrame]) -> None:
     for view in views:
-        axes.axvline(view.figures.position, color="#9ecae1", linewidth=0.8, zorder=0)
-    figures = inspection.clip.figures
-    axes.set_xlim(figures[0].position - 0.5, figures[-1].position + 0.5)
+        axes.axvline(view.measures.position, color="#9ecae1", linewidth=0.8, zorder=0)
+    measures = inspection.clip.measures
+    axes.set_xlim(measures[0].position - 0.5, measures[-1].position + 0.5)
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.3)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from scopemap.inspection.finding import Finding
-from scopemap.inspection.view import View
+from scopemap.inspection.clip import VideoFinding
+from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.field_of_view import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
 
@@ -20,14 +20,14 @@ _LEAST_BOX_PX = 3
 
 @dataclass(frozen=True)
 class Overlay:
-    """One overlay: left, top, right, bottom as shares of the picture's width and height; whether tissue is under it."""
+    """One overlay: left, top, right, bottom as shares of width and height; whether it is in the field of view."""
 
     box: tuple[float, float, float, float]
     in_field: bool
 
 
 class OverlayWatcher:
-    """Looks for overlays with the finder of the runs, in the field of view and outside, but not at its rim."""
+    """Finds overlays with the finder of the runs, in the field of view and outside, but not at its rim."""
 
     def __init__(self) -> None:
         self._finder = OverlayFinder()
@@ -35,20 +35,20 @@ class OverlayWatcher:
         self._looked = 0
         self._field = np.zeros((0, 0), bool)
 
-    def add(self, view: View) -> None:
-        """Look at the next picture."""
+    def add(self, item: InspectedFrame) -> None:
+        """Add the next frame."""
         # A field that moves has its rim inside of all that was ever lit.
-        rim = _rim(view.field) | _rim(hull_of_largest(view.lit)) | (_beside_black(view.lit) & view.field)
-        found = self._finder(view.small, view.field, ~rim & ~view.field)
+        rim = _rim(item.field) | _rim(hull_of_largest(item.lit)) | (_beside_black(item.lit) & item.field)
+        found = self._finder(item.small, item.field, ~rim & ~item.field)
         if self._times.shape != rim.shape:
             self._times, self._looked = np.zeros(rim.shape, np.int32), 0
-        self._field = view.field
+        self._field = item.field
         self._looked += 1
         if found is not None:
             self._times += found & ~rim
 
     def overlays(self) -> list[Overlay]:
-        """Return the overlays that were there for a while."""
+        """Return the overlays that were there for at least 12 frames and 5 % of them."""
         if not self._times.size:
             return []
         height, width = self._times.shape
@@ -64,20 +64,20 @@ class OverlayWatcher:
                 found.append(Overlay(box, bool(self._field[labels == label].mean() > 0.5)))
         return sorted(found, key=lambda one: one.box)
 
-    def findings(self) -> list[Finding]:
-        """Return what is burned in; only what lies over tissue matters."""
+    def findings(self) -> list[VideoFinding]:
+        """Return the overlays in and beside the field of view, and the warning about patients' names."""
         overlays, found = self.overlays(), []
         inside, outside = ([one for one in overlays if one.in_field is where] for where in (True, False))
         if inside:
             message = f"{len(inside)} overlay(s) in the field of view (text, logos): {_places(inside)}"
             advice = "runs leave them out; where they miss some, give masks: --set mask.files=FOLDER"
-            found.append(Finding("warning", "overlay", message, advice))
+            found.append(VideoFinding("warning", "overlay", message, advice))
         if outside:
             message = f"{len(outside)} overlay(s) beside the field of view (text, logos): {_places(outside)}"
-            found.append(Finding("info", "overlay-outside", message))
+            found.append(VideoFinding("info", "overlay-outside", message))
         if overlays:
             message = "burned-in text may name a patient: look before you pass the video or pictures of it on"
-            found.append(Finding("info", "overlay-privacy", message))
+            found.append(VideoFinding("info", "overlay-privacy", message))
         return found
 
 

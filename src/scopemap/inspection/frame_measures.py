@@ -1,16 +1,14 @@
-"""What every kind of finding looks at: one picture of the video after the other, small, and figures of each."""
+"""Measures of one video frame after the other: brightness, sharpness, change, motion, colour and exposure."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame
-from scopemap.inspection.finding import Finding
 from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, is_constant, mean_difference
 from scopemap.masking.field_of_view import FieldOfView
 from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, Masker, is_lit, specular
@@ -21,23 +19,22 @@ SMALL_PX = 320
 
 _FLOW_PX = 160
 _MASK = MaskSettings()
-# Text on black is no picture.
+# A frame with a smaller lit share is blank: text on black shows no tissue.
 _LEAST_LIT = 0.05
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Figures of one picture.
+class FrameMeasures:
+    """Measures of one frame.
 
     Attributes
     ----------
-    position : in the input, from 0, as `--frames` counts. index, time_s : as the reader has them.
-    blank : whether it shows nothing, or next to nothing that is not black. brightness : mean level in the field, of
-    255.
-    detail : as the tracker measures how clear a picture is. change : mean difference from the last picture that was no
-    repetition, grey levels; infinite for the first. motion : median flow since the picture before, share of the width.
+    position : in the input, from 0, as `--frames` counts. index, time_s : from the reader.
+    blank : whether it shows nothing, or next to nothing that is not black. brightness : mean level in the field, 0-255.
+    detail : the tracker's measure of sharpness. change : mean difference from the last frame that was no repeat, grey
+    levels; infinite for the first. motion : median flow since the frame before, share of the width.
     redness : mean red over the mean of the stronger of green and blue. clipped, dark, highlights : shares of the field.
-    usable : share of the picture that a run would use.
+    usable : share of the frame that a run would use.
     """
 
     position: int
@@ -56,14 +53,14 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class View:
-    """One picture.
+class InspectedFrame:
+    """One frame of the video.
 
     Attributes
     ----------
     rgb : (H, W, 3) uint8 as in the video. small : (h, w, 3) uint8, its longer side at most 320 px.
     lit : (h, w) bool, which pixels are not black. field : (h, w) bool, field of view as known so far.
-    frame : as a run sees it, rectified and masked. figures : of it.
+    frame : as a run sees it, rectified and masked. measures : of it.
     """
 
     rgb: np.ndarray
@@ -71,21 +68,11 @@ class View:
     lit: np.ndarray
     field: np.ndarray
     frame: Frame
-    figures: Figures
+    measures: FrameMeasures
 
 
-class Watcher(Protocol):
-    """Looks at each picture in turn and says at the end what it found."""
-
-    def add(self, view: View) -> None:
-        """Look at the next picture."""
-
-    def findings(self) -> list[Finding]:
-        """Return what was found."""
-
-
-class Viewer:
-    """Makes views of pictures in their order; keeps the last one that was no repetition."""
+class FrameInspector:
+    """Measures the frames of a video in their order; keeps the last one that was no repeat."""
 
     def __init__(self) -> None:
         self._field, self._masker = FieldOfView(BORDER_PX), Masker(_MASK)
@@ -93,19 +80,12 @@ class Viewer:
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
 
-    def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> View:
-        """Return the view of the picture (H, W, 3) uint8 at a position, and of the frame that a run makes of it."""
+    def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
+        """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
         small = smaller(rgb, SMALL_PX)
         lit = is_lit(small, _MASK.advanced.dark_level)
         field = self._field(lit, np.ones_like(lit))
         masked = self._masker(frame)
-        figures = self._figures(position, rgb, (small, lit, field), masked)
-        return View(rgb, small, lit, field, masked, figures)
-
-    def _figures(
-        self, position: int, rgb: np.ndarray, reduced: tuple[np.ndarray, np.ndarray, np.ndarray], masked: Frame
-    ) -> Figures:
-        small, lit, field = reduced
         inside = field if field.any() else np.ones_like(field)
         count, mask = np.count_nonzero(inside), inside.astype(np.uint8)
         red, green, blue = cv2.split(small)
@@ -115,7 +95,7 @@ class Viewer:
         means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
         lit_share = np.count_nonzero(lit & inside) / count
         highlights = specular(cv2.min(low, blue), inside, HIGHLIGHT_RATIO) & inside
-        return Figures(
+        measures = FrameMeasures(
             position=position,
             index=masked.index,
             time_s=masked.time_s,
@@ -130,12 +110,13 @@ class Viewer:
             highlights=np.count_nonzero(highlights) / count,
             usable=float(masked.valid.mean()),
         )
+        return InspectedFrame(rgb, small, lit, field, masked, measures)
 
     def _change(self, rgb: np.ndarray, small: np.ndarray) -> float:
         if self._kept is None or self._kept[0].shape != rgb.shape:
             self._kept = rgb, small
             return np.inf
-        # Means of pixels differ less than the pixels do: only where they agree, all pixels must be asked.
+        # Means of pixels differ less than the pixels do: only where they agree, all pixels are compared.
         change = mean_difference(small, self._kept[1])
         if change < LEAST_DIFFERENCE:
             change = mean_difference(rgb, self._kept[0])
