@@ -29,7 +29,7 @@ ROWS = [
     (0.68, 9.00, -3.11, np.sin(0.2), 0, 0, np.cos(0.2)),  # turned down
     (0.69, 9.01, -3.10, 0.1, -0.3, 0.5, np.sqrt(1 - 0.35)),
 ]
-CUT_OFF = "the last row is cut off or out of order, and was left out"
+CUT_OFF = "the last row is cut off and was left out"
 COLUMNS = ["ImageFrame", "Pose_Index", *(f"trans_{a}" for a in "xyz"), *(f"quot_{a}" for a in "xyzw")]
 
 
@@ -103,7 +103,9 @@ def test_a_rendered_organ(tmp_path: Path) -> None:
     notes = " ".join(sequence.notes)
     for part in ("depth: 8 bit, unit not documented", "poses: their unit is not documented", "left-handed", "row of"):
         assert part in notes
-    assert sequence.warnings == [f"{sequence.path}/Poses/colon_position_rotation.csv, line 6: {CUT_OFF}"]
+    (warning,) = sequence.warnings
+    assert "colon_position_rotation.csv, line 6: found 5 columns" in warning
+    assert CUT_OFF in warning
 
 
 def test_rendered_depth_is_the_red_channel(tmp_path: Path) -> None:
@@ -215,13 +217,11 @@ def test_a_row_of_nan_is_no_pose_and_keeps_its_place(tmp_path: Path) -> None:
     [
         ("", "holds no pose"),
         (HEADER, "holds no pose"),
-        ("a,b\n" * 3, "line 1: found 2 columns where 8"),
+        ("a,b\n" * 3, "line 1: could not convert"),
         ("tX,tZ,tY,rX,rY,rZ,rW,time(s)\n" + line(ROWS[0], 0), "line 1: expected the columns tx,ty"),
         (table(ROWS[:1]) + "1,2,3\n" + line(ROWS[1], 1), "line 3: found 3 columns where 8"),
-        (table(ROWS[:1]).replace("0.66", ""), "line 2: expected 8 numbers"),
-        (table(ROWS).replace("8.99", "y"), "line 3: expected 8 numbers .*'y'"),
-        (HEADER + "\n" + line(ROWS[0], 1) + line(ROWS[1], 0) + line(ROWS[2], 2), r"line 3: the time 1 s is not after"),
-        (HEADER + "\n" + line(ROWS[0], 0) * 2 + line(ROWS[1], 1), r"line 3: the time 1 s is not after 1 s"),
+        (table(ROWS[:1]).replace("0.66", ""), "line 2: found 7 columns"),
+        (table(ROWS).replace("8.99", "y"), "line 3: could not convert .*'y'"),
         (table([ROWS[0], (*ROWS[1][:3], 0, 0, 0, 0), ROWS[2]]), "line 3: the quaternion has length 0"),
     ],
 )
@@ -252,7 +252,9 @@ def test_depth_of_another_kind_is_refused_and_missing_depth_is_none(tmp_path: Pa
     cv2.imwrite(str(depths / "aov_image_0003.png"), np.full((96, 96), 3, np.uint8))
     source = open_sequence(organ).source
     for number in (0, 2):
-        with pytest.raises(InputError, match=rf"aov_image_000{number}\.png: expected a depth image of 8 bit"):
+        with pytest.raises(
+            InputError, match=rf"aov_image_000{number}\.png: expected a depth image of one 8-bit channel"
+        ):
             source.truth(number)
     assert source.truth(1).depth_mm is None
     np.testing.assert_array_equal(source.truth(3).depth_mm, 30)
@@ -265,7 +267,7 @@ def test_unreadable_images_are_left_out_and_equal_numbers_refused(tmp_path: Path
     assert [frame.index for frame in sequence.frames()] == [0, 2, 3]
     assert any("image_0001.png cannot be read" in warning for warning in sequence.warnings)
     save(organ / "Frames" / "image_2.png", picture(2, SIZE))
-    with pytest.raises(InputError, match="several images carry the same number"):
+    with pytest.raises(InputError, match="several images have the same number"):
         open_sequence(organ)
 
 

@@ -88,7 +88,7 @@ def test_selections_count_the_frames_that_there_are(selection: slice, keyframe: 
 
 def test_time_stamps_are_those_of_frame_data_or_count_frames(keyframe: Path) -> None:
     times_s = [frame.time_s for frame, _ in open_sequence(keyframe)]
-    np.testing.assert_allclose(times_s, (np.array(NUMBERS) - 1) / 20, atol=1e-9)
+    np.testing.assert_allclose(times_s, np.array(NUMBERS) / 20, atol=1e-9)
     # Where the correction found no time stamps it wrote 1 000 000 per frame.
     write_tar(
         keyframe / "data" / "frame_data.tar.gz", json_files(NUMBERS, lambda n, entry: entry | {"timestamp": n * 10**6})
@@ -124,7 +124,7 @@ def test_frames_that_log_and_poses_do_not_share_are_left_out(keyframe: Path) -> 
     write_tar(keyframe / "data" / "frame_data.tar.gz", json_files([1, 2, 7, 9]))
     sequence = open_sequence(keyframe)
     assert [frame.index for frame, _ in sequence] == [1, 2, 7]
-    assert "names 5 frames, but there are 4 frame_data files; the 3 frames in both are used" in sequence.warnings[0]
+    assert "5 pictures, but 4 frame_data files; the 3 frames that have both are used" in sequence.warnings[0]
 
 
 def test_a_picture_that_is_missing_or_damaged_is_left_out_with_a_warning(keyframe: Path) -> None:
@@ -164,7 +164,7 @@ def _log_of(text: str) -> Callable[[Path], None]:
     ("spoil", "message"),
     [
         (_nothing_decodes, "none of its 5 frames can be read"),
-        (_nothing_common, "name no frame in common"),
+        (_nothing_common, "no picture has the number of a frame_data file"),
         (_log_of("{"), r"cannot read included_frames in .*frame_log\.json"),
         (_log_of("[]"), "cannot read included_frames"),
         (_log_of('{"included_frames": ["a"]}'), "cannot read included_frames"),

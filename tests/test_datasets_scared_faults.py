@@ -86,8 +86,8 @@ def _left_handed(entry: dict[str, Any]) -> Any:
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (_not_finite, "no matrix of 4x4 numbers"),
-        (_left_handed, "no rigid motion"),
+        (_not_finite, "NaN or infinity"),
+        (_left_handed, "not a rigid motion"),
         (lambda entry: {"camera-pose": [[1, 2], [3]]}, "inhomogeneous"),
         (lambda entry: {"camera-pose": [[10**400] * 4] * 4}, "too large"),
         (lambda entry: [1, 2], "attribute"),
@@ -176,7 +176,7 @@ def _no_left_matrix(keyframe: Path) -> None:
         (_one_frame, "holds one frame, two are needed"),
         (_no_archive, r"frame_data\.tar\.gz: the archive is damaged"),
         (_other_numbers, "no picture has the number of a frame_data file"),
-        (_reduced_images, "far off their middle"),
+        (_reduced_images, "far off their centre"),
         (_no_left_matrix, "calibration in frame_data of .* cannot be used"),
     ],
 )

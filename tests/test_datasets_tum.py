@@ -188,16 +188,6 @@ def test_poses_say_their_unit(tmp_path: Path) -> None:
     assert any("mm (stated)" in note for note in sequence.notes)
 
 
-def test_depth_that_no_endoscope_sees_is_a_warning_except_in_the_rooms(tmp_path: Path) -> None:
-    sequence = open_sequence(write_tum(tmp_path / "colon"))
-    _ = list(sequence)
-    assert len(sequence.warnings) == 1
-    assert "the median depth is 1000 mm, where an endoscope has 5 to 500; `depth_scale`" in sequence.warnings[0]
-    sequence = open_sequence(write_tum(tmp_path / "sigmoid", level=250))
-    _ = list(sequence)
-    assert sequence.warnings == []
-
-
 def test_whole_stamps_are_seconds_and_said(tmp_path: Path) -> None:
     sequence = open_sequence(write_tum(tmp_path / ROOM, [0.0, 1.0, 2.0]))
     assert [frame.time_s for frame in frames_of(sequence)] == [0.0, 1.0, 2.0]
@@ -284,10 +274,9 @@ def test_a_row_without_a_pose_leaves_its_frame_without_one(row: str, tmp_path: P
 @pytest.mark.parametrize(
     ("file", "line", "message"),
     [
-        ("groundtruth.txt", "1305031102.2 0 0 0 0 0 1", r"line 4: found 7 numbers where a pose has 8"),
+        ("groundtruth.txt", "1305031102.2 0 0 0 0 0 1", r"line 4: found 7 numbers where earlier"),
         ("groundtruth.txt", "1305031102.2 0 0 0 0 0 0 1 5", r"line 4: found 9 numbers"),
         ("groundtruth.txt", "1305031102.2 0 0 x 0 0 0 1", r"line 4: expected numbers .*'x'"),
-        ("groundtruth.txt", "1305031102.2 0 inf 0 0 0 0 1", r"line 4: a pose holds NaN or infinity"),
         ("groundtruth.txt", "1305031102.2 0 0 0 0 0 0 3", r"line 4: the quaternion has length 3"),
         ("groundtruth.txt", f"{STAMPS[0] - 0.004:.4f} 1 0 0 0 0 0 1", r"line 4: the time stamp of an earlier line"),
         ("rgb.txt", "1305031102.2", r"rgb\.txt, line 4: expected `timestamp filename`, found '1305031102\.2'"),
@@ -318,7 +307,7 @@ def test_rows_that_are_none_are_named(file: str, line: str, message: str, tmp_pa
         ("rgb.txt", b"1.0 rgb/none.png\n2.0 rgb/nor-this.png\n", "none of the 2 images that it names is there"),
         ("rgb.txt", b"1.0 " + b"x" * 300 + b".png\n", "none of the 1 images"),
         ("rgb.txt", b"1.0 rgb/\0.png\n", "none of the 1 images"),
-        ("rgb.txt", b"\xff\xfe\x00", "cannot read the list"),
+        ("rgb.txt", b"\xff\xfe\x00", "cannot read"),
         ("depth.txt", b"", "it names no image"),
         ("groundtruth.txt", b"", "it holds no pose"),
         ("groundtruth.txt", b"\xff\xfe\x00", "groundtruth.txt"),
@@ -351,5 +340,5 @@ def test_folders_of_others_are_left_to_them(tmp_path: Path) -> None:
         save(tmp_path / f"{number}.png", picture(number))
     (tmp_path / "rgb.txt").write_text("0.0 0.png\n0.1 1.png\n")
     assert open_sequence(tmp_path).source.name == "images"
-    with pytest.raises(InputError, match=r"cannot read the list .*rgb\.txt"):
+    with pytest.raises(InputError, match=r"cannot read .*rgb\.txt"):
         open_sequence(write_tum(tmp_path / "c") / "rgb", dataset="tum")

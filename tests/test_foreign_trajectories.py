@@ -186,7 +186,7 @@ def test_log_is_as_open3d_itself_reads_it(tmp_path: Path) -> None:
 def test_log_that_could_point_either_way_asks_for_the_kind(tmp_path: Path) -> None:
     (tmp_path / "trajectory.log").write_text(log_text(moving_camera()))
     for path in (tmp_path, tmp_path / "trajectory.log"):
-        with pytest.raises(InputError, match=r"say kind 'open3d' .* or 'endo-depth'"):
+        with pytest.raises(InputError, match=r"name the kind, 'open3d' .* or 'endo-depth'"):
             read_trajectory(path)
 
 
@@ -200,7 +200,7 @@ def test_log_numbers_its_frames_where_its_numbers_ascend(tmp_path: Path) -> None
     ("edit", "message"),
     [
         (lambda text: text.rsplit("\n", 2)[0], "five lines per pose, found 99 lines"),
-        (lambda text: "", "found 0 lines"),
+        (lambda text: "", "holds no pose"),
         (lambda text: text.replace("1 1 2\n", "1 1\n"), "line 6: found 2 numbers where a log has 3"),
         (lambda text: text.replace("1 1 2\n", "1 x 2\n"), "line 6: expected numbers"),
         (lambda text: text.replace("1.00000000", "2.00000000"), "line 1: not a rigid motion"),
@@ -259,7 +259,7 @@ def test_folder_with_two_trajectories_asks_which(tmp_path: Path) -> None:
     poses = moving_camera()
     write_run(tmp_path, as_trajectory(poses))
     write_c3vd(tmp_path, se3_exp(np.ones(6)) @ poses)
-    with pytest.raises(InputError, match=r"holds trajectory\.tum with frames\.csv \(run\) and pose\.txt \(c3vd\); say"):
+    with pytest.raises(InputError, match=r"holds trajectory\.tum \(run\) and pose\.txt \(c3vd\); name"):
         read_trajectory(tmp_path)
     assert_is(read_trajectory(tmp_path, kind="run"), poses, list(range(20)))
     assert_is(read_trajectory(tmp_path, kind="c3vd"), se3_exp(np.ones(6)) @ poses, list(range(20)))

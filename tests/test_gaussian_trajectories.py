@@ -57,7 +57,7 @@ def test_gaussian_slam_is_inverted_and_numbered_by_its_split(
 )
 def test_gaussian_slam_of_an_unknown_split_asks_for_the_kind(tmp_path: Path, config: str | None) -> None:
     folder = write_splatam(tmp_path, splatam_arrays(moving_camera()), config)
-    with pytest.raises(InputError, match=r"say kind 'endogslam' .* or 'splatam'"):
+    with pytest.raises(InputError, match=r"name the kind: 'endogslam' .* or 'splatam'"):
         read_trajectory(folder)
 
 

@@ -11,10 +11,8 @@ from drawn_inputs import write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
 
 from scopemap.io import images
-from scopemap.io.datasets import c3vd, sevenscenes
 from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.scared_c import ScaredCKeyframe
-from scopemap.io.datasets.scared_files import ScenePoints
+from scopemap.io.datasets.scared import ScaredKeyframe
 from scopemap.io.opening import open_sequence
 from scopemap.io.video import VideoFile
 from scopemap.trajectory.trajectory import Trajectory
@@ -44,11 +42,9 @@ def test_it_is_the_truth_of_the_selected_frames(
 
     for owner, name in (
         (VideoFile, "frames"),
-        (ScenePoints, "depth_mm"),
-        (ScaredCKeyframe, "_image"),
-        (images, "read_image"),
-        (sevenscenes, "read_depth16"),
-        (c3vd, "_read_depth"),
+        (ScaredKeyframe, "_depth_mm"),
+        (images, "decoded_image"),
+        (images, "read_decoded"),
     ):
         monkeypatch.setattr(owner, name, refuse)
     reference = reference_trajectory(sequence)

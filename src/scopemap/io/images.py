@@ -1,9 +1,9 @@
-"""A folder of images, sorted by the numbers in their names."""
+"""A folder of images, sorted by the numbers in their names; most readers of data sets derive from it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from scopemap.cameras.camera import CameraModel
+from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
@@ -19,8 +21,11 @@ from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FOLDER_RATE_HZ = 30.0
-_OWN_CALIBRATION = "camera.yaml"
+OWN_CALIBRATION = "camera.yaml"
 _COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
+
+DepthCode = tuple[tuple[int, float, int], ...]
+"""How integer images store depth, by bits: (bits, mm per level, largest level that is a depth). Level 0 is unknown."""
 
 
 def numeric_order(path: Path) -> list[tuple[int, int, str]]:
@@ -36,9 +41,30 @@ def frame_number(path: Path) -> int | None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the colour images in `folder` in numeric order; depth, masks and hidden files are not among them."""
-    files = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
-    return sorted((file for file in files if not _COMPANION.search(file.stem)), key=numeric_order)
+    """Return the colour images in `folder` in numeric order; not depth, not masks; none where it is no folder."""
+    files = sorted(_images_in(folder), key=numeric_order)
+    return [file for file in files if not _COMPANION.search(file.stem)]
+
+
+def numbered_images(folder: Path) -> dict[int, Path]:
+    """Return all images in `folder`, depth and masks too, by the last number in their names, ascending; others not.
+
+    None where there is no folder. Raises `InputError` where two images have the same number.
+    """
+    return by_number(file for file in _images_in(folder) if frame_number(file) is not None)
+
+
+def by_number(files: Iterable[Path]) -> dict[int, Path]:
+    """Return files by the last number in their names, ascending; `InputError` without one, or with one twice."""
+    found: dict[int, Path] = {}
+    for file in sorted(files):
+        number = frame_number(file)
+        if number is None:
+            raise InputError(f"reading {file}: its name holds no number, which would be the frame's")
+        if number in found:
+            raise InputError(f"reading {file.parent}: {found[number].name} and {file.name} have the same number")
+        found[number] = file
+    return dict(sorted(found.items()))
 
 
 def read_image(file: Path) -> np.ndarray | None:
@@ -51,38 +77,50 @@ def decoded_image(content: bytes) -> np.ndarray | None:
     return _rgb(decoded(content, cv2.IMREAD_COLOR))
 
 
-def read_depth16(file: Path) -> np.ndarray | None:
-    """Return a depth image (h, w) uint16 as it is in the file, None where there is no file.
+def depth_of_levels(file: Path, levels: np.ndarray | None, code: DepthCode, scale_mm: float | None) -> np.ndarray:
+    """Return the depth (h, w) float32, mm, NaN = unknown, of an image as it is in `file`.
 
-    Raises `InputError` for what is no image of one 16-bit channel: depth that was squeezed into 8 bit is not the same.
+    `scale_mm` replaces the mm per level of `code`. Raises `InputError` unless the image has one channel of as many bits
+    as `code` knows.
     """
-    if not file.is_file():
-        return None
-    values = read_decoded(file)
-    if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        raise InputError(f"reading {file}: expected a depth image of one 16-bit channel")
-    return values
+    bits = 8 * levels.itemsize if levels is not None and levels.ndim == 2 and levels.dtype.kind == "u" else 0
+    known = next((entry for entry in code if entry[0] == bits), None)
+    if levels is None or known is None:
+        allowed = "- or ".join(str(entry[0]) for entry in code)
+        raise InputError(f"reading {file}: expected a depth image of one {allowed}-bit channel")
+    _, mm_per_level, largest = known
+    depth_mm = levels * np.float32(scale_mm or mm_per_level)
+    return np.where((levels > 0) & (levels <= largest), depth_mm, np.nan).astype(np.float32)
 
 
 class ImageFolder(SourceDefaults):
-    """A folder of images; the layouts of data sets build on it.
+    """A folder of images. A reader of a data set fills in what the data set knows of them:
 
-    The calibration is `camera.yaml` in the folder, else beside the images, where it is there; one that cannot be
-    read is its `camera_fault`. Time stamps are frame number / 30 s. Raises `InputError` where no image can be read.
+    poses : camera-to-world (4, 4), mm, by frame number. depth_files : depth images by frame number, stored as
+    `depth_code` has it. times_s : time stamps by frame number; a frame without one has its number / `rate_hz`.
+    quality : how poses and depth came about.
+
+    The calibration is `camera.yaml` in the folder, else beside the images; one that cannot be read is its
+    `camera_fault`. Raises `InputError` where no image can be read.
     """
 
     name = "images"
     quality: TruthQuality = "registered"
+    depth_code: DepthCode = ((16, 1.0, 65535),)
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
         self.path = path
         self.files = image_files(path) if files is None else files
         self.numbers = _numbers(self.files)
         self.count: int | None = len(self.files)
+        self.poses: dict[int, np.ndarray] = {}
+        self.depth_files: dict[int, Path] = {}
+        self.times_s: dict[int, float] = {}
+        self.rate_hz = FOLDER_RATE_HZ
         self.notes = [f"time stamps: frame number / {FOLDER_RATE_HZ:g} s (the folder holds none)"]
         self.warnings: list[str] = []
         self.height, self.width = self._size()
-        own = (folder / _OWN_CALIBRATION for folder in (path, self.files[0].parent))
+        own = (folder / OWN_CALIBRATION for folder in (path, self.files[0].parent))
         calibration_file = next((file for file in own if file.is_file()), None)
         if calibration_file is not None:
             with self._making_camera():
@@ -90,8 +128,13 @@ class ImageFolder(SourceDefaults):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` is a folder with images."""
-        return path.is_dir() and bool(image_files(path))
+        """Return whether `path` is a folder with images."""
+        return bool(image_files(path))
+
+    @property
+    def file_of(self) -> dict[int, Path]:
+        """The images by frame number."""
+        return dict(zip(self.numbers, self.files, strict=True))
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; an unreadable file is left out with a warning, another size is an `InputError`."""
@@ -109,25 +152,30 @@ class ImageFolder(SourceDefaults):
             yield SourceFrame(number, self._time_s(number), rgb, file.name)
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected frames, of files that turn out unreadable, too."""
+        """Return number and time stamp of the selected frames, including files that turn out unreadable."""
         return [(number, self._time_s(number)) for number in self.numbers[selection]]
 
     def pose(self, index: int) -> np.ndarray | None:
-        """A plain folder knows no pose."""
-        return None
+        """Return the true pose of a frame, or None."""
+        return self.poses.get(index)
 
     def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth, each where it is known; None where neither is. A plain folder knows none."""
+        """Return pose and depth of a frame; None where neither is known."""
         pose, depth_mm = self.pose(index), self._depth_mm(index)
         return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
-        """What a data set knows of the depth of a frame, as in `SourceTruth`."""
-        return None
+        file = self.depth_files.get(index)
+        if file is None:
+            return None
+        return depth_of_levels(file, self._depth_levels(file), self.depth_code, self.depth_scale_mm)
+
+    def _depth_levels(self, file: Path) -> np.ndarray | None:
+        """Return a depth image as it is stored, None where it cannot be read."""
+        return read_decoded(file)
 
     def _time_s(self, number: int) -> float:
-        """When a frame was taken, s."""
-        return number / FOLDER_RATE_HZ
+        return self.times_s.get(number, number / self.rate_hz)
 
     def _size(self) -> tuple[int, int]:
         for file in self.files:
@@ -137,17 +185,28 @@ class ImageFolder(SourceDefaults):
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
         raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
 
+    def _set_camera(self, camera: CameraModel, source: str, name: str) -> None:
+        """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
+        self.camera = fitted_to(camera, (self.width, self.height), name)
+        self.camera_source = source + rescaled_note(camera, self.camera)
+
+    def _check_numbers(self) -> None:
+        """Raise `InputError` where frames had to be counted, as their names do not number them."""
+        if self.numbers != [frame_number(file) for file in self.files]:
+            raise InputError(f"reading {self.path}: several images have the same number, or one has none")
+
     @contextmanager
     def _making_camera(self) -> Iterator[None]:
-        """Keep what is wrong with the data set's camera in `camera_fault`: another one may have been given."""
+        """Keep an error about the data set's camera as `camera_fault`: another camera may have been given."""
         try:
             yield
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
 
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)
+
+def _images_in(folder: Path) -> list[Path]:
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
 
 
 def _rgb(image: np.ndarray | None) -> np.ndarray | None:

@@ -24,8 +24,7 @@ from scopemap.io.datasets.endoslam import EndoSlamFolder
 from scopemap.io.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
 from scopemap.io.datasets.oneslam import OneSlamFolder
 from scopemap.io.datasets.rosbag import RosBag
-from scopemap.io.datasets.scared import ScaredKeyframe
-from scopemap.io.datasets.scared_c import ScaredCKeyframe
+from scopemap.io.datasets.scared import ScaredCKeyframe, ScaredKeyframe
 from scopemap.io.datasets.servct import ServCtFolder
 from scopemap.io.datasets.sevenscenes import SevenScenesFolder
 from scopemap.io.datasets.simcol import SimColFolder

@@ -178,10 +178,6 @@ class VideoFile(SourceDefaults):
                 f"{self.rate_hz:g} frames/s"
             )
 
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)
-
     def _bounds(self, selection: slice) -> tuple[int | None, int | None, int | None]:
         """Return bounds that count from the start; the header's claim serves only those from the end."""
         if all(bound is None or bound >= 0 for bound in (selection.start, selection.stop)):

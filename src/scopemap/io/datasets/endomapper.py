@@ -1,6 +1,6 @@
 """EndoMapper: whole colonoscopies and gastroscopies, some with poses by structure from motion.
 
-`Sequences/Seq_NNN/{Seq_NNN.mov, Seq_NNN_info.json, meta-data/colmap/Seq_NNN.zip}`; the calibration lies in a tree of
+`Sequences/Seq_NNN/{Seq_NNN.mov, Seq_NNN_info.json, meta-data/colmap/Seq_NNN.zip}`; the calibration is in a tree of
 its own, `Calibrations/Endoscope_NN/Endoscope_NN_geometrical.xml`, and the info file names the endoscope. COLMAP's poses
 fall into sub-models that share neither frame nor scale: the largest one is used. Azagra et al., "EndoMapper dataset of
 complete calibrated endoscopy procedures", Scientific Data 10, 671 (2023), doi 10.1038/s41597-023-02564-7.
@@ -16,7 +16,7 @@ from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.colmap_archive import read_largest_model
-from scopemap.io.datasets.posed_video import PosedVideo
+from scopemap.io.datasets.posed_video import PosedVideo, only_video, videos_in
 
 _PROCEDURE = re.compile(r"Seq_\d+")
 _FRAME = re.compile(r"out(\d{1,9})\.\w+")
@@ -27,30 +27,27 @@ _LEVELS_UP = 3
 
 
 class EndoMapperSequence(PosedVideo):
-    """The video of one procedure.
-
-    Attributes
-    ----------
-    frame_offset : N in COLMAP's image name `outN.png` less the number of that frame in the video.
-    """
+    """The video of one procedure. COLMAP's image `outN.png` is frame N - 1 of the video."""
 
     name = "endomapper"
     quality: TruthQuality = "sfm"
-    frame_offset = 1
 
     def __init__(self, path: Path) -> None:
-        video = _video_in(path)
+        videos = videos_in(path, ".mov")
+        named = [file for file in videos if _PROCEDURE.fullmatch(file.stem)] or videos
+        video = only_video(path, named, "an EndoMapper procedure holds one Seq_NNN.mov")
         super().__init__(path, video)
         if self.camera is None:
             file = self._calibration_file(path / f"{video.stem}_info.json")
             if file is not None:
-                self._calibrate(stated_calibration(file, (self.width, self.height)).camera, file)
+                self._set_camera(stated_calibration(file, (self.width, self.height)).camera, file)
         self._take_poses(path / "meta-data" / "colmap" / f"{video.stem}.zip")
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `Seq_NNN.mov`, or a video of another name beside a geometrical calibration."""
-        return any(_PROCEDURE.fullmatch(file.stem) or any(path.glob(f"*{_GEOMETRICAL}")) for file in _videos_in(path))
+        """Return whether `path` holds `Seq_NNN.mov`, or a video of another name beside a geometrical calibration."""
+        videos = videos_in(path, ".mov")
+        return any(_PROCEDURE.fullmatch(file.stem) or any(path.glob(f"*{_GEOMETRICAL}")) for file in videos)
 
     def _calibration_file(self, info: Path) -> Path | None:
         number = read_endoscope(info) if info.is_file() else None
@@ -68,7 +65,7 @@ class EndoMapperSequence(PosedVideo):
         found = next((file for place in places if (file := place / f"{name}{_GEOMETRICAL}").is_file()), None)
         if found is None:
             self.warnings.append(
-                f"{info.name} names {name}, but {name}{_GEOMETRICAL} lies neither beside the video nor in "
+                f"{info.name} names {name}, but {name}{_GEOMETRICAL} is neither beside the video nor in "
                 f"Calibrations/{name} above it: the camera is assumed"
             )
         return found
@@ -80,7 +77,7 @@ class EndoMapperSequence(PosedVideo):
         model = read_largest_model(archive)
         for name, pose in model.poses.items():
             match = _FRAME.fullmatch(name)
-            number = int(match[1]) - self.frame_offset if match else -1
+            number = int(match[1]) - 1 if match else -1
             if number < 0 or number in self.poses:
                 raise InputError(
                     f"reading {archive}: the image name {name!r} is not that of a frame, outN.png, or N repeats"
@@ -90,9 +87,10 @@ class EndoMapperSequence(PosedVideo):
             f"truth: COLMAP sub-model {model.number}, the largest of {model.count}: {len(self.poses)} frames; its "
             "scale is arbitrary (its unit is taken as mm); image outN.png is taken as frame N - 1; no depth is known"
         )
-        beyond = sum(self.count is not None and number >= self.count for number in self.poses)
-        if beyond:
-            self.warnings.append(f"{archive.name}: {beyond} poses are of frames beyond the {self.count} of the video")
+        if self._beyond():
+            self.warnings.append(
+                f"{archive.name}: {self._beyond()} poses are of frames beyond the {self.count} of the video"
+            )
 
 
 def read_endoscope(info: Path) -> int | None:
@@ -112,17 +110,3 @@ def read_endoscope(info: Path) -> int | None:
     if match is None:
         raise InputError(f"reading {info}: endoscope_number {text[:40]!r} is none: expected 1, 'Endoscope_01' or 'N/A'")
     return int(match[1])
-
-
-def _videos_in(path: Path) -> list[Path]:
-    files = path.iterdir() if path.is_dir() else ()
-    return sorted(file for file in files if file.suffix.lower() == ".mov" and not file.name.startswith("."))
-
-
-def _video_in(path: Path) -> Path:
-    videos = _videos_in(path)
-    named = [file for file in videos if _PROCEDURE.fullmatch(file.stem)] or videos
-    if len(named) != 1:
-        found = ", ".join(file.name for file in named[:3]) or "none"
-        raise InputError(f"reading {path}: an EndoMapper procedure holds one Seq_NNN.mov, found {len(named)} ({found})")
-    return named[0]

@@ -14,10 +14,8 @@ from tokenize import TokenError
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.decoding import read_decoded
-from scopemap.io.images import SUFFIXES, ImageFolder, frame_number, image_files
+from scopemap.io.images import ImageFolder, image_files, numbered_images
 from scopemap.trajectory.formats.poses import rigid
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
@@ -30,7 +28,7 @@ _DAMAGE = (OSError, ValueError, TypeError, SyntaxError, TokenError, EOFError, Me
 
 
 class EndoNerfFolder(ImageFolder):
-    """One EndoNeRF scene, or a folder in its layout; a `camera.yaml` beside `images` wins over `poses_bounds.npy`.
+    """One EndoNeRF scene, or a folder in its layout; a `camera.yaml` beside `images` replaces `poses_bounds.npy`.
 
     Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
     camera in it that cannot be is its `camera_fault`.
@@ -38,50 +36,34 @@ class EndoNerfFolder(ImageFolder):
 
     name = "endonerf"
     quality = "stereo"
+    depth_code = ((8, 1.0, 255), (16, 1.0, 65535))
 
     def __init__(self, path: Path) -> None:
-        file, images = _poses_file(path), path / "images"
+        file = _poses_file(path)
         if file is None:
             raise InputError(f"reading {path}: no EndoNeRF scene, looked for {' and '.join(_POSES)}")
-        super().__init__(path, image_files(images) if images.is_dir() else [])
+        super().__init__(path, image_files(path / "images"))
         rows = _read_rows(file)
         if self.camera is None:
             with self._making_camera():
-                camera = _camera(rows, file)
-                self.camera = fitted_to(camera, (self.width, self.height), str(file))
-                note = rescaled_note(camera, self.camera)
-                self.camera_source = f"focal length in {file.name}, principal point at the centre{note}"
-        self._poses = self._posed(rows, file)
-        self._depths = _numbered_images(path / _DEPTHS)
-        self.masks = path / _MASKS if _numbered_images(path / _MASKS) else None
+                known = f"focal length in {file.name}, principal point at the centre"
+                self._set_camera(_camera(rows, file), known, str(file))
+        self.poses = self._read_poses(rows, file)
+        self.depth_files = numbered_images(path / _DEPTHS)
         self.notes.append("depth beside the images: stereo matching, no sensor; files are taken as mm")
-        if self.masks is not None:
-            self.notes.append(f"masks of instruments lie beside the images, in {self.masks.name}")
-        elif _numbered_images(path / _MASKS_WITH_HOLES):
-            self.notes.append(f"{_MASKS_WITH_HOLES} (instruments and holes of the depth) is not used unasked")
+        if numbered_images(path / _MASKS):
+            self.masks = path / _MASKS
+            self.notes.append(f"masks of instruments are used, from {_MASKS} beside the images")
+        elif numbered_images(path / _MASKS_WITH_HOLES):
+            self.notes.append(f"{_MASKS_WITH_HOLES} (instruments and holes of the depth) is not used by default")
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds poses, `images` with images, and `depth` or `gt_masks`: others write LLFF, too."""
-        images = path / "images"
+        """Return whether `path` holds poses, `images` with images, and `depth` or `gt_masks`."""
         known = any((path / name).is_dir() for name in (_DEPTHS, _MASKS))
-        return known and _poses_file(path) is not None and images.is_dir() and bool(image_files(images))
+        return known and _poses_file(path) is not None and bool(image_files(path / "images"))
 
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the pose of the image's row; the identity where the camera is at rest, None where the row has none."""
-        return self._poses.get(index)
-
-    def _depth_mm(self, index: int) -> np.ndarray | None:
-        file = self._depths.get(index)
-        if file is None:
-            return None
-        values = read_decoded(file)
-        if values is None or values.ndim != 2 or values.dtype not in (np.uint8, np.uint16):
-            raise InputError(f"reading {file}: expected a depth image of one 8- or 16-bit channel")
-        depth_mm = values * np.float32(self.depth_scale_mm or 1.0)
-        return np.where(values > 0, depth_mm, np.nan).astype(np.float32)
-
-    def _posed(self, rows: np.ndarray, file: Path) -> dict[int, np.ndarray]:
+    def _read_poses(self, rows: np.ndarray, file: Path) -> dict[int, np.ndarray]:
         """Return the poses by frame number, and note by which convention they were read."""
         motions = rows[:, :15].reshape(-1, 3, 5)[..., :4]
         known = np.isfinite(motions).all(axis=(1, 2))
@@ -110,19 +92,6 @@ class EndoNerfFolder(ImageFolder):
 
 def _poses_file(path: Path) -> Path | None:
     return next((path / name for name in _POSES if (path / name).is_file()), None)
-
-
-def _numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the images in `folder` by the last number in their names, none where there is no folder."""
-    found: dict[int, Path] = {}
-    for file in sorted(folder.iterdir()) if folder.is_dir() else []:
-        number = frame_number(file)
-        if file.suffix.lower() not in SUFFIXES or file.name.startswith(".") or number is None:
-            continue
-        if number in found:
-            raise InputError(f"two images for frame {number} in {folder}: {found[number].name} and {file.name}")
-        found[number] = file
-    return found
 
 
 def _read_rows(file: Path) -> np.ndarray:

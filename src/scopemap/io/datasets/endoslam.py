@@ -2,9 +2,12 @@
 
 Real: `Cameras/HighCam/Colon-I/TumorfreeTrajectory_1/{Frames/frame_000060.jpg, Poses/*.xlsx}`. Rendered:
 `UnityCam/Colon/{Frames/image_0000.png, Pixelwise Depths/aov_image_0000.png, Poses/colon_position_rotation.csv}`; copies
-repeat folders (`Frames/Frames`, `Depths/Pixelwise Depths`). `Calibration/cam.txt` (3x3) lies beside a camera's organs.
-Ozyoruk et al., "EndoSLAM dataset and an unsupervised monocular visual odometry and depth estimation approach for
-endoscopic videos", arXiv 2006.16670.
+repeat folders (`Frames/Frames`, `Depths/Pixelwise Depths`). `Calibration/cam.txt` (3x3) is beside a camera's organs.
+
+The csv is a table of Unity, row = image number. The xlsx of the robot has the columns `ImageFrame` (the number in the
+image's name), `trans_x,y,z` (metres) and the quaternion `quot_x,y,z,w`. Not documented: the unit of Unity and of
+rendered depth, the frame and axes of the robot. Ozyoruk et al., "EndoSLAM dataset and an unsupervised monocular visual
+odometry and depth estimation approach for endoscopic videos", arXiv 2006.16670.
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError
-from scopemap.io.datasets.endoslam_poses import POSE_FILES, CameraPath, find_poses, read_camera_path
+from scopemap.frame import TruthQuality
+from scopemap.io.datasets.spreadsheet import read_sheet
+from scopemap.io.datasets.unity import read_unity_table
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, frame_number, image_files
+from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, image_files, numbered_images
+from scopemap.trajectory.formats.poses import poses_by_row
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
 """UnityCam's `cam.txt` as others quote it, for copies without it."""
@@ -33,113 +39,152 @@ DEPTH_UNIT_MM = 10.0
 _FRAMES = ("Frames", "Frames/Frames")
 _POSES = ("Poses", "Poses/Poses")
 _DEPTHS = ("Pixelwise Depths", "Depths/Pixelwise Depths", "Pixelwise Depths/Pixelwise Depths")
+_POSE_FILES = ("*position_rotation.csv", "*.xlsx")
 _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
-_CLIPPED = 255
+_COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
+_MM_PER_METRE = 1000.0
+_SAME = 1e-6
 
 
 class EndoSlamFolder(ImageFolder):
-    """The frames of one trajectory; `camera.yaml` beside `Frames` wins over `cam.txt`.
+    """The frames of one trajectory; `camera.yaml` beside `Frames` replaces `cam.txt`.
 
     Raises `InputError` where images and poses do not fit together.
     """
 
     name = "endoslam"
+    quality: TruthQuality = "exact"
+    depth_code = ((8, DEPTH_UNIT_MM, 254),)  # 255 was clipped
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _frame_files(path))
-        if self.numbers != [frame_number(file) for file in self.files]:
-            raise InputError(f"reading {path}: several images carry the same number, or one carries none")
-        file = _pose_file(path)
-        self._track: CameraPath | None = None if file is None else read_camera_path(file)
-        depths = next((path / name for name in _DEPTHS if (path / name).is_dir()), None)
-        self._depth_of = {frame_number(f): f for f in image_files(depths)} if depths is not None else {}
-        rendered = bool(self._depth_of) or (file is not None and file.suffix.lower() == ".csv")
-        self.quality = "exact" if self._track is None else self._track.quality
-        self._rate_hz, rate_source = _rate_hz(path, "UnityCam" if rendered else "HighCam" if file else "")
-        stated = self._track is not None and self._track.times_s is not None
-        self.stamped = stated
-        times = "those of the poses" if stated else f"image number / {self._rate_hz:g} s ({rate_source})"
-        self.notes = [f"time stamps: {times}"]
-        self._check_track(file)
-        if self._depth_of:
+        self._check_numbers()
+        self.depth_files = next((depths for name in _DEPTHS if (depths := numbered_images(path / name))), {})
+        file = next((found for name in _POSES if (found := _find_poses(path / name)) is not None), None)
+        rendered = bool(self.depth_files) or (file is not None and file.suffix.lower() == ".csv")
+        self.rate_hz, rate_source = _rate_hz(path, "UnityCam" if rendered else "HighCam" if file else "")
+        self.notes = [f"time stamps: image number / {self.rate_hz:g} s ({rate_source})"]
+        if self.depth_files:
             self.notes.append("depth: 8 bit, unit not documented, read as cm; compare after aligning scale")
+        if file is None:
+            self.warnings.append(f"no pose is known: looked for {' and '.join(_POSE_FILES)} in Poses")
+        elif file.suffix.lower() == ".csv":
+            self._check_poses(file, self._read_table(file))
+        else:
+            self._check_poses(file, self._read_robot(file))
         if self.camera is None:
-            self._calibrate(rendered)
+            self._set_published(rendered)
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `Frames` with images, and `Poses` or depth beside it or the name of a trajectory."""
+        """Return whether `path` holds `Frames` with images, and `Poses` or depth beside it or a trajectory's name."""
         named = _TRAJECTORY.fullmatch(path.absolute().name) is not None
         known = named or any((path / name).is_dir() for name in (_POSES[0], *_DEPTHS))
         return known and bool(_frame_files(path))
 
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the pose of the image's row; None where it has none."""
-        return None if self._track is None else self._track.poses.get(index)
+    def _read_table(self, file: Path) -> int:
+        """Read Unity's table and return the number of its rows."""
+        table = read_unity_table(file, _MM_PER_METRE)
+        self.poses, self.times_s = table.poses, table.times_of(self.numbers, self.rate_hz)
+        if self.times_s:
+            self.stamped = True
+            self.notes[0] = "time stamps: those of the poses"
+        self.warnings += table.warnings
+        rotations = np.array([T[:3, :3] for T in table.poses.values()])
+        if len(rotations) > 1 and np.ptp(rotations, axis=0).max() < _SAME:
+            self.warnings.append(f"{file.name}: all rotations are the same; errors of rotation against it mislead")
+        self.notes += [
+            "poses: their unit is not documented, read as metres; compare after aligning scale",
+            "poses: Unity's left-handed axes, y mirrored to OpenCV's (EndoGSLAM mirrors z; neither is documented)",
+            f"poses: row of {file.name} = image number, from 0 (it does not state it)",
+        ]
+        return table.count
 
-    def _time_s(self, number: int) -> float:
-        times_s = None if self._track is None else self._track.times_s
-        if times_s is None:
-            return number / self._rate_hz
-        last = len(times_s) - 1
-        return float(times_s[min(number, last)] + max(number - last, 0) / self._rate_hz)
+    def _read_robot(self, file: Path) -> int:
+        """Read the robot's spreadsheet and return the number of its rows."""
+        self.quality = "kinematic"
+        rows, where = _sheet_rows(file)
+        for row, T in poses_by_row(rows[:, 1:], _MM_PER_METRE, where).items():
+            image = rows[row, 0]
+            if not (np.isfinite(image) and image >= 0 and image == int(image)):
+                raise InputError(f"{where[row]}: ImageFrame must be the number of an image, found {image:g}")
+            known = self.poses.setdefault(int(image), T)
+            if np.abs(known - T).max() > _SAME:
+                raise InputError(f"{where[row]}: image {int(image)} has another pose in an earlier row")
+        self.notes += [
+            "poses: metres, as in the file; whether of camera or robot hand, and in which axes, is not documented",
+            "poses: joined by ImageFrame = number in the image's name",
+        ]
+        return len(rows)
 
-    def _check_track(self, file: Path | None) -> None:
-        if self._track is None or file is None:
-            self.warnings.append(
-                f"no pose is known: looked for {' and '.join(POSE_FILES)} in Poses (.txt is not documented)"
-            )
-            return
-        self.notes += self._track.notes
-        self.warnings += self._track.warnings
-        without = sum(number not in self._track.poses for number in self.numbers)
+    def _check_poses(self, file: Path, count: int) -> None:
+        without = sum(number not in self.poses for number in self.numbers)
         if without == len(self.numbers):
             raise InputError(
-                f"reading {self.path}: no image has a pose in {file} ({self._track.count} rows; images "
-                f"{self.numbers[0]} to {self.numbers[-1]}); do they belong together?"
+                f"reading {self.path}: no image has a pose in {file} ({count} rows; images {self.numbers[0]} to "
+                f"{self.numbers[-1]}); do they belong together?"
             )
-        if without or self._track.count != len(self.numbers):
+        if without or count != len(self.numbers):
             self.warnings.append(
-                f"{file.name} holds {self._track.count} rows for {len(self.numbers)} images; "
-                f"{without} images have no pose"
+                f"{file.name} holds {count} rows for {len(self.numbers)} images; {without} images have no pose"
             )
 
-    def _calibrate(self, rendered: bool) -> None:
+    def _set_published(self, rendered: bool) -> None:
         size = (self.width, self.height)
         around = (self.path.absolute(), *self.path.absolute().parents[:3])
         file = next((f for folder in around if (f := folder / "Calibration" / "cam.txt").is_file()), None)
         if file is not None:
-            self.camera, self.camera_source = (
-                read_calibration(file, size).camera,
-                f"intrinsics of the data set ({file})",
-            )
-            self.notes.append("cam.txt is used as it stands: pixel centres that count from 0, no distortion")
+            self.camera = read_calibration(file, size).camera
+            self.camera_source = f"intrinsics of the data set ({file})"
+            self.notes.append("cam.txt is taken for pixel centres that count from 0, and no distortion")
         elif rendered and size == (UNITY_CAMERA.width, UNITY_CAMERA.height):
             self.camera, self.camera_source = UNITY_CAMERA, "published UnityCam intrinsics"
 
-    def _depth_mm(self, index: int) -> np.ndarray | None:
-        file = self._depth_of.get(index)
-        if file is None:
-            return None
-        values = read_decoded(file)
-        if values is None or values.dtype != np.uint8:
-            raise InputError(f"reading {file}: expected a depth image of 8 bit")
-        # Depth is the red channel; OpenCV turns the channels round.
-        values = values if values.ndim == 2 else values[..., 2]
-        known = (values > 0) & (values < _CLIPPED)
-        return np.where(known, values * (self.depth_scale_mm or DEPTH_UNIT_MM), np.nan).astype(np.float32)
+    def _depth_levels(self, file: Path) -> np.ndarray | None:
+        levels = read_decoded(file)
+        # Depth is the red channel, the last in OpenCV's order.
+        return levels[..., 2] if levels is not None and levels.ndim == 3 else levels
 
 
 def _frame_files(path: Path) -> list[Path]:
-    folders = (path / name for name in _FRAMES)
-    return next((files for folder in folders if folder.is_dir() and (files := image_files(folder))), [])
+    return next((files for name in _FRAMES if (files := image_files(path / name))), [])
 
 
-def _pose_file(path: Path) -> Path | None:
-    return next((file for name in _POSES if (file := find_poses(path / name)) is not None), None)
+def _find_poses(folder: Path) -> Path | None:
+    """Return the file of poses in `folder`, which need not exist, or None; several are an `InputError`."""
+    for pattern in _POSE_FILES:
+        # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
+        found = sorted(file for file in folder.glob(pattern) if not file.name.startswith((".", "~")))
+        if len(found) > 1:
+            names = ", ".join(file.name for file in found[:5])
+            raise InputError(f"reading {folder}: it holds {len(found)} files of poses ({names}); leave one there")
+        if found:
+            return found[0]
+    return None
 
 
 def _rate_hz(path: Path, camera: str) -> tuple[float, str]:
-    """Return the rate of the camera that the path names, else that of `camera`, and whose it is."""
+    """Return the rate of the camera that the path names, else that of `camera`, and where it is from."""
     named = next((part for part in reversed(path.absolute().parts) if part in RATES_HZ), camera)
     return (RATES_HZ[named], f"published rate of {named}") if named in RATES_HZ else (FOLDER_RATE_HZ, "assumed")
+
+
+def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:
+    """Return the columns `_COLUMNS` of the first sheet, (N, 8), NaN for empty cells, and the place of each row."""
+    sheet = read_sheet(file)
+    names = [name.lower().replace("quat_", "quot_") for name in sheet[0][1]] if sheet else []
+    missing = [name for name in _COLUMNS if name not in names]
+    if missing:
+        found = ", ".join(filter(None, names)) or "-"
+        raise InputError(f"{file}: the first sheet has no column {', '.join(missing)}, found {found}")
+    wanted = [names.index(name) for name in _COLUMNS]
+    filled = [(f"{file}, row {number}", cells) for number, cells in sheet[1:] if any(cells[c] for c in wanted)]
+    rows = []
+    for place, cells in filled:
+        try:
+            rows.append([float(cells[column] or "nan") for column in wanted])
+        except ValueError as error:
+            raise InputError(f"{place}: expected {len(wanted)} numbers ({error})") from None
+    if not rows:
+        raise InputError(f"reading {file}: it holds no pose")
+    return np.array(rows), [place for place, _ in filled]

@@ -1,64 +1,101 @@
-"""SCARED: da Vinci stereo video of porcine abdomens, poses from robot kinematics, surface from structured light.
+"""SCARED and SCARED-C: da Vinci stereo video of porcine abdomens, surface from structured light.
 
-A keyframe's folder as it is downloaded, nothing unpacked: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above
-the right), `data/frame_data.tar.gz`, `data/scene_points.tar.gz`. Copies that others have unpacked are read, too. Frame
-number = order in the video, from 0 = number of the JSON and of the scene points. Allan et al., arXiv 2101.01133.
+SCARED, a keyframe's folder as it is downloaded: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the
+right), `data/frame_data.tar.gz` (poses from robot kinematics), `data/scene_points.tar.gz`. Copies that others have
+unpacked are read, too. Frame number = order in the video, from 0 = number of the JSON and of the scene points. A scene
+point file holds X, Y, Z per pixel in the camera's frame, mm, the left view above the right one. Allan et al., "Stereo
+correspondence and reconstruction of endoscopic data challenge", arXiv 2101.01133.
+
+SCARED-C: SCARED's left images with poses by structure from motion (github.com/juseonghan/SCARED-C): also
+`intrinsics_colmap.yaml`, `frame_log.json` and `data/rgb_frames.tar.gz`. Frames count from 1 and have gaps, where COLMAP
+registered none.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from math import gcd
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.reading import read_calibration, stated_calibration
+from scopemap.cameras.formats.parsing import Fields
+from scopemap.cameras.formats.reading import of_fields, read_calibration, stated_calibration
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.scared_files import KeyframeTruth, calibration_camera, read_frame_data
-from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, image_files
+from scopemap.frame import TruthQuality
+from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
+from scopemap.io.decoding import decoded
+from scopemap.io.images import FOLDER_RATE_HZ, OWN_CALIBRATION, ImageFolder, decoded_image, image_files
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
+from scopemap.trajectory.formats.scared import parse_frame_data, times_of
 
-OWN_CALIBRATION = "camera.yaml"
 _CALIBRATIONS = ("endoscope_calibration.yaml", "camera_calibration.yaml")
 _VIDEOS = ("data/rgb.mp4", "rgb.mp4")
 _IMAGES = ("image_02/data", "left", "data/left", "left_finalpass")
 _RECTIFIED = "data/left_finalpass"
 _STILL = "Left_Image.png"
+# The last place are files that are loose in `data`; an archive of that name is not meant.
+_FRAME_DATA = ("data/frame_data", "frame_data", "image_02/data/frame_data", "data/.")
+_SCENE_POINTS = ("data/scene_points", "scene_points", "image_02/data/groundtruth")
+_INTRINSICS, _LOG = "intrinsics_colmap.yaml", "frame_log.json"
 _NAMED = re.compile(r"dataset_?\d+.*keyframe_?\d+")
 _BADLY_CALIBRATED = (4, 5)
 _STACKED_ASPECT = 1.4
 _MOST_OFF_CENTRE = 0.25
+# COLMAP puts the centre of the top-left pixel at (0.5, 0.5).
+_COLMAP_CENTRE_PX = 0.5
+
+
+class _Pictures(Protocol):
+    """The pictures of a keyframe: a video, a folder or an archive.
+
+    numbers : of the frames; a range for a video, as its header claims, None where it claims nothing.
+    """
+
+    width: int
+    height: int
+    numbers: range | list[int] | None
+    rate_hz: float
+    warnings: list[str]
+
+    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the frames with these numbers; None: all. Only those of `selection`, which counts positions."""
 
 
 class ScaredKeyframe(SourceDefaults):
-    """The left view of one keyframe's video, with its true poses and depth where they lie beside it.
+    """The left view of one keyframe's video, with its true poses and depth where they are beside it.
 
     Raises `InputError` for a keyframe that is a single picture, and `CalibrationError` for one that does not fit.
     """
 
     name = "scared"
+    quality: TruthQuality = "kinematic"
 
     def __init__(self, path: Path) -> None:
         self.path = _keyframe(path)
-        self._pictures, self._shift = _pictures(self.path)
+        self._pictures = self._find_pictures()
         stacked = self._pictures.height > _STACKED_ASPECT * self._pictures.width
         self.width, self.height = self._pictures.width, self._pictures.height // (2 if stacked else 1)
-        self._data = read_frame_data(self.path)
-        self.notes, self.warnings = self._found_notes(stacked), self._pictures.warnings
-        self.warnings += _faults_of(self.path) + self._data.faults
+        self.notes: list[str] = []
+        self.warnings = self._pictures.warnings
+        self._read_frame_data()
         self._numbers = self._common_numbers()
-        self.count: int | None = self._pictures.count if self._numbers is None else len(self._numbers)
+        numbers = self._pictures.numbers if self._numbers is None else self._numbers
+        self.count: int | None = None if numbers is None else len(numbers)
+        self._points = find_numbered(self.path, _SCENE_POINTS, "scene_points", (".tiff", ".tif"))
         self._calibrate()
-        scale_mm = self.depth_scale_mm or 1.0
-        self._truth = KeyframeTruth(self.path, self._data, (self.width, self.height), "kinematic", scale_mm)
+        times = "those of frame_data" if self.stamped else f"frame number / {self._pictures.rate_hz:g} s"
+        self.notes += [f"time stamps: {times}", *self._assumptions(stacked)]
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` is a keyframe's folder, by its calibration file or its name, with pictures in it."""
+        """Return whether `path` is a keyframe's folder, by its calibration file or its name, with pictures in it."""
         path = _keyframe(path)
         known = any((path / name).is_file() for name in _CALIBRATIONS)
         named = _NAMED.search("/".join(path.absolute().parts[-2:])) is not None
@@ -66,98 +103,247 @@ class ScaredKeyframe(SourceDefaults):
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected left views, decoded in order."""
-        for frame in self._chosen(selection):
-            index = frame.index - self._shift
-            time_s = frame.time_s if self._numbers is None else self._time_s(index)
-            yield SourceFrame(index, time_s, np.ascontiguousarray(frame.rgb[: self.height]), frame.name)
+        for frame in self._pictures.frames(self._numbers, selection):
+            time_s = frame.time_s if self._numbers is None else self._time_s(frame.index)
+            yield replace(frame, time_s=time_s, rgb=np.ascontiguousarray(frame.rgb[: self.height]))
 
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return number and time of the selected frames; None for a video without frame_data."""
         return None if self._numbers is None else [(n, self._time_s(n)) for n in self._numbers[selection]]
 
     def pose(self, index: int) -> np.ndarray | None:
-        """Return the pose by the robot's kinematics."""
-        return self._truth.pose(index)
+        """Return the camera-to-world pose (4, 4), mm, or None."""
+        return self._poses.get(index)
 
     def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth: the keyframe's scan, moved by the robot's kinematics."""
-        return self._truth.of_frame(index)
+        """Return pose and depth: the keyframe's scan, seen from that pose. None where neither is known."""
+        pose, depth_mm = self.pose(index), self._depth_mm(index)
+        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
-    def _chosen(self, selection: slice) -> Iterator[SourceFrame]:
-        if self._numbers is None or not isinstance(self._pictures, VideoFile):
-            yield from self._pictures.frames(selection)
-            return
-        numbers = self._numbers[selection]
-        if numbers:
-            wanted = set(numbers)
-            step = gcd(*(number - numbers[0] for number in numbers)) or 1
-            frames = self._pictures.frames(slice(numbers[0], numbers[-1] + 1, step))
-            yield from (frame for frame in frames if frame.index in wanted)
+    def _find_pictures(self) -> _Pictures:
+        for place in _VIDEOS:
+            if (self.path / place).is_file():
+                return _VideoPictures(self.path / place)
+        for place in _IMAGES:
+            if image_files(self.path / place):
+                return _FolderPictures(self.path / place)
+        if (self.path / _RECTIFIED).is_dir():
+            raise InputError(
+                f"reading {self.path}: {_RECTIFIED} holds rectified images, to which neither the calibration nor the "
+                "poses belong; give the folder with rgb.mp4"
+            )
+        if (self.path / _STILL).is_file():
+            raise InputError(
+                f"reading {self.path}: this SCARED keyframe is a single stereo picture without a video (rgb.mp4), a "
+                "sequence needs two frames; give another keyframe"
+            )
+        raise InputError(f"reading {self.path}: no SCARED keyframe, looked for {', '.join((*_VIDEOS, *_IMAGES))}")
+
+    def _read_frame_data(self) -> None:
+        """Read all poses, time stamps and the calibration; a file that cannot be used is a warning."""
+        files = find_numbered(self.path, _FRAME_DATA, "frame_data", (".json",))
+        frames = [parse_frame_data(name, number, content) for name, number, content in files or []]
+        frames.sort(key=lambda frame: frame.index)
+        self._posed = [frame.index for frame in frames]
+        self._poses = {frame.index: frame.T_world_camera for frame in frames if frame.T_world_camera is not None}
+        self._times_s, _ = times_of(frames)
+        self._stated = next((frame.calibration for frame in frames if frame.calibration is not None), None)
+        self.stamped = bool(self._times_s)
+        faults = [frame.fault for frame in frames if frame.fault]
+        if faults and files is not None:
+            self.warnings.append(
+                f"{files.path}: {len(faults)} of {len(frames)} files cannot be used, so their frames have no true pose "
+                f"(first: {faults[0]})"
+            )
+        stamps = [frame.stamp for frame in frames]
+        if files is not None and frames and not self.stamped and len({str(stamp) for stamp in stamps}) > 1:
+            self.warnings.append(f"{files.path}: its time stamps do not increase or only count frames; none is used")
 
     def _common_numbers(self) -> list[int] | None:
         """Return the numbers of frames that have a picture and, where there is frame_data, a JSON of it."""
-        pictures, posed = self._pictures, self._data.numbers
-        if isinstance(pictures, VideoFile):
-            if not posed:
-                return None
-            common = [n for n in posed if pictures.count is None or n < pictures.count]
-            available = pictures.count or len(common)
-        else:
-            numbers = [number - self._shift for number in pictures.numbers]
-            common = sorted(set(numbers) & set(posed)) if posed else numbers
-            available = len(numbers)
+        available = self._pictures.numbers
+        if not self._posed:
+            return available if isinstance(available, list) else None
+        if available is None:
+            return self._posed
+        known = set(available) if isinstance(available, list) else available
+        common = [number for number in self._posed if number in known]
         if not common:
             raise InputError(f"reading {self.path}: no picture has the number of a frame_data file")
-        if len(common) < max(available, len(posed)):
+        if len(common) < max(len(available), len(self._posed)):
             self.warnings.append(
-                f"{self.path}: {available} pictures, but {len(posed)} frame_data files; the {len(common)} frames that "
-                "have both are used"
+                f"{self.path}: {len(available)} pictures, but {len(self._posed)} frame_data files; the {len(common)} "
+                "frames that have both are used"
             )
-            self._keep(set(common))
         return common
-
-    def _keep(self, wanted: set[int]) -> None:
-        """Forget the images of other frames; a video passes over them."""
-        pictures = self._pictures
-        if isinstance(pictures, ImageFolder):
-            kept = [f for n, f in zip(pictures.numbers, pictures.files, strict=True) if n - self._shift in wanted]
-            self._pictures = ImageFolder(pictures.path, kept)
-            self._pictures.warnings = self.warnings
-
-    def _time_s(self, index: int) -> float:
-        return self._data.times_s.get(index, index / self._rate_hz)
-
-    @property
-    def _rate_hz(self) -> float:
-        return self._pictures.rate_hz if isinstance(self._pictures, VideoFile) else FOLDER_RATE_HZ
 
     def _calibrate(self) -> None:
         size = (self.width, self.height)
-        file = next((self.path / n for n in (OWN_CALIBRATION, *_CALIBRATIONS) if (self.path / n).is_file()), None)
-        if file is not None and file.name == OWN_CALIBRATION:
-            self._use_calibration(stated_calibration(file, size))
-        elif file is not None:
+        own = self.path / OWN_CALIBRATION
+        file = next((self.path / name for name in _CALIBRATIONS if (self.path / name).is_file()), None)
+        if own.is_file():
+            self._use_calibration(stated_calibration(own, size))
+            return
+        if file is not None:
             calibration = read_calibration(file, size)
             self.camera, self.depth_scale_mm = calibration.camera, calibration.depth_scale_mm
             self.camera_source = f"{calibration.source} beside the frames"
-        elif self._data.calibration is not None:
-            self.camera = calibration_camera(self._data.calibration, size, f"frame_data of {self.path}")
+        elif self._stated is not None:
+            try:
+                self.camera = of_fields(Fields(self._stated.items()), size).camera
+            except ValueError as error:
+                raise CalibrationError(
+                    f"the calibration in frame_data of {self.path} cannot be used: {error}"
+                ) from None
             self.camera_source = "camera-calibration in frame_data"
-        if self.camera is not None and (file is None or file.name != OWN_CALIBRATION):
+        if self.camera is not None:
             _check_centred(self.camera, self.path)
 
-    def _found_notes(self, stacked: bool) -> list[str]:
-        self.stamped = bool(self._data.times_s)
-        times = "those of frame_data" if self.stamped else f"frame number / {self._rate_hz:g} s"
-        notes = [
-            f"time stamps: {times}",
-            "the view used: " + ("left, the upper half" if stacked else "the whole image"),
-        ]
-        if self._shift:
+    def _assumptions(self, stacked: bool) -> list[str]:
+        numbers = [int(n) for part in self.path.absolute().parts[-3:] for n in re.findall(r"dataset_?(\d+)", part)]
+        if numbers and numbers[-1] in _BADLY_CALIBRATED:
+            self.warnings.append(
+                f"SCARED dataset {numbers[-1]}: its calibration is known to be inaccurate, and so is what is measured"
+            )
+        notes = ["the view used: " + ("left, the upper half" if stacked else "the whole image")]
+        if isinstance(self._pictures, _FolderPictures) and self._pictures.shift:
             notes.append("image number n is taken as frame n - 1: images that a video was unpacked to count from 1")
-        if not self._data.poses:
+        if not self._poses:
             return [*notes, "no pose is known: frame_data is not there"]
         return [*notes, "truth: scan of the keyframe moved by robot kinematics; its error grows away from the keyframe"]
+
+    def _time_s(self, index: int) -> float:
+        return self._times_s.get(index, index / self._pictures.rate_hz)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        """Return the left view's depth (h, w) float32, NaN = unknown; None where the frame has no scene points."""
+        content = None if self._points is None else self._points.read(index)
+        if content is None or self._points is None:
+            return None
+        where = f"{self._points.path}, frame {index}"
+        points = decoded(content)
+        if points is None or points.dtype != np.float32 or points.ndim != 3 or points.shape[2] != 3:
+            found = "no readable image" if points is None else f"{points.dtype} of shape {points.shape}"
+            raise InputError(f"reading {where}: expected scene points, an image of three 32-bit floats, found {found}")
+        rows, columns = points.shape[:2]
+        if rows * self.width not in (self.height * columns, 2 * self.height * columns):
+            raise InputError(
+                f"reading {where}: scene points of {columns}x{rows} px fit neither the left images of "
+                f"{self.width}x{self.height} px nor both views above each other"
+            )
+        # The left view is on top; OpenCV reverses X, Y, Z as it does R, G, B.
+        depth_mm = points[: self.height * columns // self.width, :, 0] * np.float32(self.depth_scale_mm or 1.0)
+        return np.where(np.isfinite(depth_mm) & (depth_mm > 0), depth_mm, np.float32(np.nan))
+
+
+class ScaredCKeyframe(ScaredKeyframe):
+    """The frames of one keyframe that COLMAP registered, read out of their archive one at a time.
+
+    Raises `InputError` where there are no frames, and `CalibrationError` for intrinsics that do not fit.
+    """
+
+    name = "scared-c"
+    quality: TruthQuality = "sfm"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` holds COLMAP's intrinsics and the frames."""
+        return (path / _INTRINSICS).is_file() and _find_frames(path) is not None
+
+    def _find_pictures(self) -> _Pictures:
+        files = _find_frames(self.path)
+        if files is None:
+            raise InputError(f"reading {self.path}: no SCARED-C keyframe, data/rgb_frames.tar.gz is not there")
+        log = self.path / _LOG
+        return _ArchivePictures(files, _read_log(log) if log.is_file() else files.numbers())
+
+    def _calibrate(self) -> None:
+        size = (self.width, self.height)
+        own, file = self.path / OWN_CALIBRATION, self.path / _INTRINSICS
+        if own.is_file():
+            self._use_calibration(stated_calibration(own, size))
+        elif not file.is_file():
+            missing = f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)"
+            self.camera_fault = CalibrationError(missing)
+        else:
+            pinhole = read_calibration(file, size).camera.central
+            self.camera = replace(pinhole, cx=pinhole.cx - _COLMAP_CENTRE_PX, cy=pinhole.cy - _COLMAP_CENTRE_PX)
+            self.camera_source = f"{_INTRINSICS}, pixel centres moved by half a pixel"
+
+    def _assumptions(self, stacked: bool) -> list[str]:
+        return ["truth: COLMAP's poses, scaled to the scan of the keyframe"]
+
+
+class _VideoPictures:
+    numbers: range | list[int] | None
+
+    def __init__(self, file: Path) -> None:
+        self._video = VideoFile(file)
+        self.width, self.height, self.rate_hz = self._video.width, self._video.height, self._video.rate_hz
+        self.numbers = None if self._video.count is None else range(self._video.count)
+        self.warnings = self._video.warnings
+
+    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the frames; a video passes over those in between."""
+        chosen = None if numbers is None else numbers[selection]
+        if chosen is None:
+            yield from self._video.frames(selection)
+        elif chosen:
+            step = gcd(*(number - chosen[0] for number in chosen)) or 1
+            frames = self._video.frames(slice(chosen[0], chosen[-1] + 1, step))
+            yield from (frame for frame in frames if frame.index in set(chosen))
+
+
+class _FolderPictures:
+    """Images of a folder; those that a video was unpacked to count from 1, so that `shift` is 1."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = ImageFolder(folder)
+        self.shift = 0 if self._folder.numbers[0] == 0 else 1
+        self.width, self.height, self.rate_hz = self._folder.width, self._folder.height, FOLDER_RATE_HZ
+        self.numbers: range | list[int] | None = [number - self.shift for number in self._folder.numbers]
+        self.warnings = self._folder.warnings
+
+    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the frames."""
+        for number in (numbers or [])[selection]:
+            position = self._folder.numbers.index(number + self.shift)
+            for frame in self._folder.frames(slice(position, position + 1)):
+                yield replace(frame, index=number)
+
+
+class _ArchivePictures:
+    """Images in an archive; one that is missing or damaged is left out with a warning."""
+
+    rate_hz = FOLDER_RATE_HZ
+
+    def __init__(self, files: NumberedFiles, numbers: list[int]) -> None:
+        self._files = files
+        self.numbers: range | list[int] | None = numbers
+        self.warnings: list[str] = []
+        first = next((image for number in numbers if (image := self._image(number)) is not None), None)
+        if first is None:
+            raise InputError(f"reading {files.path}: none of its {len(numbers)} frames can be read")
+        self.height, self.width = first.shape[:2]
+
+    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the frames."""
+        for number in (numbers or [])[selection]:
+            rgb = self._image(number)
+            warning = f"{self._files.path}: frame {number} is missing or cannot be read, and was left out"
+            if rgb is None:
+                self.warnings += [warning] if warning not in self.warnings else []
+            elif rgb.shape[:2] != (self.height, self.width):
+                raise InputError(
+                    f"reading {self._files.path}: frame {number} is {rgb.shape[1]}x{rgb.shape[0]} px, those before it "
+                    f"are {self.width}x{self.height} px"
+                )
+            else:
+                yield SourceFrame(number, number / self.rate_hz, rgb, f"frame{number:06d}.png")
+
+    def _image(self, number: int) -> np.ndarray | None:
+        content = self._files.read(number)
+        return None if content is None else decoded_image(content)
 
 
 def _keyframe(path: Path) -> Path:
@@ -166,42 +352,27 @@ def _keyframe(path: Path) -> Path:
     return path.parent if path.name == "data" and calibrated else path
 
 
-def _pictures(path: Path) -> tuple[VideoFile | ImageFolder, int]:
-    """Return what holds the pictures, and what is to be taken from their numbers to count frames from 0."""
-    for place in _VIDEOS:
-        if (path / place).is_file():
-            return VideoFile(path / place), 0
-    for place in _IMAGES:
-        if (path / place).is_dir() and image_files(path / place):
-            folder = ImageFolder(path / place)
-            return folder, 0 if folder.numbers[0] == 0 else 1
-    if (path / _RECTIFIED).is_dir():
-        raise InputError(
-            f"reading {path}: {_RECTIFIED} holds rectified images, to which neither the calibration nor the poses "
-            "belong; give the folder with rgb.mp4"
-        )
-    if (path / _STILL).is_file():
-        raise InputError(
-            f"reading {path}: this SCARED keyframe is a single stereo picture without a video (rgb.mp4), a sequence "
-            "needs two frames; give another keyframe"
-        )
-    raise InputError(f"reading {path}: no SCARED keyframe, looked for {', '.join((*_VIDEOS, *_IMAGES))}")
-
-
-def _faults_of(path: Path) -> list[str]:
-    parts = path.absolute().parts[-3:]
-    numbers = [int(match[1]) for part in reversed(parts) if (match := re.search(r"dataset_?(\d+)", part))]
-    if not numbers or numbers[0] not in _BADLY_CALIBRATED:
-        return []
-    return [f"SCARED dataset {numbers[0]}: its calibration is known to be inaccurate; figures measured on it mislead"]
-
-
 def _check_centred(camera: CameraModel, path: Path) -> None:
     central = camera.central
     off = max(abs((central.cx + 0.5) / camera.width - 0.5), abs((central.cy + 0.5) / camera.height - 0.5))
     if off > _MOST_OFF_CENTRE:
         raise CalibrationError(
             f"the calibration of {path} does not fit images of {camera.width}x{camera.height} px: its principal point "
-            f"{central.cx:g}, {central.cy:g} lies far off their middle; for reduced images put their own "
+            f"{central.cx:g}, {central.cy:g} is far off their centre; for reduced images put their own "
             f"{OWN_CALIBRATION} there"
         )
+
+
+def _find_frames(path: Path) -> NumberedFiles | None:
+    return find_numbered(path, ("data/rgb_frames", "rgb_frames"), "frame", (".png", ".jpg"))
+
+
+def _read_log(file: Path) -> list[int]:
+    try:
+        included = json.loads(file.read_text(encoding="utf-8"))["included_frames"]
+        numbers = sorted({int(number) for number in included})
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise InputError(f"cannot read included_frames in {file}: {error!r}") from None
+    if not numbers:
+        raise InputError(f"reading {file}: included_frames names no frame")
+    return numbers

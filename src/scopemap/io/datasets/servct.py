@@ -16,47 +16,48 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.rectification import Rectifier
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.images import ImageFolder, image_files, read_depth16, read_image
-from scopemap.io.source import SourceFrame, SourceTruth
+from scopemap.io.images import ImageFolder, image_files, read_image
+from scopemap.io.source import SourceFrame
 
 _LEFT = "Left_rectified"
 _CALIBRATION = "Rectified_calibration"
 _TRUTHS = ("Ground_truth_CT", "Reference_CT", "Ground_truth_RGB", "Reference_RGB")
-_DEPTH_SCALE_MM = 1 / 256
 _SAME_CAMERA_PX = 0.01
 _BLUE = (0, 0, 255)
 
 
 class ServCtFolder(ImageFolder):
-    """The left pictures of one experiment; a `camera.yaml` beside `Left_rectified` wins over the calibration files.
+    """The left pictures of one experiment; a `camera.yaml` beside `Left_rectified` replaces the calibration files.
 
     Each picture has a calibration of its own. Where these differ, pictures and depth are brought to the camera of the
     first. Raises `InputError` for pictures that cannot be used; a calibration that cannot is its `camera_fault`.
     """
 
     name = "serv-ct"
+    depth_code = ((16, 1 / 256, 65535),)
 
     def __init__(self, path: Path) -> None:
-        left = path / _LEFT
-        super().__init__(path, image_files(left) if left.is_dir() else [])
-        self._stem_of = {number: file.stem for number, file in zip(self.numbers, self.files, strict=True)}
-        self._truth = next((path / name for name in _TRUTHS if (path / name / "DepthL").is_dir()), None)
+        super().__init__(path, image_files(path / _LEFT))
+        truth = next((path / name for name in _TRUTHS if (path / name / "DepthL").is_dir()), None)
         self._rectifiers: dict[int, Rectifier] = {}
         if self.camera is None:
             with self._making_camera():
                 self._calibrate()
-        self.notes.append("stereo pictures, no video: the left ones are used, no pose is known, what they show differs")
-        if self._truth is not None:
-            scan = "the CT scan" if self._truth.name.endswith("_CT") else "a scanner with structured light"
-            self.notes.append(f"depth beside the images: {scan}, registered to them ({self._truth.name})")
+        self.notes.append("stereo pictures, no video: the left ones are used, no pose is known, the scenes differ")
+        if truth is not None:
+            depths = {number: truth / "DepthL" / f"{file.stem}.png" for number, file in self.file_of.items()}
+            self.depth_files = {number: file for number, file in depths.items() if file.is_file()}
+            scan = "the CT scan" if truth.name.endswith("_CT") else "a scanner with structured light"
+            self.notes.append(f"depth beside the images: {scan}, registered to them ({truth.name})")
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds `Left_rectified` with images, and beside it calibration or truth of SERV-CT."""
+        """Return whether `path` holds `Left_rectified` with images, and calibration or truth of SERV-CT beside it."""
         known = any((path / name).is_dir() for name in (_CALIBRATION, *_TRUTHS))
-        return known and (path / _LEFT).is_dir() and bool(image_files(path / _LEFT))
+        return known and bool(image_files(path / _LEFT))
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected left pictures, all as the camera of the first sees them."""
@@ -64,22 +65,17 @@ class ServCtFolder(ImageFolder):
             rectifier = self._rectifiers.get(frame.index)
             yield frame if rectifier is None else replace(frame, rgb=rectifier.image(frame.rgb))
 
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return the depth by the scan, without a pose; None where there is none."""
-        if self._truth is None:
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        depth_mm = super()._depth_mm(index)
+        if depth_mm is None:
             return None
-        name = f"{self._stem_of[index]}.png"
-        values = read_depth16(self._truth / "DepthL" / name)
-        if values is None:
-            return None
-        known = (values > 0) & ~_outside_scan(self._truth / "OcclusionL" / name, values.shape)
-        depth_mm = np.where(known, values * np.float32(self.depth_scale_mm or _DEPTH_SCALE_MM), np.nan)
+        file = self.depth_files[index]
+        depth_mm[_outside_scan(file.parents[1] / "OcclusionL" / file.name, depth_mm.shape)] = np.nan
         rectifier = self._rectifiers.get(index)
-        depth_mm = depth_mm.astype(np.float32) if rectifier is None else rectifier.nearest(depth_mm.astype(np.float32))
-        return SourceTruth(None, depth_mm, "registered")
+        return depth_mm if rectifier is None else rectifier.nearest(depth_mm)
 
     def _calibrate(self) -> None:
-        files = {number: self.path / _CALIBRATION / f"{stem}.json" for number, stem in self._stem_of.items()}
+        files = {n: self.path / _CALIBRATION / f"{file.stem}.json" for n, file in self.file_of.items()}
         cameras = {n: _read_camera(f, (self.width, self.height)) for n, f in files.items() if f.is_file()}
         if not cameras:
             return
@@ -103,15 +99,11 @@ def _read_camera(file: Path, size: tuple[int, int]) -> PinholeCamera:
             f"cannot read the calibration in {file}: no matrix P1 of 3x4 numbers ({error})"
         ) from None
     (fx, skew, cx, _), (zero, fy, cy, _) = P1[:2].tolist()
-    width, height = size
-    upright = np.allclose([skew, zero, *P1[2]], [0, 0, 0, 0, 1, 0])
-    plausible = 0.3 * width < fx < 5 * width and 0.2 < fy / fx < 5
-    if not (upright and plausible and 0 <= cx < width and 0 <= cy < height):
-        raise CalibrationError(
-            f"the calibration {file} is not that of images of {width}x{height} px: found focal length {fx:g}, {fy:g} "
-            f"and principal point {cx:g}, {cy:g} px"
-        )
-    return PinholeCamera(fx, fy, cx, cy, width, height)
+    if not np.allclose([skew, zero, *P1[2]], [0, 0, 0, 0, 1, 0]):
+        raise CalibrationError(f"the calibration {file} has a matrix P1 that is not [K | 0]")
+    camera = PinholeCamera(fx, fy, cx, cy, *size)
+    check_plausible(camera, f"the calibration {file}")
+    return camera
 
 
 def _same(a: PinholeCamera, b: PinholeCamera) -> bool:

@@ -8,17 +8,15 @@ videos", IJCARS 2023, arXiv 2304.08023.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
-from scopemap.io.datasets.posed_video import PosedVideo
-from scopemap.io.datasets.unity import numbers_of, poses_of_rows
-from scopemap.trajectory.formats.poses import are_frame_numbers
-from scopemap.trajectory.formats.text import fields_of, text_lines
+from scopemap.io.datasets.posed_video import PosedVideo, only_video, videos_in
+from scopemap.trajectory.formats.poses import are_frame_numbers, poses_by_row
+from scopemap.trajectory.formats.text import read_numbers
 
 _CALIBRATION = "StereoCalibration.ini"
 _POSES = "groundtruth.txt"
@@ -27,12 +25,7 @@ _MM_PER_METRE = 1000.0
 
 
 class StereoMisFolder(PosedVideo):
-    """The left view of one recording.
-
-    Attributes
-    ----------
-    frame_offset : number of a row in groundtruth.txt less that of its frame in the video.
-    """
+    """The left view of one recording."""
 
     name = "stereomis"
 
@@ -40,11 +33,14 @@ class StereoMisFolder(PosedVideo):
         file = path / _CALIBRATION
         # The file states its own size.
         camera = stated_calibration(file, (1, 1)).camera if file.is_file() else None
-        super().__init__(path, _video_in(path), _PUBLISHED_ASPECT if camera is None else camera.width / camera.height)
+        video = only_video(path, videos_in(path, ".mp4"), "a StereoMIS recording holds one .mp4")
+        super().__init__(path, video, _PUBLISHED_ASPECT if camera is None else camera.width / camera.height)
         if self.camera is None and camera is not None:
-            self._calibrate(camera, file)
-        self.frame_offset = 0
-        self._take_poses(path / _POSES)
+            self._set_camera(camera, file)
+        if (path / _POSES).is_file():
+            self._read_poses(path / _POSES)
+        else:
+            self.notes.append(f"no pose is known: {_POSES} is not there")
         if (path / "masks").is_dir():
             self.notes.append(
                 "masks/ is not used: 0 is where instruments are, the other way round than mask.files has it, and the "
@@ -53,83 +49,36 @@ class StereoMisFolder(PosedVideo):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether `path` holds the stereo calibration and a video."""
-        return (path / _CALIBRATION).is_file() and bool(_videos_in(path))
+        """Return whether `path` holds the stereo calibration and a video."""
+        return (path / _CALIBRATION).is_file() and bool(videos_in(path, ".mp4"))
 
-    def _take_poses(self, file: Path) -> None:
-        if not file.is_file():
-            self.notes.append(f"no pose is known: {_POSES} is not there")
-            return
-        found = read_groundtruth(file)
-        self.poses, self.frame_offset = found.poses, found.frame_offset
-        base = f"row {found.frame_offset} is the video's first frame"
-        if not found.numbered:
-            base = "the rows carry no frame numbers: row = frame, from 0"
+    def _read_poses(self, file: Path) -> None:
+        """Read rows of 8 numbers, the first the frame, or of 7, in any order; numbers from 1 count frames from 1.
+
+        A row that holds NaN or infinity is a frame without a pose. Raises `InputError`, with the line, for what is no
+        such row, and for a frame that comes again.
+        """
+        table = read_numbers(file, missing=True)
+        rows, columns = table.values.shape
+        if columns not in (7, 8):
+            expected = "frame tx ty tz qx qy qz qw, or the last 7"
+            raise InputError(f"{table.where[0]}: found {columns} columns, expected {expected}")
+        numbers, offset, base = np.arange(rows), 0, "the rows have no frame numbers: row = frame, from 0"
+        if columns == 8:
+            table = table.sorted_by_stamp()
+            numbers = table.values[:, 0]
+            if not are_frame_numbers(numbers) or numbers[0] < 0:
+                raise InputError(f"reading {file}: the first column of 8 must be frame numbers, found {numbers[0]:g}")
+            offset = int(numbers[0] == 1)
+            base = f"row {offset} is the video's first frame"
+        poses = poses_by_row(table.values[:, -7:], _MM_PER_METRE, table.where)
+        self.poses = {int(numbers[row]) - offset: pose for row, pose in poses.items()}
         self.notes.append(
             f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; {base}; no depth is known"
         )
-        beyond = sum(self.count is not None and number >= self.count for number in found.poses)
-        if beyond or (not found.numbered and self.count is not None and found.rows != self.count):
+        beyond = self._beyond()
+        if beyond or (columns == 7 and self.count is not None and rows != self.count):
             self.warnings.append(
-                f"{file}: it holds {found.rows} rows, {beyond} of them beyond the {self.count} frames of the video; "
-                "poses may belong to other frames"
+                f"{file}: it holds {rows} rows, {beyond} of them beyond the {self.count} frames of the video; poses "
+                "may belong to other frames"
             )
-
-
-@dataclass(frozen=True)
-class Groundtruth:
-    """What `groundtruth.txt` says.
-
-    Attributes
-    ----------
-    poses : (4, 4) float64 camera-to-world, mm, by frame of the video; a frame without a finite row is not among them.
-    frame_offset : number of a row less that of its frame.
-    numbered : whether the rows carry frame numbers.
-    rows : how many there are.
-    """
-
-    poses: dict[int, np.ndarray]
-    frame_offset: int
-    numbered: bool
-    rows: int
-
-
-def read_groundtruth(file: Path) -> Groundtruth:
-    """Return the poses in rows of 8 numbers, the first the frame, or of 7; in any order, by spaces, tabs or commas.
-
-    Numbers that begin at 1 count frames from 1. A row that holds NaN or infinity is a frame without a pose. Raises
-    `InputError`, with the line, for what is no such row, and for a frame that comes again.
-    """
-    lines = [(number, fields_of(line)) for number, line in enumerate(text_lines(file), start=1)]
-    rows = [(f"{file}, line {number}", fields) for number, fields in lines if fields]
-    if not rows:
-        raise InputError(f"reading {file}: it holds no pose")
-    where = [place for place, _ in rows]
-    columns = len(rows[0][1])
-    if columns not in (7, 8):
-        raise InputError(f"{where[0]}: found {columns} columns, expected frame tx ty tz qx qy qz qw, or the last 7")
-    values = np.array([numbers_of(fields, columns, place) for place, fields in rows])
-    numbers = values[:, 0] if columns == 8 else np.arange(len(rows))
-    if not are_frame_numbers(numbers) or numbers.min() < 0:
-        raise InputError(f"reading {file}: the first column of 8 must be frame numbers, found {numbers.min():g}, ...")
-    _, first = np.unique(numbers, return_index=True)
-    if len(first) < len(numbers):
-        again = min(set(range(len(numbers))) - set(first.tolist()))
-        raise InputError(f"{where[again]}: frame {numbers[again]:g} comes again; leave one row out")
-    offset = int(numbers.min() == 1)
-    known, T = poses_of_rows(values[:, -7:], _MM_PER_METRE, where)
-    poses = {int(number) - offset: pose for number, pose in zip(numbers[known], T, strict=True)}
-    return Groundtruth(poses, offset, columns == 8, len(rows))
-
-
-def _videos_in(path: Path) -> list[Path]:
-    files = path.iterdir() if path.is_dir() else ()
-    return sorted(file for file in files if file.suffix.lower() == ".mp4" and not file.name.startswith("."))
-
-
-def _video_in(path: Path) -> Path:
-    videos = _videos_in(path)
-    if len(videos) != 1:
-        found = ", ".join(file.name for file in videos[:3]) or "none"
-        raise InputError(f"reading {path}: a StereoMIS recording holds one .mp4, found {len(videos)} ({found})")
-    return videos[0]

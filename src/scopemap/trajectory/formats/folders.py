@@ -23,7 +23,7 @@ _SAME_TIME_S = 2e-3
 def read_run(folder: Path, unit: Unit) -> Trajectory:
     """Read `trajectory.tum` and `frames.csv` of a run, always mm, with frame numbers and lost frames.
 
-    Frames that the run skipped have no pose, and are not among them.
+    Frames that the run skipped have no pose, and are left out.
     """
     table = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
     indices, times_s, status = _read_frames(folder / "frames.csv")
@@ -56,11 +56,21 @@ def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:
     numbered = sorted((int(re.sub(r"\D", "", path.name)), path) for path in folder.glob("frame-*.pose.txt"))
     if not numbered:
         raise InputError(f"cannot read a trajectory from {folder}: looked for frame-*.pose.txt")
-    tables = [read_numbers(path) for _, path in numbered]
-    for table in tables:
-        if table.values.shape != (4, 4):
-            raise InputError(f"{table.path}: expected 4 lines of 4 numbers, found {table.values.shape}")
-    T = np.stack([table.values for table in tables])
-    T[:, :3, 3] *= MM_PER_UNIT["m"]
-    T = rigid(T, [str(table.path) for table in tables])
-    return stamped(T, np.array([number for number, _ in numbered]), None, "7-Scenes, camera-to-world, m")
+    poses = [(number, read_seven_scenes_pose(path)) for number, path in numbered]
+    lost = next((path for (_, path), (_, pose) in zip(numbered, poses, strict=True) if pose is None), None)
+    if lost is not None:
+        raise InputError(f"{lost}: a pose holds NaN or infinity; leave out frames without a pose")
+    T = np.stack([pose for _, pose in poses if pose is not None])
+    return stamped(T, np.array([number for number, _ in poses]), None, "7-Scenes, camera-to-world, m")
+
+
+def read_seven_scenes_pose(file: Path) -> np.ndarray | None:
+    """Return the camera-to-world pose (4, 4), mm, of one file; None where tracking lost it (NaN or infinity)."""
+    table = read_numbers(file, missing=True)
+    if table.values.size != 16:
+        raise InputError(f"reading {file}: expected 4x4 numbers, found {table.values.shape}")
+    if not np.isfinite(table.values).all():
+        return None
+    T = table.values.reshape(4, 4).copy()
+    T[:3, 3] *= MM_PER_UNIT["m"]
+    return rigid(T[None], [str(file)])[0]

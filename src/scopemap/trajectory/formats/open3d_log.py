@@ -10,6 +10,7 @@ depth in mm by 1000. The two look alike, so a `.log` is read only when its kind 
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.formats.poses import are_frame_numbers, file_of, rigid, stamped
-from scopemap.trajectory.formats.text import fields_of, parse_row, text_lines
+from scopemap.trajectory.formats.text import read_rows
 from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 LOG_FILE = "trajectory.log"
@@ -37,22 +38,16 @@ def read_endo_depth(path: Path, unit: Unit) -> Trajectory:
 
 
 def _read_log(path: Path, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
-    lines = [(number, fields_of(line)) for number, line in enumerate(text_lines(path), start=1)]
-    lines = [(number, fields) for number, fields in lines if fields]
-    if not lines or len(lines) % len(_WIDTHS):
-        raise InputError(
-            f"cannot read a trajectory from {path}: a log has five lines per pose, found {len(lines)} lines in all"
-        )
-    rows = []
-    for row, (number, fields) in enumerate(lines):
-        width = _WIDTHS[row % len(_WIDTHS)]
-        if len(fields) != width:
-            raise InputError(f"{path}, line {number}: found {len(fields)} numbers where a log has {width}")
-        rows.append(parse_row(fields, f"{path}, line {number}"))
-    blocks = [rows[start : start + len(_WIDTHS)] for start in range(0, len(rows), len(_WIDTHS))]
-    T = np.array([block[1:] for block in blocks])
+    rows = read_rows(path)
+    for (line, numbers), width in zip(rows, cycle(_WIDTHS), strict=False):
+        if len(numbers) != width:
+            raise InputError(f"{path}, line {line}: found {len(numbers)} numbers where a log has {width}")
+    period = len(_WIDTHS)
+    if len(rows) % period:
+        raise InputError(f"reading {path}: a log has five lines per pose, found {len(rows)} lines in all")
+    heads = rows[::period]
+    T = np.array([numbers for row, (_, numbers) in enumerate(rows) if row % period]).reshape(-1, 4, 4)
     T[:, :3, 3] *= MM_PER_UNIT[unit]
-    numbers = np.array([block[0][0] for block in blocks])
-    count_frames = are_frame_numbers(numbers) and bool(np.all(np.diff(numbers) > 0))
-    where = [f"{path}, line {number}" for number, _ in lines[:: len(_WIDTHS)]]
-    return rigid(T, where), numbers if count_frames else np.arange(len(T))
+    indices = np.array([numbers[0] for _, numbers in heads])
+    ascend = are_frame_numbers(indices) and bool(np.all(np.diff(indices) > 0))
+    return rigid(T, [f"{path}, line {line}" for line, _ in heads]), indices if ascend else np.arange(len(T))

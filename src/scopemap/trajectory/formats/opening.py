@@ -31,59 +31,15 @@ READERS: dict[str, Reader] = {
 KINDS = ("auto", *READERS)
 
 _COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, 16: text.read_c3vd}
-# A name in words, whether a folder holds it, and what reads it.
-_FOLDERS: tuple[tuple[str, Callable[[Path], bool], Reader], ...] = (
-    (
-        "trajectory.tum with frames.csv (run)",
-        lambda f: (f / "trajectory.tum").is_file() and (f / "frames.csv").is_file(),
-        folders.read_run,
-    ),
-    ("pose.txt (c3vd)", lambda f: (f / "pose.txt").is_file(), text.read_c3vd),
-    ("frame-*.pose.txt (7-scenes)", lambda f: any(f.glob("frame-*.pose.txt")), folders.read_seven_scenes),
-    (
-        "frame_data*.json or frame_data.tar.gz (scared)",
-        lambda f: scared.find_scared(f) is not None,
-        scared.read_scared,
-    ),
-    (
-        "poses_pred.txt or poses_gt.txt (oneslam)",
-        lambda f: any((f / name).is_file() for name in text.ONESLAM_FILES),
-        text.read_oneslam,
-    ),
-    ("params.npz (endogslam, splatam)", lambda f: (f / splatam.PARAMS_FILE).is_file(), splatam.read_params),
-    (
-        "trajectory.log (open3d, endo-depth)",
-        lambda f: (f / open3d_log.LOG_FILE).is_file(),
-        lambda f, unit: _refuse_log(f / open3d_log.LOG_FILE),
-    ),
-    (
-        "images.txt (colmap)",
-        lambda f: any((f / name).is_file() for name in colmap.COLMAP_FILES),
-        colmap.read_colmap,
-    ),
-)
 
 
 def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory:
-    """Read a trajectory from whatever `path` holds, recognised by content; its `source` says what was assumed.
+    """Read a trajectory of any format, which its content tells; its `source` states what was assumed.
 
-    | kind | file or folder | pose as stored | unit |
-    |---|---|---|---|
-    | run | folder with `trajectory.tum` and `frames.csv` | camera-to-world | mm |
-    | tum | 8 columns | camera-to-world | stated in a `#` line, else `unit` |
-    | kitti, bodyslam | 12 columns | camera-to-world | stated, else `unit` |
-    | c3vd | `pose.txt`, 16 columns, transposed or row-major | camera-to-world | mm |
-    | 7-scenes | folder of `frame-*.pose.txt` | camera-to-world | m |
-    | scared | `frame_data*.json`, or `frame_data.tar.gz`, in a folder | world-to-camera | mm |
-    | oneslam | `poses_pred.txt`, TUM rows by frame number | camera-to-world | `unit` |
-    | endogslam, splatam | `params.npz` | world-to-camera | `unit` |
-    | open3d | `trajectory.log` | camera-to-world | `unit` |
-    | endo-depth | `trajectory.log` of Endo-Depth-and-Motion | world-to-camera | m |
-    | colmap | `images.txt` | world-to-camera | `unit` |
-
-    "m" and "mm" in the table are fixed. TUM time stamps that are all integers below 1e9 are frame numbers, unless the
-    header says `time: s`. Where content fits two readings, the error asks for `kind`. Raises `InputError` with the line
-    or frame at fault, `SettingsError` for an unknown `kind`.
+    The kinds, their conventions and units are listed in docs/formats.md, "Trajectories". `unit` is that of a file that
+    neither states nor fixes one. TUM time stamps that are all integers below 1e9 are frame numbers, unless the header
+    says `time: s`. Where content fits two readings, the error asks for `kind`. Raises `InputError` with the line or
+    frame at fault, `SettingsError` for an unknown `kind`.
     """
     path = Path(path)
     if kind not in KINDS:
@@ -98,20 +54,43 @@ def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Tra
 
 
 def holds_trajectory(folder: Path) -> bool:
-    """Whether a folder holds poses in a form that is recognised."""
-    return any(holds(folder) for _, holds, _ in _FOLDERS)
+    """Return whether a folder holds poses in a known format."""
+    return any(_holds(folder, files) for _, files, _ in _FOLDERS)
+
+
+def _refuse_log(path: Path, unit: Unit) -> Trajectory:
+    path = path / open3d_log.LOG_FILE if path.is_dir() else path
+    raise InputError(
+        f"cannot tell which way the poses of {path} point: name the kind, 'open3d' (camera-to-world, as Open3D writes "
+        "them) or 'endo-depth' (world-to-camera in metres, as Endo-Depth-and-Motion does)"
+    )
+
+
+# Kind, files of which a folder holds one, and what reads it.
+_FOLDERS: tuple[tuple[str, tuple[str, ...], Reader], ...] = (
+    ("run", ("trajectory.tum",), folders.read_run),
+    ("c3vd", ("pose.txt",), text.read_c3vd),
+    ("7-scenes", ("frame-*.pose.txt",), folders.read_seven_scenes),
+    ("scared", scared.SCARED_FILES, scared.read_scared),
+    ("oneslam", text.ONESLAM_FILES, text.read_oneslam),
+    ("endogslam, splatam", (splatam.PARAMS_FILE,), splatam.read_params),
+    ("open3d, endo-depth", (open3d_log.LOG_FILE,), _refuse_log),
+    ("colmap", colmap.COLMAP_FILES, colmap.read_colmap),
+)
+
+
+def _holds(folder: Path, files: tuple[str, ...]) -> bool:
+    return any(found.is_file() for pattern in files for found in folder.glob(pattern))
 
 
 def _reader_of_folder(folder: Path) -> Reader:
-    found = [(name, reader) for name, holds, reader in _FOLDERS if holds(folder)]
-    if not found:
-        raise InputError(
-            f"no trajectory in the folder {folder}: looked for {', '.join(name for name, _, _ in _FOLDERS)}"
-        )
-    if len(found) > 1:
-        names = " and ".join(name for name, _ in found)
-        raise InputError(f"the folder {folder} holds {names}; say which kind is meant, or name the file itself")
-    return found[0][1]
+    found = [(kind, files, reader) for kind, files, reader in _FOLDERS if _holds(folder, files)]
+    if len(found) == 1:
+        return found[0][2]
+    names = [f"{' or '.join(files[:2])} ({kind})" for kind, files, _ in found or _FOLDERS]
+    if found:
+        raise InputError(f"the folder {folder} holds {' and '.join(names)}; name the kind, or the file itself")
+    raise InputError(f"no trajectory in the folder {folder}: looked for {', '.join(names)}")
 
 
 def _reader_of_file(path: Path) -> Reader:
@@ -121,9 +100,8 @@ def _reader_of_file(path: Path) -> Reader:
         return scared.read_scared
     lines = text.text_lines(path)
     first = [line for line in lines if text.fields_of(line)][:2]
-    widths = [len(text.fields_of(line)) for line in first]
-    if widths == [3, 4]:
-        return lambda file, unit: _refuse_log(file)
+    if [len(text.fields_of(line)) for line in first] == [3, 4]:
+        return _refuse_log
     if first and colmap.is_image_line(first[0]):
         return colmap.read_colmap
     if any(line.startswith("#") and "frame_index" in line for line in lines[:2]):
@@ -135,13 +113,6 @@ def _reader_of_file(path: Path) -> Reader:
             "and 16 (C3VD pose.txt)"
         )
     return _COLUMNS[columns]
-
-
-def _refuse_log(path: Path) -> Trajectory:
-    raise InputError(
-        f"cannot tell which way the poses of {path} point: say kind 'open3d' (camera-to-world, as Open3D writes them) "
-        "or 'endo-depth' (world-to-camera in metres, as Endo-Depth-and-Motion does)"
-    )
 
 
 def _refuse_pickle(path: Path) -> None:

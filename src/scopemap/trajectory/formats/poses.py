@@ -1,4 +1,4 @@
-"""What all forms of files share: poses are checked, made exact, and stamped."""
+"""What all formats share: poses are checked to be rigid, made exactly so, and put into a `Trajectory`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
     bottom = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
     wrong = np.flatnonzero((deviation > _RIGID_TOLERANCE) | (np.linalg.det(R) < 0) | (bottom > _RIGID_TOLERANCE))
     if wrong.size:
+        last_row = " ".join(f"{value:.3g}" for value in T[wrong[0], 3])
         raise InputError(
             f"{where[wrong[0]]}: not a rigid motion (R^T R is off the identity by {deviation[wrong[0]]:.3g}, det R = "
-            f"{np.linalg.det(R[wrong[0]]):.3g}, last row {_numbers(T[wrong[0], 3])}); poses must be without scale"
+            f"{np.linalg.det(R[wrong[0]]):.3g}, last row {last_row}); poses must be without scale"
         )
-    # Files carry six digits or so: make the rotations exact, as the inverse by transposition needs them.
+    # Files hold six digits or so, and the inverse by transposition needs exact rotations.
     return np.stack([orthonormalised(pose) for pose in T])
 
 
@@ -40,13 +41,25 @@ def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) 
     if wrong.size:
         raise InputError(f"{where[wrong[0]]}: the quaternion has length {norms[wrong[0]]:.3g} instead of 1")
     T = np.tile(np.eye(4), (len(positions), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
-    T[:, :3, 3] = positions
+    if len(positions):
+        T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
+        T[:, :3, 3] = positions
     return T
 
 
+def poses_by_row(rows: np.ndarray, mm_per_unit: float, where: list[str]) -> dict[int, np.ndarray]:
+    """Return the pose (4, 4), translation in mm, of each row (N, 7) `tx ty tz qx qy qz qw`, by number of the row.
+
+    A row that holds NaN or infinity has no pose. `where` names the rows in the `InputError` at
+    a quaternion that is not of length 1.
+    """
+    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    T = from_quaternions(rows[known, 3:], rows[known, :3] * mm_per_unit, [where[row] for row in known])
+    return dict(zip(known.tolist(), T, strict=True))
+
+
 def are_frame_numbers(stamps: np.ndarray) -> bool:
-    """Whether stamps (N,) are all whole, and small enough to count frames."""
+    """Return whether stamps (N,) are all whole, and small enough to count frames."""
     return bool(np.all((stamps == np.round(stamps)) & (np.abs(stamps) < _MOST_FRAMES)))
 
 
@@ -70,7 +83,3 @@ def file_of(path: Path, names: tuple[str, ...]) -> Path:
         wanted = f"looked for {' and '.join(names)}" if names else "this kind is read from a file"
         raise InputError(f"cannot read a trajectory from the folder {path}: {wanted}")
     return found
-
-
-def _numbers(row: np.ndarray) -> str:
-    return " ".join(f"{value:.3g}" for value in row)

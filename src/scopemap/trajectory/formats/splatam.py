@@ -33,7 +33,7 @@ _IDENTITY_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class _Split:
-    """Which frames a run saw: those not held out, from `start` (first of them) in steps of `stride`."""
+    """Which frames a run used: those not held out, from `start` (first of them) in steps of `stride`."""
 
     held_out: bool = False
     start: int = 0
@@ -47,10 +47,8 @@ class _Split:
     @property
     def words(self) -> str:
         """The split in words."""
-        first, second, third = self.frames(3)
-        return f"columns are frames {first}, {second}, {third}, ..." + (
-            f" without {self.start + 7}, {self.start + 15}, ..." if self.held_out else ""
-        )
+        without = f" without {self.start + 7}, {self.start + 15}, ..." if self.held_out else ""
+        return f"columns are frames {', '.join(map(str, self.frames(3)))}, ...{without}"
 
 
 def read_endogslam(path: Path, unit: Unit) -> Trajectory:
@@ -64,14 +62,14 @@ def read_splatam(path: Path, unit: Unit) -> Trajectory:
 
 
 def read_params(path: Path, unit: Unit) -> Trajectory:
-    """Read `params.npz`, its frames numbered as the `config.py` beside it says; `InputError` where there is none."""
+    """Read `params.npz`, its frames numbered by the `config.py` beside it; `InputError` where there is none."""
     file = file_of(path, (PARAMS_FILE,))
     split = _split_of_run(file.with_name("config.py"))
     if split is None:
         raise InputError(
-            f"cannot number the frames of {file}: no config.py of its run with plain values of train_or_test, start "
-            "and stride lies beside it; say kind 'endogslam' (frames 7, 15, ... were held out, as EndoGSLAM and "
-            "Endo-2DTAM do on C3VD) or 'splatam' (every frame was used)"
+            f"cannot number the frames of {file}: it has no config.py of its run beside it with plain values of "
+            "train_or_test, start and stride; name the kind: 'endogslam' (frames 7, 15, ... were held out, as "
+            "EndoGSLAM and Endo-2DTAM do on C3VD) or 'splatam' (every frame was used)"
         )
     return _read(file, unit, split)
 

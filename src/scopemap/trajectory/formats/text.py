@@ -1,4 +1,4 @@
-"""Tables of numbers, a pose a line: TUM (8 columns), KITTI (12) and C3VD (16), and the systems that write them.
+"""Text files with one pose a line: TUM (8 numbers), KITTI (12), C3VD (16), and what OneSLAM and BodySLAM write.
 
 OneSLAM (github.com/arcadelab/OneSLAM, slam.py, write_tum_poses) writes its keyframes alone to `poses_pred.txt`, as TUM
 rows camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same
@@ -6,7 +6,7 @@ form. Its scale is that of a constant first guess of depth, so arbitrary.
 
 BodySLAM (github.com/GuidoManni/BodySLAM, UTILS/io_utils.py and EVALUATION/MPEM_eval.py, save_poses_as_kitti) writes the
 upper 3x4 of every pose as a KITTI line. It chains T_i = T_(i-1) relative_i, which is right for camera-to-world poses;
-scale and unit are not stated. Its SCARED truth is the JSON's world-to-camera matrix as it stands: read the JSON.
+scale and unit are not stated. Its SCARED truth is the JSON's world-to-camera matrix as it is: read the JSON.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ ONESLAM_FILES = ("poses_pred.txt", "poses_gt.txt")
 
 @dataclass(frozen=True)
 class NumberTable:
-    """The numbers of a text file: values (N, C), the line each row stood on, and the comment lines."""
+    """The numbers of a text file.
+
+    values : (N, C) float64. line_numbers : line of each row, from 1. comments : the comment lines.
+    """
 
     path: Path
     values: np.ndarray
-    line_numbers: list[int]
+    line_numbers: np.ndarray
     comments: str
 
     @property
@@ -53,59 +56,63 @@ class NumberTable:
             )
         return self
 
+    def rows(self, chosen: np.ndarray) -> NumberTable:
+        """Return the table of the rows that `chosen` (bool mask or row numbers) picks."""
+        return replace(self, values=self.values[chosen], line_numbers=self.line_numbers[chosen])
+
     def sorted_by_stamp(self) -> NumberTable:
         """Return the table in ascending order of its first column; raises `InputError` where a stamp comes again."""
-        order = np.argsort(self.values[:, 0], kind="stable")
-        repeated = np.flatnonzero(np.diff(self.values[order, 0]) == 0)
+        table = self.rows(np.argsort(self.values[:, 0], kind="stable"))
+        repeated = np.flatnonzero(np.diff(table.values[:, 0]) == 0)
         if repeated.size:
-            where = self.where[order[repeated[0] + 1]]
-            raise InputError(f"{where}: the time stamp of an earlier line comes again; leave one out")
-        return replace(self, values=self.values[order], line_numbers=[self.line_numbers[k] for k in order])
+            raise InputError(f"{table.where[repeated[0] + 1]}: the time stamp of an earlier line comes again")
+        return table
 
 
 def text_lines(path: Path) -> list[str]:
-    """Return the lines of a text file; `InputError` where it cannot be read as text."""
+    """Return the lines of a text file, without a byte order mark; `InputError` where it cannot be read as text."""
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read a trajectory from {path}: {error}") from None
+        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def fields_of(line: str) -> list[str]:
-    """Return what stands in a line before a `#`, split at spaces and commas."""
-    return line.partition("#")[0].replace(",", " ").split()
+    """Return the fields of a line before a `#`, separated by spaces, commas or semicolons."""
+    return re.sub("[,;]", " ", line.partition("#")[0]).split()
 
 
-def read_numbers(path: Path) -> NumberTable:
-    """Return the table in a text file; `InputError`, with the line, where it is no table of finite numbers."""
-    lines = text_lines(path)
-    rows: list[list[float]] = []
-    line_numbers: list[int] = []
-    for number, line in enumerate(lines, start=1):
+def read_rows(path: Path, *, missing: bool = False) -> list[tuple[int, list[float]]]:
+    """Return line number, from 1, and numbers of each line that is neither empty nor a comment.
+
+    `missing` allows NaN and infinity, which mark a frame without a pose. Raises `InputError`, with the line, at
+    anything but numbers, and where there is no row.
+    """
+    rows = []
+    for number, line in enumerate(text_lines(path), start=1):
         fields = fields_of(line)
-        if not fields:
-            continue
-        rows.append(parse_row(fields, f"{path}, line {number}"))
-        line_numbers.append(number)
-        if len(rows[-1]) != len(rows[0]):
-            raise InputError(
-                f"{path}, line {number}: found {len(fields)} numbers where earlier lines have {len(rows[0])}"
-            )
+        try:
+            row = [float(field) for field in fields]
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: expected numbers ({error}); mark comments by '#'") from None
+        if not missing and not np.all(np.isfinite(row)):
+            raise InputError(f"{path}, line {number}: a pose holds NaN or infinity; leave out frames without a pose")
+        if row:
+            rows.append((number, row))
     if not rows:
-        raise InputError(f"cannot read a trajectory from {path}: it holds no pose")
-    comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
-    return NumberTable(path, np.array(rows), line_numbers, comments)
+        raise InputError(f"reading {path}: it holds no pose")
+    return rows
 
 
-def parse_row(fields: list[str], where: str) -> list[float]:
-    """Return the numbers in `fields`; `InputError`, with `where`, at what is no finite number."""
-    try:
-        row = [float(field) for field in fields]
-    except ValueError as error:
-        raise InputError(f"{where}: expected numbers ({error}); mark comments by '#'") from None
-    if not np.all(np.isfinite(row)):
-        raise InputError(f"{where}: a pose holds NaN or infinity; leave out frames without a pose")
-    return row
+def read_numbers(path: Path, *, missing: bool = False) -> NumberTable:
+    """Return the table in a text file; `InputError`, with the line, where rows differ in length. See `read_rows`."""
+    rows = read_rows(path, missing=missing)
+    width = len(rows[0][1])
+    for number, row in rows:
+        if len(row) != width:
+            raise InputError(f"{path}, line {number}: found {len(row)} numbers where earlier lines have {width}")
+    comments = "\n".join(line for line in text_lines(path) if line.lstrip().startswith("#"))
+    return NumberTable(path, np.array([row for _, row in rows]), np.array([number for number, _ in rows]), comments)
 
 
 def tum_poses(table: NumberTable, unit: Unit) -> tuple[np.ndarray, str]:
@@ -138,17 +145,8 @@ def read_oneslam(path: Path, unit: Unit) -> Trajectory:
     return stamped(T, stamps, None, f"OneSLAM, TUM rows by frame number, camera-to-world, {words}")
 
 
-def read_kitti(path: Path, unit: Unit) -> Trajectory:
+def read_kitti(path: Path, unit: Unit, form: str = "KITTI") -> Trajectory:
     """Read KITTI rows, the upper 3x4 of a camera-to-world pose each; row = frame number, from 0."""
-    return _read_kitti(path, unit, "KITTI")
-
-
-def read_bodyslam(path: Path, unit: Unit) -> Trajectory:
-    """Read the KITTI rows that BodySLAM writes."""
-    return _read_kitti(path, unit, "BodySLAM, KITTI rows")
-
-
-def _read_kitti(path: Path, unit: Unit, form: str) -> Trajectory:
     table = read_numbers(file_of(path, ())).with_columns(12, form)
     mm_per_unit, words = table.unit(unit)
     T = np.tile(np.eye(4), (len(table.values), 1, 1))
@@ -157,8 +155,17 @@ def _read_kitti(path: Path, unit: Unit, form: str) -> Trajectory:
     return stamped(rigid(T, table.where), np.arange(len(T)), None, f"{form}, camera-to-world, {words}, row = frame")
 
 
+def read_bodyslam(path: Path, unit: Unit) -> Trajectory:
+    """Read the KITTI rows that BodySLAM writes."""
+    return read_kitti(path, unit, "BodySLAM, KITTI rows")
+
+
 def read_c3vd(path: Path, unit: Unit) -> Trajectory:
-    """Read C3VD's `pose.txt`, always mm; see `scopemap.trajectory.trajectory.read_poses`. `unit` is not asked."""
+    """Read C3VD's `pose.txt`, 16 numbers a line, always mm; `unit` is not used.
+
+    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
+    over all its lines (with no translation at all they look alike: taken as stored).
+    """
     table = read_numbers(file_of(path, ("pose.txt",))).with_columns(16, "C3VD's pose.txt")
     T = table.values.reshape(-1, 4, 4)
     if np.allclose(T[:, :3, 3], 0):
@@ -172,9 +179,5 @@ def read_c3vd(path: Path, unit: Unit) -> Trajectory:
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """Return the camera-to-world poses (N, 4, 4), mm, of a `pose.txt`: 16 numbers a line, by commas or spaces.
-
-    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
-    over all its lines (with no translation at all they look alike: taken as stored). Raises `InputError`.
-    """
+    """Return the camera-to-world poses (N, 4, 4), mm, of C3VD's `pose.txt`; see `read_c3vd`. Raises `InputError`."""
     return read_c3vd(Path(path), "mm").T_world_camera
