@@ -1,23 +1,30 @@
-"""COLMAP's cameras, `cameras.txt` and `cameras.bin` (colmap.github.io/format.html, colmap.github.io/cameras.html).
+"""COLMAP models: cameras and images with their poses, text or binary, in a folder or a zip archive.
 
-`cameras.bin`: a count (uint64); per camera its number (uint32), its model's (int32), width, height (uint64), parameters
-(double). COLMAP's pixels count from the corner of the image, so principal points are half a pixel larger than here.
+Formats: colmap.github.io/format.html, colmap.github.io/cameras.html. Binary files are little-endian: a count (uint64),
+then per camera its number (uint32), its model's (int32), width, height (uint64) and parameters (double); per image its
+number (uint32), qw qx qy qz tx ty tz (double), its camera's number (uint32), its name ending in a zero byte, a count of
+points (uint64) and 24 bytes for each. COLMAP's pixels count from the corner of the image, so principal points are half
+a pixel larger than here.
 """
 
 from __future__ import annotations
 
+import io
+import lzma
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from struct import Struct
+from typing import IO
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, check_plausible
-from scopemap.cameras.formats.colmap_binary import opened_model
 from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OpenCvCamera
-from scopemap.errors import CalibrationError
+from scopemap.errors import CalibrationError, InputError
 
 # How many parameters each model has; its place here is its number in binary files.
 _PARAMETERS = {
@@ -29,30 +36,122 @@ _PARAMETERS = {
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 _READ = (*_PERSPECTIVE, "FOV", *_FISHEYES)
-_OF_ONE_FOCAL_LENGTH = (
-    *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
-)
+_OF_ONE_FOCAL_LENGTH = tuple(name for name in _READ if name.startswith(("SIMPLE", "RADIAL")))
 _CORNER_TO_CENTRE_PX = 0.5
 _MODEL_NAME = re.compile(r"[A-Z][A-Z_]{2,39}")
 _ADVICE = (
     f"reconstruct with {', '.join(_READ[:-1])} or {_READ[-1]}, undistort the images with COLMAP, or put a calibration "
     "(camera.yaml) into the folder"
 )
-
-_COUNT = Struct("<Q")
-_CAMERA = Struct("<IiQQ")
-# A camera has two parameters at least.
-_SMALLEST_CAMERA_BYTES = _CAMERA.size + 16
+_COUNT, _CAMERA, _IMAGE = Struct("<Q"), Struct("<IiQQ"), Struct("<I7dI")
+_POINT_BYTES, _PIECE_BYTES = 24, 1 << 20
+_MOST_IMAGES, _LONGEST_NAME_BYTES = 1_000_000, 4096
+_FIELDS_BEFORE_NAME, _FIELDS_OF_POINT = 9, 3
+_MODEL_IN_ARCHIVE = re.compile(r"(?:.*/)?sparse/\d{1,9}/images\.bin")
+_MOST_MODEL_BYTES, _MOST_LIST_BYTES = 1 << 30, 1 << 20
+_DAMAGED_ARCHIVE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """A camera as it stands in the file: its model's name, image size in px, parameters in COLMAP's order."""
+    """A camera of a model: its model's name, image size in px, parameters in COLMAP's order."""
 
     model: str
     width: int
     height: int
     parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """An image of a model.
+
+    Attributes
+    ----------
+    name : its path below the folder of the images, as written.
+    camera : number of its camera.
+    values : qw qx qy qz tx ty tz, world to camera, in units of the model.
+    where : file and place in it, for errors.
+    """
+
+    name: str
+    camera: int
+    values: tuple[float, ...]
+    where: str
+
+    @property
+    def is_posed(self) -> bool:
+        """Whether all values of the pose are finite."""
+        return all(map(math.isfinite, self.values))
+
+    @property
+    def path(self) -> PurePosixPath:
+        """Its path below the folder of the images, also of a name with backslashes."""
+        return PurePosixPath(self.name.replace("\\", "/"))
+
+
+@dataclass(frozen=True)
+class SubModel:
+    """One of the models in an archive: the number of its folder, its images, and how many models there are."""
+
+    number: int
+    count: int
+    images: list[ModelImage]
+
+
+def model_files(folder: Path) -> tuple[Path, Path] | None:
+    """Return the files (cameras, images) of the model in `folder`, binary before text as COLMAP does, or None."""
+    pairs = ((folder / f"cameras{ending}", folder / f"images{ending}") for ending in (".bin", ".txt"))
+    return next((pair for pair in pairs if pair[0].is_file() and pair[1].is_file()), None)
+
+
+def read_cameras(file: Path, *, binary: bool | None = None) -> dict[int, ModelCamera]:
+    """Return the cameras of a model by number; `binary` None: by the file's ending.
+
+    Raises `CalibrationError` for a file that is damaged.
+    """
+    cameras: dict[int, ModelCamera] = {}
+    try:
+        with file.open("rb") as stream:
+            is_binary = file.suffix == ".bin" if binary is None else binary
+            for number, camera in _binary_cameras(stream) if is_binary else _text_cameras(stream):
+                if number in cameras:
+                    raise ValueError(f"camera {number} comes again; leave one out")
+                cameras[number] = camera
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"cannot read the cameras of a COLMAP model from {file}: {error}") from None
+    return cameras
+
+
+def read_images(file: Path) -> list[ModelImage]:
+    """Return the images of a model; `InputError` for a file that is damaged, holds none, or names one twice."""
+    try:
+        with file.open("rb") as stream:
+            return _images_in(stream, str(file), file.suffix == ".bin")
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the images of a COLMAP model from {file}: {error}") from None
+
+
+def read_largest_model(archive: Path) -> SubModel:
+    """Return the model `sparse/<M>/images.bin` in a zip archive whose `cluster_list/<M>.txt` names the most frames.
+
+    Without lists that with the longest file; of equals the first. Raises `InputError` for an archive that is damaged,
+    holds no model, or one of more than 1 GB.
+    """
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            sizes = _model_sizes(opened)
+            if not sizes:
+                raise InputError(f"reading {archive}: it holds no COLMAP model (sparse/<number>/images.bin)")
+            member = max(sizes, key=lambda member: (sizes[member], -_model_number(member)))
+            size = opened.getinfo(member).file_size
+            if size > _MOST_MODEL_BYTES:
+                raise InputError(f"reading {archive}: {member} holds {size >> 20} MB, expected 1024 MB at most")
+            with opened.open(member) as stream:
+                images = _images_in(stream, f"{archive}, {member}", binary=True)
+    except _DAMAGED_ARCHIVE as error:
+        raise InputError(f"reading {archive}: the archive is damaged or incomplete ({error})") from None
+    return SubModel(_model_number(member), len(sizes), images)
 
 
 def is_cameras_text(text: str) -> bool:
@@ -63,37 +162,37 @@ def is_cameras_text(text: str) -> bool:
 
 
 def is_cameras_binary(content: bytes) -> bool:
-    """Whether content begins as `cameras.bin` does: a count, then a camera of a model that is known."""
-    if len(content) < _COUNT.size + _SMALLEST_CAMERA_BYTES:
+    """Whether content begins as `cameras.bin` does: a count, then a camera of a known model."""
+    if len(content) < _COUNT.size + _CAMERA.size:
         return False
     (count,) = _COUNT.unpack_from(content)
     _, model, width, height = _CAMERA.unpack_from(content, _COUNT.size)
     return bool(0 < count <= len(content) and 0 <= model < len(_PARAMETERS) and width and height)
 
 
+def is_image_line(line: str) -> bool:
+    """Whether a line of text gives the pose of an image: nine numbers, then a name; lines of points are all numbers."""
+    fields = line.split(maxsplit=_FIELDS_BEFORE_NAME)
+    return (
+        len(fields) > _FIELDS_BEFORE_NAME
+        and all(_is_number(field) for field in fields[:_FIELDS_BEFORE_NAME])
+        and not _is_number(fields[_FIELDS_BEFORE_NAME].split()[0])
+    )
+
+
 def only_camera(file: Path, *, binary: bool) -> CameraModel:
-    """Return the camera of a file that holds one; `CalibrationError` or `InputError` for any other file."""
-    cameras = list(_binary_cameras(file) if binary else _text_cameras(file))
+    """Return the camera of a file that holds one; `CalibrationError` for any other file."""
+    cameras = read_cameras(file, binary=binary)
     if len(cameras) != 1:
         raise CalibrationError(
             f"the calibration {file} holds {len(cameras)} cameras (COLMAP): leave the one of these images in it"
         )
-    ((number, camera),) = cameras
+    ((number, camera),) = cameras.items()
     return camera_model(camera, f"camera {number} of {file}")
 
 
-def read_cameras(file: Path) -> dict[int, ModelCamera]:
-    """Return the cameras of a model by number; `CalibrationError` or `InputError` for a file that is damaged."""
-    cameras: dict[int, ModelCamera] = {}
-    for number, camera in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
-        if number in cameras:
-            raise CalibrationError(f"reading {file}: camera {number} comes again; leave one out")
-        cameras[number] = camera
-    return cameras
-
-
 def camera_model(camera: ModelCamera, name: str) -> CameraModel:
-    """Return the camera for pixel centres that count from 0; `name` is what errors call it.
+    """Return the camera for pixel centres that count from 0; `name` is its name in errors.
 
     Raises `CalibrationError` for a model that has no counterpart here, and for parameters that fit no such images.
     """
@@ -120,6 +219,24 @@ def camera_model(camera: ModelCamera, name: str) -> CameraModel:
     return model
 
 
+def _model_number(member: str) -> int:
+    return int(PurePosixPath(member).parent.name)
+
+
+def _model_sizes(archive: zipfile.ZipFile) -> dict[str, int]:
+    """Return how many frames the lists of the models name, by member; without all lists the sizes of the members."""
+    members = [name for name in archive.namelist() if _MODEL_IN_ARCHIVE.fullmatch(name)]
+    sizes = {}
+    for member in members:
+        try:
+            name = f"{PurePosixPath(member).parents[2] / 'cluster_list' / str(_model_number(member))}.txt"
+            with archive.open(name) as stream:
+                sizes[member] = len(stream.read(_MOST_LIST_BYTES).split())
+        except KeyError:
+            return {member: archive.getinfo(member).file_size for member in members}
+    return sizes
+
+
 def _with_lens(model: str, central: PinholeCamera, lens: list[float]) -> CameraModel:
     if model in _FISHEYES:
         return FisheyeCamera(central, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
@@ -130,38 +247,116 @@ def _with_lens(model: str, central: PinholeCamera, lens: list[float]) -> CameraM
     return OpenCvCamera(central, tuple(lens) if model == "FULL_OPENCV" else (*lens, 0.0, 0.0, 0.0)[:4])
 
 
-def _text_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
-    try:
-        content = file.read_bytes()
-        if b"\0" in content:
-            raise ValueError("it is binary, not text")
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"cannot read the cameras of a COLMAP model from {file}: {error}") from None
-    # Bytes that are no UTF-8, as in comments of any tool, become question marks.
-    for number, line in enumerate(content.decode("utf-8-sig", errors="replace").splitlines(), start=1):
+def _text_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
+    # Comments may have any encoding.
+    for number, line in enumerate(io.TextIOWrapper(stream, "utf-8-sig", errors="replace"), start=1):
         fields = line.split()
+        if "\0" in line:
+            raise ValueError("it is binary, not text")
         if not fields or line.startswith("#"):
             continue
         try:
-            model, (key, width, height) = fields[1], (int(fields[i]) for i in (0, 2, 3))
-            parameters = tuple(float(field) for field in fields[4:])
+            key, width, height = (int(fields[i]) for i in (0, 2, 3))
+            yield key, ModelCamera(fields[1], width, height, tuple(float(field) for field in fields[4:]))
         except (IndexError, ValueError):
-            raise CalibrationError(
-                f"{file}, line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line.strip()[:60]!r}"
+            raise ValueError(
+                f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line.strip()[:60]!r}"
             ) from None
-        yield key, ModelCamera(model, width, height, parameters)
 
 
-def _binary_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
-    names = list(_PARAMETERS)
-    with opened_model(file) as content:
-        for _ in range(content.count(_SMALLEST_CAMERA_BYTES, "cameras")):
-            key, model, width, height = content.take(_CAMERA)
-            if not 0 <= model < len(names):
-                raise CalibrationError(
-                    f"reading {file}: camera {key} is of a model with the number {model}, of which nothing is known; "
-                    f"{_ADVICE}"
-                )
-            name = names[model]
-            yield key, ModelCamera(name, width, height, content.take(Struct(f"<{_PARAMETERS[name]}d")))
-        content.check_end()
+def _binary_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
+    models = list(_PARAMETERS)
+    (count,) = _taken(stream, _COUNT)
+    for _ in range(count):
+        key, model, width, height = _taken(stream, _CAMERA)
+        if not 0 <= model < len(models):
+            raise ValueError(f"camera {key} is of an unknown model, number {model}; {_ADVICE}")
+        parameters = _taken(stream, Struct(f"<{_PARAMETERS[models[model]]}d"))
+        yield key, ModelCamera(models[model], width, height, parameters)
+    _check_end(stream)
+
+
+def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
+    images = list((_binary_images if binary else _text_images)(stream, where))
+    if not images:
+        raise ValueError("it holds no image with its pose")
+    seen: set[PurePosixPath] = set()
+    for image in images:
+        if image.path in seen:
+            raise ValueError(f"the image {image.name!r} comes again ({image.where}); leave one out")
+        seen.add(image.path)
+    return images
+
+
+def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
+    """Yield the images of `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, each with a line of points below or none."""
+    points_may_follow = False
+    for number, line in enumerate(io.TextIOWrapper(stream, "utf-8"), start=1):
+        if line.startswith("#"):
+            continue
+        if is_image_line(line):
+            _, *values, camera, name = line.split(maxsplit=_FIELDS_BEFORE_NAME)
+            if not re.fullmatch(r"[0-9]{1,10}", camera):
+                raise ValueError(f"line {number}: expected the number of a camera before the name, found {camera!r}")
+            yield ModelImage(name.strip(), int(camera), tuple(map(float, values)), f"{where}, line {number}")
+            points_may_follow = True
+        elif line.strip() and not (points_may_follow and _is_points_line(line)):
+            raise ValueError(
+                f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and below it points of three "
+                f"numbers each, found {line.strip()[:60]!r}"
+            )
+        else:
+            points_may_follow = False
+
+
+def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
+    (count,) = _taken(stream, _COUNT)
+    if count > _MOST_IMAGES:
+        raise ValueError(f"it claims {count} images, expected {_MOST_IMAGES} at most")
+    for position in range(count):
+        _, *values, camera = _taken(stream, _IMAGE)
+        name = b""
+        while (letter := stream.read(1)) not in (b"\0", b"") and len(name) < _LONGEST_NAME_BYTES:
+            name += letter
+        if letter != b"\0" or not name:
+            raise ValueError(f"image {position + 1} has no name; it is damaged or cut off")
+        (points,) = _taken(stream, _COUNT)
+        _skip(stream, _POINT_BYTES * points)
+        yield ModelImage(name.decode(), camera, tuple(values), f"{where}, image {position + 1}")
+    _check_end(stream)
+
+
+def _taken(stream: IO[bytes], form: Struct) -> tuple:
+    """Return the next values, of the types in `form`."""
+    content = stream.read(form.size)
+    if len(content) < form.size:
+        raise ValueError("it is cut off; write the model anew")
+    return form.unpack(content)
+
+
+def _skip(stream: IO[bytes], size: int) -> None:
+    """Read on by `size` bytes, a piece at a time: `size` is no more than a claim."""
+    while size > 0:
+        piece = len(stream.read(min(size, _PIECE_BYTES)))
+        if not piece:
+            raise ValueError("it is cut off; write the model anew")
+        size -= piece
+
+
+def _check_end(stream: IO[bytes]) -> None:
+    if stream.read(1):
+        raise ValueError("bytes are left after the last entry; it is damaged")
+
+
+def _is_points_line(line: str) -> bool:
+    """Whether a line holds points; there may be thousands, so only the first is checked."""
+    fields = line.split()
+    return len(fields) % _FIELDS_OF_POINT == 0 and all(_is_number(field) for field in fields[:_FIELDS_OF_POINT])
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,6 +1,6 @@
 """COLMAP: images with the model that structure from motion made of them, text or binary.
 
-The images lie in `images`, or beside the model's files; the model in the folder itself, in `sparse/0`, `sparse` or
+The images are in `images`, or beside the model's files; the model in the folder itself, in `sparse/0`, `sparse` or
 `colmap/sparse/0`. Where several models were made of the images, the folder of any of them (`sparse/1`) can be given.
 Schoenberger and Frahm, "Structure-from-motion revisited", CVPR 2016; colmap.github.io/format.html.
 """
@@ -14,13 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
-from scopemap.cameras.formats.colmap import camera_model, read_cameras
+from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
-from scopemap.geometry.se3 import inverse
-from scopemap.io.datasets.colmap_files import image_path, model_files, read_images
 from scopemap.io.images import ImageFolder, image_files
 from scopemap.io.source import SourceTruth
-from scopemap.trajectory.formats.colmap import ModelImage, poses_of
+from scopemap.trajectory.formats.colmap import camera_poses
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 _DEEPEST_MODEL = 3
@@ -46,19 +44,18 @@ class ColmapFolder(ImageFolder):
             )
         cameras_file, images_file = found
         images = read_images(images_file)
-        files = _pictures(path, images)
+        files = _files_of(path, images)
         super().__init__(path, files)
         names = {file.name: number for file, number in zip(files, self.numbers, strict=True)}
-        here = {names[name]: image for image in images if (name := image_path(image).name) in names}
+        here = {names[image.path.name]: image for image in images if image.path.name in names}
         if self.camera is None:
             with self._making_camera():
                 self._use_camera(cameras_file, Counter(image.camera for image in here.values()))
         posed = {number: image for number, image in here.items() if image.is_posed}
         if not posed:
             raise InputError(f"reading {images_file}: every pose of the images that are here holds NaN or infinity")
-        poses = inverse(poses_of(list(posed.values())))
-        self._poses = dict(zip(posed, poses, strict=True))
-        self._say(images_file, len(images), len(here))
+        self._poses = dict(zip(posed, camera_poses(list(posed.values())), strict=True))
+        self._report_model(images_file, len(images), len(here))
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -86,24 +83,24 @@ class ColmapFolder(ImageFolder):
             raise InputError(
                 f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ "
                 f"({'; '.join(named)}{'; ...' * (len(models) > _MOST_NAMED)}); a sequence has one: reconstruct with a "
-                "single camera for all images, or give their calibration (--camera, or as camera.yaml in "
-                f"{self.path})"
+                f"single camera for all images, or give their calibration (--camera, or as camera.yaml in {self.path})"
             )
         camera = models[most_used[0]]
         self.camera = fitted_to(camera, (self.width, self.height), f"camera {most_used[0]} of {file}")
         note = rescaled_note(camera, self.camera)
         self.camera_source = f"COLMAP {file.name}, {cameras[most_used[0]].model}{note}"
 
-    def _say(self, file: Path, in_model: int, here: int) -> None:
+    def _report_model(self, file: Path, in_model: int, here: int) -> None:
         self.notes.append(
             "poses by structure from motion (COLMAP), world-to-camera inverted; scale unknown: units are taken as mm"
         )
         if len(self._poses) < len(self.files):
             self.notes.append(f"{len(self.files) - len(self._poses)} of {len(self.files)} images have no pose")
-        others = _other_models(file.parent)
+        beside = file.absolute().parent.parent.iterdir() if file.parent.name.isdecimal() else ()
+        others = sorted(o.name for o in beside if o.name.isdecimal() and o.name != file.parent.name and model_files(o))
         if others:
             self.notes.append(
-                f"{file.parent} was read, one of {len(others) + 1} models, each in a world of its own; the others: "
+                f"{file.parent} was read, one of {len(others) + 1} models, each in a frame of its own; the others: "
                 f"{', '.join(others[:_MOST_NAMED])}{', ...' * (len(others) > _MOST_NAMED)}"
             )
         if here < in_model:
@@ -118,7 +115,7 @@ def _model(path: Path) -> tuple[Path, Path] | None:
 
 
 def _image_folders(path: Path) -> Iterator[Path]:
-    """Yield the folders in which the images of the model may lie, the likeliest first."""
+    """Yield the folders in which the images of the model may be, the likeliest first."""
     if (path / _IMAGES).is_dir():
         yield path / _IMAGES
     if image_files(path):
@@ -128,16 +125,16 @@ def _image_folders(path: Path) -> Iterator[Path]:
         yield from (folder for folder in above if folder.is_dir())
 
 
-def _pictures(path: Path, images: list[ModelImage]) -> list[Path]:
+def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
     """Return all images of the folder that holds those of the model; `InputError` where there is none, or several."""
-    inner = sorted({image_path(image).parent for image in images})
+    inner = sorted({image.path.parent for image in images})
     if len(inner) > 1:
         named = ", ".join(repr(str(folder)) for folder in inner[:_MOST_NAMED]) + ", ..." * (len(inner) > _MOST_NAMED)
         raise InputError(
-            f"reading {path}: the images of the COLMAP model lie in {len(inner)} folders ({named}), a sequence in one; "
+            f"reading {path}: the images of the COLMAP model are in {len(inner)} folders ({named}), a sequence in one; "
             "reconstruct one of them, or leave the others out of the model"
         )
-    wanted = {image_path(image).name for image in images}
+    wanted = {image.path.name for image in images}
     for folder in _image_folders(path):
         for place in (_below(folder, inner[0].parts), folder):
             files = image_files(place) if place is not None else []
@@ -150,18 +147,10 @@ def _pictures(path: Path, images: list[ModelImage]) -> list[Path]:
 
 
 def _below(folder: Path, parts: tuple[str, ...]) -> Path | None:
-    """Return the folder at `parts` below `folder`; the names were written by anyone, so none leads out of it."""
+    """Return the folder at `parts` below `folder`; names from a file of unknown origin must not lead out of it."""
     for part in parts:
         inner = next((inner for inner in folder.iterdir() if inner.name == part and inner.is_dir()), None)
         if inner is None:
             return None
         folder = inner
     return folder
-
-
-def _other_models(folder: Path) -> list[str]:
-    """Return the names of the numbered models beside the one in `folder`."""
-    if not folder.name.isdecimal():
-        return []
-    beside = (other for other in folder.absolute().parent.iterdir() if other.name.isdecimal() and other.is_dir())
-    return sorted((o.name for o in beside if o.name != folder.name and model_files(o) is not None), key=int)

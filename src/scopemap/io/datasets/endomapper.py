@@ -12,11 +12,12 @@ import json
 import re
 from pathlib import Path
 
+from scopemap.cameras.formats.colmap import read_largest_model
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
-from scopemap.io.datasets.colmap_archive import read_largest_model
 from scopemap.io.datasets.posed_video import PosedVideo, only_video, videos_in
+from scopemap.trajectory.formats.colmap import camera_poses
 
 _PROCEDURE = re.compile(r"Seq_\d+")
 _FRAME = re.compile(r"out(\d{1,9})\.\w+")
@@ -75,7 +76,9 @@ class EndoMapperSequence(PosedVideo):
             self.notes.append("no pose is known: there is no COLMAP reconstruction of this procedure")
             return
         model = read_largest_model(archive)
-        for name, pose in model.poses.items():
+        images = [image for image in model.images if image.is_posed]
+        for image, pose in zip(images, camera_poses(images), strict=True):
+            name = image.path.name
             match = _FRAME.fullmatch(name)
             number = int(match[1]) - 1 if match else -1
             if number < 0 or number in self.poses:

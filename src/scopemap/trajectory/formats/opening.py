@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+from scopemap.cameras.formats.colmap import is_image_line
 from scopemap.errors import InputError, SettingsError
 from scopemap.trajectory.formats import colmap, folders, open3d_log, scared, splatam, text
 from scopemap.trajectory.trajectory import Trajectory, Unit
@@ -102,7 +103,7 @@ def _reader_of_file(path: Path) -> Reader:
     first = [line for line in lines if text.fields_of(line)][:2]
     if [len(text.fields_of(line)) for line in first] == [3, 4]:
         return _refuse_log
-    if first and colmap.is_image_line(first[0]):
+    if first and is_image_line(first[0]):
         return colmap.read_colmap
     if any(line.startswith("#") and "frame_index" in line for line in lines[:2]):
         return text.read_oneslam
