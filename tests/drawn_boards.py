@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from scopemap.calibration import CharucoBoard, Checkerboard
+from scopemap.calibration.targets import CharucoBoard, Checkerboard
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scopemap.calibration.calibrating import BoardCalibration
-from scopemap.calibration.selection import views_per_place
-from scopemap.calibration.views import View
+from scopemap.calibration.camera_calibration import CameraCalibration
+from scopemap.calibration.views import View, views_per_pixel
 from scopemap.errors import InputError
 from scopemap.report.canvas import headline, new_figure
 
@@ -22,7 +21,7 @@ _LONGER_PERCENT = 95
 _MOST_LABELS = 25
 
 
-def draw_calibration(calibration: BoardCalibration, example: np.ndarray, file: Path) -> None:
+def draw_calibration(calibration: CameraCalibration, example: np.ndarray, file: Path) -> None:
     """Draw how well `calibration` explains its views into `file`, a PNG.
 
     `example` (h, w, 3) uint8 is the frame of `calibration.example`. Raises `InputError` where the file cannot be
@@ -53,14 +52,14 @@ def _draw_example(axes: Axes, view: View, frame: np.ndarray) -> None:
     axes.imshow(frame)
     axes.plot(*view.found.pixels.T, "x", color="#ff3030", markersize=7)
     axes.plot(*view.corners.pixels.T, "o", color="#00ff55", markersize=8, fillstyle="none")
-    found, used = len(view.found.pixels), len(view.corners.pixels)
+    found, used = len(view.found), len(view.corners)
     axes.set_title(f"frame {view.index}: {found} corners found (crosses), {used} used (circles)", fontsize=10)
     axes.set_axis_off()
 
 
-def _draw_residuals(axes: Axes, calibration: BoardCalibration, colours: np.ndarray) -> None:
+def _draw_residuals(axes: Axes, calibration: CameraCalibration, colours: np.ndarray) -> None:
     width, height = calibration.fit.camera.width, calibration.fit.camera.height
-    count = views_per_place(calibration.views, (width, height))
+    count = views_per_pixel(calibration.views, (width, height))
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     shown = axes.imshow(count, cmap="Greys", vmin=0, vmax=max(2 * int(count.max()), 1), extent=extent)
     most = int(count.max())
@@ -86,7 +85,7 @@ def _draw_residuals(axes: Axes, calibration: BoardCalibration, colours: np.ndarr
     )
 
 
-def _draw_errors(axes: Axes, calibration: BoardCalibration, colours: np.ndarray) -> None:
+def _draw_errors(axes: Axes, calibration: CameraCalibration, colours: np.ndarray) -> None:
     places = np.arange(len(calibration.views))
     axes.bar(places, calibration.fit.view_rms_px, color=colours)
     axes.axhline(calibration.fit.rms_px, color="black", linestyle="--", linewidth=1)

@@ -1,8 +1,9 @@
-"""Calibration boards: a checkerboard, or a ChArUco board, of which a part is enough; how each is found in a picture."""
+"""Calibration targets: a checkerboard or a ChArUco board, found in an image by OpenCV's detectors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -11,45 +12,60 @@ import numpy as np
 
 from scopemap.errors import SettingsError
 
+DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+"""Names of the sets of markers that OpenCV has."""
+
 _FEWEST, _MOST = 3, 100  # a side, inner corners or squares
 _FEWEST_CORNERS = 8
-# A board is first looked for in a picture of this size: where there is none, a large one takes seconds to say so.
+# A target is first looked for in an image of this size: the search takes seconds in a large one without a target.
 _SEARCH_SIDE_PX = 800
-# Corners are placed by what lies within so much around them, and no farther than a share of a square: farther off, the
-# lens bends the edges.
+# Corners are refined in a window of so many px, or this share of the image, but at most this share of a square: farther
+# off, the lens bends the edges.
 _REACH_PX, _REACH_SHARE, _REACH_SQUARES = 8, 1 / 160, 0.4
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+# Texture often passes for a grid of the smallest size, sometimes for a larger one, whose corners are then 0.4 squares
+# and more off a plane; strong distortion moves those of a real one by up to 0.3.
+_SMALLEST_GRID, _OFF_PLANE = (4, 3), 0.3
+_TELLING_MARKERS = 4
+_MOST_IMAGES = 6
 
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners of a board in a picture.
+    """Corners of a target in an image.
 
     Attributes
     ----------
-    board_mm : (N, 3) float64, where they lie on the board, z = 0.
-    pixels : (N, 2) float64, where they are seen.
+    board_mm : (N, 3) float64, on the target, z = 0.
+    pixels : (N, 2) float64, in the image.
     """
 
     board_mm: np.ndarray
     pixels: np.ndarray
 
+    def __len__(self) -> int:
+        return len(self.pixels)
 
-class Board(Protocol):
-    """What is printed on the plate."""
+    def where(self, kept: np.ndarray) -> Corners:
+        """Return the corners that the mask (N,) keeps."""
+        return Corners(self.board_mm[kept], self.pixels[kept])
+
+
+class Target(Protocol):
+    """A printed calibration target."""
 
     @property
     def described(self) -> str:
-        """The board in a few words."""
+        """The target in a few words."""
 
     def find(self, grey: np.ndarray) -> Corners | None:
-        """Return the board's corners in a picture (h, w) uint8, None where it is not seen or too little of it."""
+        """Return the target's corners in an image (h, w) uint8, None where too few are seen."""
 
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the picture.
+    """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the image.
 
     Raises `SettingsError` for a board that cannot be.
     """
@@ -63,20 +79,19 @@ class Checkerboard:
 
     @property
     def described(self) -> str:
-        """The board in a few words."""
+        """The target in a few words."""
         return f"checkerboard of {self.columns}x{self.rows} inner corners, squares of {self.square_mm:g} mm"
 
     @cached_property
     def corners_mm(self) -> np.ndarray:
         """All corners (N, 3), row by row."""
-        rows, columns = np.mgrid[: self.rows, : self.columns]
-        grid = np.stack([columns.ravel(), rows.ravel(), np.zeros(self.rows * self.columns)], -1)
-        return grid * self.square_mm
+        grid = np.mgrid[: self.columns, : self.rows, :1].T.reshape(-1, 3)
+        return grid * float(self.square_mm)
 
     def find(self, grey: np.ndarray) -> Corners | None:
         """Return all corners, None where one is missing.
 
-        Found by Duda and Frese (BMVC 2018), else by OpenCV's older search; then placed where gradients agree.
+        Found by Duda and Frese (BMVC 2018), else by OpenCV's older search; refined to subpixels in the full image.
         """
         shrink = min(1.0, _SEARCH_SIDE_PX / max(grey.shape))
         small = grey if shrink == 1 else cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
@@ -88,14 +103,18 @@ class Checkerboard:
             return None
         scale = np.array(grey.shape[::-1]) / small.shape[::-1]
         pixels = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-        return Corners(self.corners_mm, _refined(grey, pixels))
+        widest = max(_REACH_PX, round(_REACH_SHARE * max(grey.shape)))
+        reach = max(2, min(widest, int(_REACH_SQUARES * nearest_px(pixels))))
+        start = pixels.astype(np.float32).reshape(-1, 1, 2)
+        refined = cv2.cornerSubPix(grey, start, (reach, reach), (-1, -1), _REFINED)
+        return Corners(self.corners_mm, refined.reshape(-1, 2).astype(np.float64))
 
 
 @dataclass(frozen=True)
 class CharucoBoard:
-    """A ChArUco board: `columns` x `rows` squares, the white ones with a marker that tells which they are.
+    """A ChArUco board: `columns` x `rows` squares, the white ones with markers that identify them; a part is enough.
 
-    `dictionary` is OpenCV's name of the markers' set; `legacy`: laid out as by OpenCV before 4.6. Raises
+    `dictionary` is OpenCV's name of the set of markers; `legacy`: laid out as by OpenCV before 4.6. Raises
     `SettingsError` for a board that cannot be.
     """
 
@@ -110,11 +129,11 @@ class CharucoBoard:
         _check(self.columns, self.rows, self.square_mm)
         if not 0 < self.marker_mm < self.square_mm:
             raise SettingsError(
-                f"a marker of {self.marker_mm:g} mm does not lie within a square of {self.square_mm:g} mm"
+                f"a marker of {self.marker_mm:g} mm does not fit into a square of {self.square_mm:g} mm"
             )
         if self.dictionary not in DICTIONARIES:
             raise SettingsError(f"unknown markers '{self.dictionary}': choose one of {', '.join(DICTIONARIES)}")
-        known, wanted = len(self._markers.bytesList), self.columns * self.rows // 2
+        known, wanted = len(_markers(self.dictionary).bytesList), self.columns * self.rows // 2
         if wanted > known:
             raise SettingsError(
                 f"a ChArUco board of {self.columns}x{self.rows} squares has {wanted} markers, {self.dictionary} only "
@@ -123,34 +142,26 @@ class CharucoBoard:
 
     @property
     def described(self) -> str:
-        """The board in a few words."""
+        """The target in a few words."""
         return (
             f"ChArUco board of {self.columns}x{self.rows} squares of {self.square_mm:g} mm, markers of "
             f"{self.marker_mm:g} mm from {self.dictionary}{', legacy layout' if self.legacy else ''}"
         )
 
-    @property
-    def _markers(self) -> cv2.aruco.Dictionary:
-        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-
     @cached_property
     def layout(self) -> cv2.aruco.CharucoBoard:
-        """The board as OpenCV knows it."""
+        """OpenCV's board."""
         size = (self.columns, self.rows)
-        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, self._markers)
+        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, _markers(self.dictionary))
         board.setLegacyPattern(self.legacy)
         return board
 
-    @cached_property
-    def _detector(self) -> cv2.aruco.CharucoDetector:
-        return cv2.aruco.CharucoDetector(self.layout)
-
     def find(self, grey: np.ndarray) -> Corners | None:
-        """Return the corners that are told by markers beside them, None for fewer than 8 or all in one line."""
-        # In a small picture markers have few pixels: doubled, more are read, and corners are twice as exact.
+        """Return the corners beside markers that were read, None for fewer than 8 or all in one line."""
+        # In a small image markers have few pixels: doubled, more are read, and corners are twice as exact.
         grow = 2 if max(grey.shape) <= _SEARCH_SIDE_PX else 1
         large = grey if grow == 1 else cv2.resize(grey, None, fx=grow, fy=grow, interpolation=cv2.INTER_CUBIC)
-        pixels, ids, _, _ = self._detector.detectBoard(large)
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(self.layout).detectBoard(large)
         if ids is None or len(ids) < _FEWEST_CORNERS:
             return None
         board_mm = np.asarray(self.layout.getChessboardCorners(), dtype=np.float64)[ids.ravel()]
@@ -159,8 +170,65 @@ class CharucoBoard:
         return Corners(board_mm, (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) / grow - 0.5)
 
 
-DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
-"""Names of the sets of markers that OpenCV brings along."""
+def nearest_px(pixels: np.ndarray) -> float:
+    """Return the median distance of corners (N, 2) from their nearest neighbour, px."""
+    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return float(np.median(distance.min(axis=1)))
+
+
+def other_target_seen(target: Target, images: Sequence[np.ndarray]) -> str:
+    """Return which other target the grey `images` show in which `target` was not found, as advice; "" for none."""
+    images = images[-_MOST_IMAGES:]
+    seen = (search(target, grey) for search in (_other_layout, _other_markers, _other_checkerboard) for grey in images)
+    return next(filter(None, seen), "")
+
+
+def _other_layout(target: Target, grey: np.ndarray) -> str:
+    if not isinstance(target, CharucoBoard):
+        return ""
+    here, swapped = (target.columns, target.rows), (target.rows, target.columns)
+    for (columns, rows), legacy in ((swapped, target.legacy), (here, not target.legacy), (swapped, not target.legacy)):
+        if replace(target, columns=columns, rows=rows, legacy=legacy).find(grey) is not None:
+            how = "--legacy" if legacy else "without --legacy"
+            return f"a ChArUco board of {columns}x{rows} squares is seen: give --board {columns}x{rows}, {how}"
+    return ""
+
+
+def _other_markers(target: Target, grey: np.ndarray) -> str:
+    own = target.dictionary if isinstance(target, CharucoBoard) else ""
+    found = {name: cv2.aruco.ArucoDetector(_markers(name)).detectMarkers(grey)[1] for name in DICTIONARIES}
+    counts = {name: 0 if ids is None else len(ids) for name, ids in found.items()}
+    # Small sets are parts of large ones: of those with as many markers, the target's own, else the smallest.
+    name = max(DICTIONARIES, key=lambda name: (counts[name], name == own, -len(_markers(name).bytesList)))
+    if counts[name] < _TELLING_MARKERS:
+        return ""
+    if name == own:
+        return f"markers of {own} are seen, but not as they are on this board: check --board (squares, not corners)"
+    asked = f"give --dictionary {name}" if own else f"is it a ChArUco board (--charuco --dictionary {name})?"
+    return f"markers of {name} are seen: {asked}"
+
+
+def _other_checkerboard(target: Target, grey: np.ndarray) -> str:
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, flags)
+    if not found or meta.size <= _SMALLEST_GRID[0] * _SMALLEST_GRID[1]:
+        return ""
+    (rows, columns), pixels = meta.shape[:2], np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    even = np.mgrid[:columns, :rows].T.reshape(-1, 2).astype(np.float64)
+    H, _ = cv2.findHomography(even, pixels)
+    off = np.inf if H is None else cv2.perspectiveTransform(even[None], H)[0] - pixels
+    if np.sqrt(np.mean(np.sum(np.atleast_2d(off) ** 2, axis=1))) > _OFF_PLANE * nearest_px(pixels):
+        return ""
+    size = f"{max(rows, columns)}x{min(rows, columns)}"
+    if not isinstance(target, Checkerboard):
+        return f"a checkerboard of {size} inner corners is seen: leave out --charuco"
+    same = sorted((target.columns, target.rows)) == sorted((rows, columns))
+    return "" if same else f"a checkerboard of {size} inner corners is seen: give --board {size}"
+
+
+def _markers(dictionary: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
 
 
 def _check(columns: int, rows: int, square_mm: float) -> None:
@@ -168,18 +236,3 @@ def _check(columns: int, rows: int, square_mm: float) -> None:
         raise SettingsError(f"a board of {columns}x{rows} cannot be: {_FEWEST} to {_MOST} a side are possible")
     if not 0 < square_mm < np.inf:
         raise SettingsError(f"the squares of a board must be larger than 0 mm, got {square_mm:g}")
-
-
-def _refined(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return `pixels` (N, 2) moved onto the corners nearby, to a fraction of a pixel."""
-    straight = max(_REACH_PX, round(_REACH_SHARE * max(grey.shape)))
-    reach = max(2, min(straight, int(_REACH_SQUARES * nearest_px(pixels))))
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    return cv2.cornerSubPix(grey, start, (reach, reach), (-1, -1), _REFINED).reshape(-1, 2).astype(np.float64)
-
-
-def nearest_px(pixels: np.ndarray) -> float:
-    """Return the median distance of corners (N, 2) from their nearest neighbour, px."""
-    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.median(distance.min(axis=1)))

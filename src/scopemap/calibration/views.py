@@ -1,4 +1,4 @@
-"""Views of a board: the frames of an input in which it is found, and how sharp they are."""
+"""Views of a calibration target in a video: found, measured for sharpness, and selected so that they differ."""
 
 from __future__ import annotations
 
@@ -8,26 +8,33 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from scopemap.calibration.targets import Board, Corners, nearest_px
+from scopemap.calibration.targets import Corners, Target, nearest_px
 from scopemap.errors import InputError
 from scopemap.io.source import Source
 
-_FRAMES_LOOKED_AT = 300
+_FRAMES_SEARCHED = 300
 _FARTHEST_EDGE_PX = 20
+_LONGEST_KEPT_SIDE_PX = 1200
+_MOST_VIEWS = 40
+_CELLS_ACROSS = 16
+# Edges so much wider than in the sharper quarter of the views are blurred.
+_BLURRED, _BLURRED_PX = 1.7, 0.5
+# Views this close in position, size and tilt, with this few new cells, show the same.
+_SAME, _NEW_CELLS = 0.05, 2
+_FARTHEST = 0.5
 
 Listener = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
 class View:
-    """A board as one frame shows it.
+    """The target in one frame.
 
     Attributes
     ----------
     index : number of the frame in the input. name : the frame's file, or "".
-    corners : the board's corners and where they are seen, those in use.
+    corners : the corners in use. found : all corners that were found.
     edge_px : width of the edges between black and white, px.
-    found : all corners that were found.
     """
 
     index: int
@@ -39,15 +46,15 @@ class View:
 
 @dataclass
 class Search:
-    """What looking through an input gave.
+    """The views found in an input.
 
     Attributes
     ----------
     size : width and height of the frames, px.
-    selection : the frames in which the board was looked for, every `every`-th of those asked for.
-    looked_at : how many these were.
-    views : where it was found.
-    without : some of the frames in which it was not found, grey: to say why.
+    selection : the frames that were searched, every `every`-th of those asked for.
+    looked_at : number of these frames.
+    views : the views found.
+    without : some of the frames without a view, grey, 1200 px at most.
     """
 
     size: tuple[int, int]
@@ -58,43 +65,61 @@ class Search:
     without: list[np.ndarray] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """A view that was not used, and why."""
+
+    view: View
+    reason: str
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Views to calibrate with; those that were blurred; the number of those like a selected one."""
+
+    views: list[View]
+    blurred: list[LeftOut]
+    alike: int
+
+
 def find_views(
     source: Source,
-    board: Board,
+    target: Target,
     selection: slice | None = None,
     every: int | None = None,
     listener: Listener | None = None,
 ) -> Search:
-    """Look for `board` in every `every`-th selected frame, as `source` has it; None: about 300 frames in all.
+    """Search every `every`-th selected frame of `source` for `target`; None: about 300 frames in all.
 
-    `selection` counts positions in the source, None: all. `listener` is told the frames looked at, and of how many.
-    Raises `InputError` where the source cannot be read.
+    `selection` counts positions in the source, None: all. `listener` is called with the number of frames searched, and
+    of all. Raises `InputError` where the source cannot be read.
     """
     selection = selection or slice(None)
     if selection.step is not None and selection.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
     count = None if source.count is None else len(range(*selection.indices(source.count)))
-    every = every or max(1, (count or 0) // _FRAMES_LOOKED_AT)
+    every = every or max(1, (count or 0) // _FRAMES_SEARCHED)
     total = None if count is None else -(-count // every)
-    looked_at = slice(selection.start, selection.stop, every * (selection.step or 1))
-    search = Search((source.width, source.height), looked_at, every)
+    searched = slice(selection.start, selection.stop, every * (selection.step or 1))
+    search = Search((source.width, source.height), searched, every)
     missed = 0
-    for frame in source.frames(looked_at):
+    for frame in source.frames(searched):
         search.looked_at += 1
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        corners = board.find(grey)
-        if corners is None:
+        corners = target.find(grey)
+        if corners is not None:
+            search.views.append(View(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels), corners))
+        else:
             missed += 1
             if missed & (missed - 1) == 0:  # the 1st, 2nd, 4th, 8th ...: few, from all parts of a long video
-                search.without.append(grey)
-        else:
-            search.views.append(View(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels), corners))
+                shrink = min(1.0, _LONGEST_KEPT_SIDE_PX / max(grey.shape))
+                search.without.append(cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA))
         if listener is not None:
             listener(search.looked_at, total)
     return search
 
 
-def picture_of(view: View, source: Source, search: Search) -> np.ndarray:
+def image_of(view: View, source: Source, search: Search) -> np.ndarray:
     """Return the frame (h, w, 3) uint8 of a view that `search` found in `source`, read anew."""
     for frame in source.frames(search.selection):
         if frame.index == view.index:
@@ -103,7 +128,7 @@ def picture_of(view: View, source: Source, search: Search) -> np.ndarray:
 
 
 def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
-    """Return how wide the edges at corners (N, 2) are, px: contrast over steepest slope, the median of the corners."""
+    """Return the width of the edges at corners (N, 2), px: contrast over steepest slope, the median of the corners."""
     image = grey.astype(np.float32)
     slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
     reach = int(np.clip(0.4 * nearest_px(pixels), 2, _FARTHEST_EDGE_PX))
@@ -112,3 +137,70 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
         window = np.s_[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1]
         widths.append(float(np.ptp(image[window])) / max(float(slope[window].max()), 1e-6))
     return float(np.median(widths))
+
+
+def select_views(views: list[View], size: tuple[int, int], most: int = _MOST_VIEWS) -> Selected:
+    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, best first.
+
+    The next view is the one with most new cells of the image under its corners and the greatest distance, in position,
+    size and tilt, from those that were taken.
+    """
+    if not views:
+        return Selected([], [], 0)
+    edge_px = np.array([view.edge_px for view in views])
+    usual = float(np.percentile(edge_px, 25))
+    limit = max(_BLURRED * usual, usual + _BLURRED_PX)
+    reason = "blurred: its edges are {:.1f} px wide, in sharp views {:.1f} px"
+    blurred = [LeftOut(view, reason.format(view.edge_px, usual)) for view in views if view.edge_px > limit]
+    sharp, edge_px = [view for view in views if view.edge_px <= limit], edge_px[edge_px <= limit]
+    pose = np.array([_pose(view, size) for view in sharp])
+    cells = np.array([_cells(view, size) for view in sharp])
+    covered, distance = np.zeros(cells.shape[1], dtype=bool), np.full(len(sharp), _FARTHEST)
+    chosen: list[int] = []
+    while len(chosen) < most:
+        new = (cells & ~covered).sum(axis=1)
+        worth = (distance + new / cells.shape[1]) * edge_px.min() / edge_px
+        worth[(distance < _SAME) & (new < _NEW_CELLS)] = -1.0
+        worth[chosen] = -1.0
+        best = int(np.argmax(worth))
+        if worth[best] < 0:
+            break
+        chosen.append(best)
+        covered |= cells[best]
+        distance = np.minimum(distance, np.linalg.norm(pose - pose[best], axis=1))
+    return Selected([sharp[i] for i in chosen], blurred, len(sharp) - len(chosen))
+
+
+def views_per_pixel(views: list[View], size: tuple[int, int], across: int = 160) -> np.ndarray:
+    """Return how many views have a pixel within their corners: (h, w) int, the image on a grid `across` wide."""
+    scale = across / size[0]
+    count = np.zeros((max(1, round(size[1] * scale)), across), dtype=int)
+    for view in views:
+        hull = cv2.convexHull(np.rint(view.corners.pixels * scale).astype(np.int32))
+        count += cv2.fillConvexPoly(np.zeros(count.shape, np.uint8), hull, 1)
+    return count
+
+
+def _pose(view: View, size: tuple[int, int]) -> np.ndarray:
+    """Position (2), log size and tilt (2) of the target, all about 1 at most, from the homography to the image."""
+    board, pixels = view.corners.board_mm[:, :2], view.corners.pixels
+    centre, extent = board.mean(axis=0), float(np.linalg.norm(np.ptp(board, axis=0)))
+    image = float(np.sqrt(size[0] * size[1]))
+    H, _ = cv2.findHomography((board - centre) / extent, pixels / image)
+    if H is None:
+        return np.array([*(pixels.mean(axis=0) / image), 0, 0, 0])
+    jacobian = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
+    # The direction of the image in which the target recedes, however it is rotated in its plane.
+    recedes = jacobian @ H[2, :2]
+    tilt = recedes / max(float(np.linalg.norm(recedes)), 1e-12) * float(np.linalg.norm(H[2, :2]))
+    log_size = 0.5 * float(np.log(max(abs(np.linalg.det(jacobian)), 1e-12)))
+    return np.array([*H[:2, 2], log_size, *tilt])
+
+
+def _cells(view: View, size: tuple[int, int]) -> np.ndarray:
+    """Which cells of a grid over the image hold a corner, flat bool."""
+    side = size[0] / _CELLS_ACROSS
+    covered = np.zeros((max(1, round(size[1] / side)), _CELLS_ACROSS), dtype=bool)
+    across, down = np.clip((view.corners.pixels / side).astype(int), 0, np.array(covered.shape[::-1]) - 1).T
+    covered[down, across] = True
+    return covered.ravel()

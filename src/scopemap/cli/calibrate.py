@@ -21,7 +21,8 @@ from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from scopemap.calibration import Board, BoardCalibration
+    from scopemap.calibration.camera_calibration import CameraCalibration
+    from scopemap.calibration.targets import Target
     from scopemap.config import InputSettings
 
 _ENDINGS = (".yaml", ".yml")
@@ -52,7 +53,7 @@ def calibrate(
     model: Annotated[
         ModelChoice, typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen.")
     ] = ModelChoice.AUTO,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Calibration to write; its picture lies beside it.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Calibration to write; its picture goes beside it.")] = Path(
         "calibration.yaml"
     ),
     frames: Annotated[
@@ -80,19 +81,20 @@ def calibrate(
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
     selection, reading = parse_slice(frames) if frames else None, _reading(settings or [])
     # Imported here, so that --help does not wait for it.
-    from scopemap import calibration as boards
+    from scopemap.calibration import camera_calibration
     from scopemap.calibration.picture import draw_calibration
+    from scopemap.calibration.views import find_views, image_of
     from scopemap.io.opening import open_source
 
     silent = quiet or as_json
     pictures = open_source(source, dataset=dataset, settings=reading)
     with count_progress("looking for the board", "looked at", silent=silent) as listener:
-        search = boards.find_views(pictures, target, selection, every, listener)
+        search = find_views(pictures, target, selection, every, listener)
     if not silent:
         typer.echo(f"the board was found in {len(search.views)} of {search.looked_at} frames; fitting", err=True)
-    done = boards.calibrate(search, target, model.value, pictures.pixel_aspect)
-    boards.save_calibration(done, out)
-    draw_calibration(done, boards.picture_of(done.example, pictures, search), picture)
+    done = camera_calibration.calibrate(search, target, model.value, pictures.pixel_aspect)
+    camera_calibration.save_calibration(done, out)
+    draw_calibration(done, image_of(done.example, pictures, search), picture)
     for note in [] if silent else pictures.notes:
         typer.echo(f"note: {note}", err=True)
     for warning in [] if quiet else [*pictures.warnings, *done.warnings]:
@@ -131,8 +133,8 @@ def _reading(pairs: list[str]) -> InputSettings:
 
 def _board(
     text: str, square_mm: float, *, charuco: bool, marker_mm: float | None, dictionary: str | None, legacy: bool
-) -> Board:
-    from scopemap.calibration import CharucoBoard, Checkerboard
+) -> Target:
+    from scopemap.calibration.targets import CharucoBoard, Checkerboard
 
     match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", text)
     if not match:
@@ -147,7 +149,7 @@ def _board(
     return Checkerboard(columns, rows, square_mm)
 
 
-def _print(done: BoardCalibration) -> None:
+def _print(done: CameraCalibration) -> None:
     facts, console = done.summary(), Console()
     table = Table("frame", "name")
     for title in ("corners", "error (px RMS)", "tilt (deg)", "distance (mm)"):

@@ -1,10 +1,9 @@
-"""Calibration with boards: known cameras are found again from rendered views, and what cannot serve is said."""
+"""Camera calibration: known cameras are found again from rendered views, and what cannot serve is said."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,16 +11,18 @@ import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
 from PIL import Image
 
-from scopemap.calibration import BoardCalibration, CharucoBoard, Checkerboard, Search, calibrate, save_calibration
-from scopemap.calibration.choosing import FORMS, chosen, held_out_error_px
-from scopemap.calibration.diagnosis import what_is_seen_instead
-from scopemap.calibration.fitting import LensForm, fit_camera, with_bootstrap
-from scopemap.calibration.judging import warnings_about
-from scopemap.calibration.outliers import agreeing
+from scopemap.calibration.camera_calibration import CameraCalibration, calibrate, save_calibration, warnings_about
+from scopemap.calibration.intrinsics import FORMS, LensForm, choose_form, fit_camera, with_deviations
 from scopemap.calibration.picture import draw_calibration
-from scopemap.calibration.selection import LeftOut, select_views
-from scopemap.calibration.targets import Board, Corners, nearest_px
-from scopemap.calibration.views import View, edge_width_px
+from scopemap.calibration.targets import (
+    CharucoBoard,
+    Checkerboard,
+    Corners,
+    Target,
+    nearest_px,
+    other_target_seen,
+)
+from scopemap.calibration.views import Search, View, edge_width_px, select_views
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError
@@ -30,7 +31,7 @@ CHARUCO = CharucoBoard(7, 5, 4.0, 3.0)
 WRONG, BLURRED = 100, 101
 
 
-def searched(board: Board, pictures: dict[int, np.ndarray]) -> Search:
+def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
     search = Search(SIZE)
     for index, picture in pictures.items():
         grey = picture[..., 0]
@@ -61,17 +62,17 @@ def pinhole_search() -> Search:
 
 
 @pytest.fixture(scope="module")
-def pinhole(pinhole_search: Search) -> BoardCalibration:
+def pinhole(pinhole_search: Search) -> CameraCalibration:
     return calibrate(pinhole_search, CHECKERBOARD)
 
 
 @pytest.fixture(scope="module")
-def fisheye() -> BoardCalibration:
+def fisheye() -> CameraCalibration:
     return calibrate(searched(CHECKERBOARD, pictures(FISHEYE, CHECKERBOARD, 16)), CHECKERBOARD)
 
 
 @pytest.fixture(scope="module")
-def charuco() -> BoardCalibration:
+def charuco() -> CameraCalibration:
     return calibrate(searched(CHARUCO, pictures(PINHOLE, CHARUCO, 16)), CHARUCO, "pinhole")
 
 
@@ -86,7 +87,7 @@ def bend_px(camera: CameraModel, rays: np.ndarray) -> np.ndarray:
 def test_a_known_camera_is_found_again(
     name: str, truth: CameraModel, off_px: float, bend_rms_px: float, request: pytest.FixtureRequest
 ) -> None:
-    done: BoardCalibration = request.getfixturevalue(name)
+    done: CameraCalibration = request.getfixturevalue(name)
     found, true = done.fit.camera.central, truth.central
     assert type(done.fit.camera) is type(truth)
     assert abs(found.fx / true.fx - 1) < 0.005
@@ -99,7 +100,7 @@ def test_a_known_camera_is_found_again(
     assert done.fit.rms_px < 0.12
 
 
-def test_a_fit_says_how_sure_it_is(pinhole: BoardCalibration, fisheye: BoardCalibration) -> None:
+def test_a_fit_says_how_sure_it_is(pinhole: CameraCalibration, fisheye: CameraCalibration) -> None:
     for done, truth in ((pinhole, PINHOLE), (fisheye, FISHEYE)):
         assert set(done.fit.deviations) == set(done.fit.parameters) == {"fx", "fy", "cx", "cy", *done.fit.form.terms}
         for name in ("fx", "fy", "cx", "cy"):
@@ -120,7 +121,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
             pixels = studio.corners_px(pose, bow_mm=rng.normal(0, 0.05))
             corners = Corners(CHECKERBOARD.corners_mm, pixels + rng.normal(0, 0.05, pixels.shape))
             views.append(View(i, "", corners, 1.0, corners))
-        fit = with_bootstrap(fit_camera(views, SIZE, form, near=PINHOLE), views)
+        fit = with_deviations(fit_camera(views, SIZE, form, near=PINHOLE), views)
         off = np.array(list(fit.parameters.values())) - true
         shares.append(off / np.array(list(fit.deviations.values())))
     # 128 errors over their deviations; those that the noise of single corners gives were 2.3 times too small.
@@ -128,27 +129,8 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
     assert np.mean(np.abs(shares) < 2) > 0.9
 
 
-def test_the_error_in_views_held_out_is_of_the_views_and_corners_used(
-    pinhole_search: Search, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    counts = []
-
-    def stricter(views: list[View], *rest: Any) -> tuple[list[View], list[LeftOut]]:
-        """Once the form is chosen, the view that fits worst goes, too."""
-        kept, out = agreeing(views, *rest)
-        counts.append(len(kept))
-        worst = int(np.argmax(fit_camera(kept, *rest).view_rms_px))
-        return (kept, out) if len(counts) == 1 else (kept[:worst] + kept[worst + 1 :], out)
-
-    monkeypatch.setattr("scopemap.calibration.calibrating.agreeing", stricter)
-    done = calibrate(pinhole_search, CHECKERBOARD, "pinhole")
-    assert len(done.views) == counts[0] - 1
-    again = held_out_error_px(done.views, fit_camera(done.views, SIZE, done.fit.form))
-    assert done.held_out_px[done.fit.form] == pytest.approx(again, rel=1e-6)
-
-
 def test_the_wrong_and_the_blurred_view_are_left_out_with_the_reason(
-    pinhole_search: Search, pinhole: BoardCalibration
+    pinhole_search: Search, pinhole: CameraCalibration
 ) -> None:
     assert {WRONG, BLURRED} <= {view.index for view in pinhole_search.views}
     reasons = {out.view.index: out.reason for out in pinhole.left_out}
@@ -158,7 +140,7 @@ def test_the_wrong_and_the_blurred_view_are_left_out_with_the_reason(
     assert BLURRED in {out.view.index for out in pinhole.blurred}
 
 
-def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pinhole: BoardCalibration) -> None:
+def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pinhole: CameraCalibration) -> None:
     views = {view.index: view for view in pinhole.views}
     spoiled = []
     for view in list(views.values())[:3]:
@@ -177,7 +159,7 @@ def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pi
 
 
 def test_the_model_and_no_more_coefficients_than_needed_are_chosen(
-    pinhole: BoardCalibration, fisheye: BoardCalibration
+    pinhole: CameraCalibration, fisheye: CameraCalibration
 ) -> None:
     assert pinhole.fit.form == LensForm("pinhole", ("k1", "k2", "p1", "p2"))
     assert fisheye.fit.form.model == "fisheye"
@@ -188,14 +170,14 @@ def test_the_model_and_no_more_coefficients_than_needed_are_chosen(
 
 def test_the_simpler_form_wins_unless_another_is_clearly_better() -> None:
     simple, rich, fish = FORMS[1], FORMS[4], FORMS[6]
-    assert chosen({simple: 0.100, rich: 0.099, fish: 0.0985}) == simple
-    assert chosen({simple: 0.100, rich: 0.090, fish: 0.089}) == rich
-    assert chosen({simple: np.inf, rich: np.inf, fish: 0.2}) == fish
+    assert choose_form({simple: 0.100, rich: 0.099, fish: 0.0985}) == simple
+    assert choose_form({simple: 0.100, rich: 0.090, fish: 0.089}) == rich
+    assert choose_form({simple: np.inf, rich: np.inf, fish: 0.2}) == fish
     with pytest.raises(CalibrationError, match="no model predicts views"):
-        chosen({simple: np.inf})
+        choose_form({simple: np.inf})
 
 
-def test_the_summary_says_where_the_boards_were(pinhole: BoardCalibration) -> None:
+def test_the_summary_says_where_the_boards_were(pinhole: CameraCalibration) -> None:
     truth = dict(enumerate(Studio(PINHOLE, CHECKERBOARD).poses(18)))
     facts = pinhole.summary()
     assert len(facts["views"]) == len(pinhole.views) >= 12
@@ -271,30 +253,22 @@ def one_picture() -> dict[str, np.ndarray]:
         ("checkerboard", Checkerboard(10, 7, 3.0), "a checkerboard of 9x6 inner corners is seen: give --board 9x6"),
         ("checkerboard", CHARUCO, "a checkerboard of 9x6 inner corners is seen: leave out --charuco"),
         ("charuco", replace(CHARUCO, columns=5, rows=7), "a ChArUco board of 7x5 squares is seen: give --board 7x5"),
-        ("charuco", replace(CHARUCO, columns=9, rows=5), "but not as they lie on this board: check --board"),
+        ("charuco", replace(CHARUCO, columns=9, rows=5), "but not as they are on this board: check --board"),
         ("charuco", replace(CHARUCO, dictionary="DICT_6X6_250"), "give --dictionary DICT_4X4_50"),
         ("charuco", CHECKERBOARD, "is it a ChArUco board (--charuco --dictionary DICT_4X4_50)?"),
     ],
 )
-def test_another_board_is_named(shown: str, board: Board, hint: str, one_picture: dict[str, np.ndarray]) -> None:
+def test_another_board_is_named(shown: str, board: Target, hint: str, one_picture: dict[str, np.ndarray]) -> None:
     assert board.find(one_picture[shown]) is None
-    assert hint in what_is_seen_instead(board, [one_picture[shown]])
-    assert what_is_seen_instead(board, [np.full((120, 160), 90, np.uint8)]) == ""
-
-
-def test_the_smallest_grid_is_named_only_where_it_is_one_and_seen_twice() -> None:
-    studio = Studio(PINHOLE, Checkerboard(4, 3, 3.0))
-    shots = [studio.shot(pose, seed=i)[..., 0] for i, pose in enumerate(studio.poses(3, seed=1, distance_mm=30.0))]
-    hint = "a checkerboard of 4x3 inner corners is seen: give --board 4x3"
-    assert what_is_seen_instead(CHECKERBOARD, shots) == hint
-    assert what_is_seen_instead(CHECKERBOARD, shots[:1]) == ""
+    assert hint in other_target_seen(board, [one_picture[shown]])
+    assert other_target_seen(board, [np.full((120, 160), 90, np.uint8)]) == ""
 
 
 def test_texture_is_no_board() -> None:
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     pictures = [texture(np.random.default_rng(seed)) for seed in (3, 10, 11, 13, 15, 21)]
     assert sum(cv2.findChessboardCornersSBWithMeta(grey, (4, 3), flags)[0] for grey in pictures) > 1
-    assert what_is_seen_instead(CHECKERBOARD, pictures) == ""
+    assert other_target_seen(CHECKERBOARD, pictures) == ""
 
 
 def texture(rng: np.random.Generator, size: tuple[int, int] = (960, 540)) -> np.ndarray:
@@ -313,7 +287,7 @@ def texture(rng: np.random.Generator, size: tuple[int, int] = (960, 540)) -> np.
         (lambda: Checkerboard(9, 101, 3.0), "9x101 cannot be"),
         (lambda: Checkerboard(9, 6, 0.0), "larger than 0 mm"),
         (lambda: Checkerboard(9, 6, float("nan")), "larger than 0 mm"),
-        (lambda: CharucoBoard(7, 5, 4.0, 4.0), "does not lie within a square"),
+        (lambda: CharucoBoard(7, 5, 4.0, 4.0), "does not fit a square"),
         (lambda: CharucoBoard(7, 5, 4.0, 3.0, "DICT_3X3"), "unknown markers 'DICT_3X3': choose one of DICT_4X4_100,"),
         (lambda: CharucoBoard(14, 10, 4.0, 3.0), "has 70 markers, DICT_4X4_50 only 50"),
     ],
@@ -350,7 +324,7 @@ def large() -> Studio:
 # ---- what is left open
 
 
-def test_warnings(pinhole: BoardCalibration) -> None:
+def test_warnings(pinhole: CameraCalibration) -> None:
     fit = pinhole.fit
     assert warnings_about(fit, 0.8, 1.0) == []
     flat = fit.T_camera_board.copy()
@@ -363,7 +337,7 @@ def test_warnings(pinhole: BoardCalibration) -> None:
         assert words in said
 
 
-def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: BoardCalibration, tmp_path: Path) -> None:
+def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: CameraCalibration, tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_text("the earlier one")
     narrow = replace(pinhole, fit=replace(pinhole.fit, camera=PinholeCamera(9000.0, 9000.0, 160, 120, *SIZE)))
@@ -372,7 +346,7 @@ def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: BoardCalibr
     assert [each.read_text() for each in tmp_path.iterdir()] == ["the earlier one"]
 
 
-def test_the_picture(pinhole: BoardCalibration, tmp_path: Path) -> None:
+def test_the_picture(pinhole: CameraCalibration, tmp_path: Path) -> None:
     frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     draw_calibration(pinhole, frame, tmp_path / "calibration.png")
     assert Image.open(tmp_path / "calibration.png").size == (1600, 500)

@@ -1,0 +1,221 @@
+"""Camera calibration with a target: views selected, outliers left out, a camera fitted, judged and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from scopemap.calibration.intrinsics import (
+    FORMS,
+    Fit,
+    LensForm,
+    choose_form,
+    fit_camera,
+    held_out_error_px,
+    with_deviations,
+    without_outliers,
+)
+from scopemap.calibration.targets import Target, other_target_seen
+from scopemap.calibration.views import LeftOut, Search, View, select_views, views_per_pixel
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.errors import CalibrationError, InputError
+
+FEWEST_VIEWS = 8
+_FEW_VIEWS = 12
+_TILTED_DEG, _TILTED_VIEWS = 15.0, 3
+_LITTLE_COVERED = 0.5
+_LARGE_RMS_PX = 1.0
+_UNSURE_FOCAL = 0.01
+_OTHER_ASPECT = 0.02
+_UNMAPPED = 0.001
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """A camera calibrated with a target, and how well.
+
+    Attributes
+    ----------
+    fit : the camera, and the poses of the target. views : those it was fitted to, in the input's order.
+    held_out_px : error of every form tried, in views that it was not fitted to, px.
+    left_out : views that do not fit. blurred : views that are blurred.
+    alike : number of views that were not used because another one shows the same.
+    coverage : share of the image within targets.
+    warnings : shortcomings to know before use.
+    """
+
+    fit: Fit
+    views: list[View]
+    held_out_px: dict[LensForm, float]
+    left_out: list[LeftOut]
+    blurred: list[LeftOut]
+    alike: int
+    coverage: float
+    warnings: list[str]
+
+    @property
+    def stray_corners(self) -> int:
+        """Number of corners of the views that were left out, as they do not fit."""
+        return sum(len(view.found) - len(view.corners) for view in self.views)
+
+    @property
+    def example(self) -> View:
+        """The view with most corners found, of these the largest: to be shown."""
+        return max(self.views, key=lambda view: (len(view.found), float(np.prod(np.ptp(view.found.pixels, 0)))))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain numbers and texts: px, mm, degrees."""
+        fit = self.fit
+        rows = zip(self.views, fit.view_rms_px, tilts_deg(fit), fit.T_camera_board, strict=True)
+        return {
+            "model": fit.form.model,
+            "terms": list(fit.form.terms),
+            "image_size": [fit.camera.width, fit.camera.height],
+            "parameters": fit.parameters,
+            "deviations": fit.deviations,
+            "rms_px": fit.rms_px,
+            "held_out_px": {form.described: error for form, error in self.held_out_px.items()},
+            "coverage": self.coverage,
+            "views": [
+                {
+                    "frame": view.index,
+                    "name": view.name,
+                    "corners": len(view.corners),
+                    "rms_px": float(error),
+                    "tilt_deg": float(tilt),
+                    "distance_mm": float(np.median(view.corners.board_mm @ pose[2, :3] + pose[2, 3])),
+                }
+                for view, error, tilt, pose in rows
+            ],
+            **{
+                name: [{"frame": out.view.index, "name": out.view.name, "reason": out.reason} for out in outs]
+                for name, outs in (("left_out", self.left_out), ("blurred", self.blurred))
+            },
+            "alike": self.alike,
+            "stray_corners": self.stray_corners,
+            "warnings": self.warnings,
+        }
+
+
+def calibrate(
+    search: Search, target: Target, model: Literal["pinhole", "fisheye", "auto"] = "auto", pixel_aspect: float = 1.0
+) -> CameraCalibration:
+    """Return the camera that took the views of `target` found by `search`.
+
+    Of the forms of `model` (auto: of both models) the simplest is taken that predicts held-out views about as well as
+    the best. `pixel_aspect` is the input's, width of a pixel over height. Raises `InputError` for fewer than 8 views
+    that differ and agree, `CalibrationError` where no camera explains them.
+    """
+    found, size = len(search.views), search.size
+    seen = f"the board was found in {found} of {search.looked_at} frames"
+    if found < FEWEST_VIEWS:
+        advice = other_target_seen(target, search.without) or f"looked for a {target.described}"
+        raise _too_few(seen, advice)
+    selected = select_views(search.views, size)
+    if len(selected.views) < FEWEST_VIEWS:
+        differ = f"but {len(selected.views)} of these views are sharp and differ"
+        raise _too_few(f"{seen}, {differ}", "move the board through the picture and tilt it")
+    forms = [form for form in FORMS if model in ("auto", form.model)]
+    views, out = without_outliers(selected.views, size, _most_flexible(selected.views, size, forms))
+    views.sort(key=lambda view: view.index)
+    if len(views) < FEWEST_VIEWS:
+        agree = f"{seen}, but only {len(views)} of {len(selected.views)} views agree"
+        worst = f"frame {out[0].view.index}: {out[0].reason}; " if out else ""
+        raise _too_few(agree, f"{worst}is the board flat and the zoom untouched?")
+    errors = {form: held_out_error_px(views, size, form) for form in forms}
+    fit = with_deviations(fit_camera(views, size, choose_form(errors)), views)
+    covered = float((views_per_pixel(views, size) > 0).mean())
+    warnings = warnings_about(fit, covered, pixel_aspect)
+    return CameraCalibration(fit, views, errors, out, selected.blurred, selected.alike, covered, warnings)
+
+
+def save_calibration(calibration: CameraCalibration, file: Path) -> None:
+    """Write the camera to `file`, OpenCV YAML, in place of an earlier one.
+
+    Raises `CalibrationError`, and writes none, where the camera could not be read again or not be written.
+    """
+    camera = calibration.fit.camera
+    partial = file.with_name(f".{file.stem}.partial{file.suffix}")
+    try:
+        write_calibration(camera, partial)
+        read_calibration(partial, (camera.width, camera.height))
+        partial.replace(file)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"the views lead to a camera that cannot be used, so none was written: {error}"
+        ) from None
+    except OSError as error:
+        raise CalibrationError(f"cannot write the calibration to {file}: {error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def tilts_deg(fit: Fit) -> np.ndarray:
+    """Return the angle (V,) between each target's plane and the image's, degrees."""
+    return np.degrees(np.arccos(np.clip(np.abs(fit.T_camera_board[:, 2, 2]), 0, 1)))
+
+
+def warnings_about(fit: Fit, covered: float, pixel_aspect: float) -> list[str]:
+    """Return the shortcomings of a fit.
+
+    `covered` is the share of the image within targets, `pixel_aspect` the width of a pixel over its height.
+    """
+    central, camera, views = fit.camera.central, fit.camera, len(fit.residuals_px)
+    tilted = int(np.sum(tilts_deg(fit) > _TILTED_DEG))
+    unsure, aspect = fit.deviations["fx"] / central.fx, central.fy / central.fx
+    grid = np.stack(np.meshgrid(np.arange(0, camera.width, 4), np.arange(0, camera.height, 4)), -1)
+    unmapped = float(np.mean(np.isnan(camera.unproject(grid)[..., 2])))
+    possible = [
+        (views < _FEW_VIEWS, f"only {views} views that differ: 15 to 40 are usual"),
+        (
+            tilted < _TILTED_VIEWS,
+            f"the board is tilted by more than {_TILTED_DEG:g} deg in {tilted} view(s): focal length and distance can "
+            "hardly be separated; tilt it by 20 to 40 deg in several directions",
+        ),
+        (
+            covered < _LITTLE_COVERED,
+            f"the boards cover {100 * covered:.0f} % of the picture: beyond them the distortion is extrapolated; hold "
+            "the board into the corners, too",
+        ),
+        (
+            fit.rms_px > _LARGE_RMS_PX,
+            f"corners are {fit.rms_px:.2f} px off on the whole: is the board flat, the video sharp, the zoom fixed?",
+        ),
+        (
+            unsure > _UNSURE_FOCAL,
+            f"the focal length is known to {100 * unsure:.1f} % only: add views with the board tilted",
+        ),
+        (
+            abs(aspect / pixel_aspect - 1) > _OTHER_ASPECT,
+            f"by the fit pixels are {aspect:.3f} times as wide as high, by the input {pixel_aspect:.3f}: are the "
+            "board's squares square, or the picture stretched?",
+        ),
+        (
+            unmapped > _UNMAPPED,
+            f"{100 * unmapped:.1f} % of the picture's pixels are beyond the fitted lens and are left out by it",
+        ),
+    ]
+    return [message for applies, message in possible if applies]
+
+
+def _too_few(found: str, advice: str) -> InputError:
+    return InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")
+
+
+def _most_flexible(views: list[View], size: tuple[int, int], forms: list[LensForm]) -> LensForm:
+    """Return the form with most coefficients, of the model that fits most views best: for finding outliers."""
+    fits = []
+    for form in {form.model: form for form in forms}.values():
+        try:
+            fits.append(fit_camera(views, size, form))
+        except CalibrationError:
+            continue
+    if not fits:
+        raise CalibrationError(
+            f"calibrating: no camera explains the {len(views)} views; is the board flat and the one named?"
+        )
+    return min(fits, key=lambda fit: float(np.median(fit.view_rms_px))).form
