@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
 from scopemap.io.datasets.checking import Finding, check, check_path, refusal
 from scopemap.io.datasets.pose_depth import PoseDepthTest
-from scopemap.io.datasets.survey import FrameRecord, Survey, survey
+from scopemap.io.datasets.survey import FrameFigures, Survey, survey
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import SourceFrame, SourceTruth
@@ -364,9 +364,8 @@ def _moving(steps_mm: np.ndarray, noise_mm: float) -> Survey:
     positions_mm += np.random.default_rng(0).normal(0, noise_mm, positions_mm.shape)
     poses = np.tile(np.eye(4), (len(steps_mm), 1, 1))
     poses[:, :3, 3] = positions_mm
-    frames = tuple(FrameRecord(i, i / 30, f"{i}", 200.0, 30.0, False, T, None) for i, T in enumerate(poses))
-    camera = PinholeCamera(500, 500, 320, 256, 640, 512)
-    return Survey("stereomis", camera, True, "", 1.0, None, frames, (), {}, "", (), (), ())
+    frames = tuple(FrameFigures(i, i / 30, f"{i}", 200.0, 30.0, False, T, None) for i, T in enumerate(poses))
+    return Survey(cast(Sequence, None), frames)
 
 
 def test_a_camera_that_moves_off_does_not_jump() -> None:

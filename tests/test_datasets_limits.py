@@ -108,7 +108,7 @@ def test_a_count_of_frames_beyond_the_file_is_not_believed(
     assert reference_trajectory(sequence) is None
     found = survey(sequence)
     assert (found.announced, len(found.frames), found.stopped) == (None, FRAMES, "")
-    assert not any("breaks off" in warning for warning in found.warnings)
+    assert not any("breaks off" in warning for warning in found.sequence.warnings)
 
 
 def test_a_count_that_the_file_has_room_for_is_believed(tmp_path: Path) -> None:

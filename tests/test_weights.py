@@ -36,7 +36,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty weights folder, one toy checkpoint beside the registered ones, and a network that must not be used."""
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
-    monkeypatch.setattr(checkpoints, "_ALL", (*checkpoints._ALL, TOY))
+    monkeypatch.setitem(checkpoints.REGISTRY, TOY.name, TOY)
     monkeypatch.setitem(REGISTRY, "toy", TOY)
     monkeypatch.setattr("torch.hub.download_url_to_file", _forbidden)
     monkeypatch.setattr("huggingface_hub.snapshot_download", _forbidden)

@@ -1,14 +1,14 @@
-"""What is wrong with a data set, or looks wrong, by the figures of one pass over it (`survey`).
+"""Faults of a data set, by the figures of one pass over it (`survey`).
 
-Each check takes a `Survey` and returns findings. An error makes results wrong or impossible, a warning wants to be
-looked at, an info says what was assumed. Thresholds are for endoscopy: centimetres of depth, steps of a few mm at most.
+Each check takes a `Survey` and returns findings. An error makes results wrong or impossible, a warning should be looked
+at, an info states what was assumed. Thresholds are for endoscopy: centimetres of depth, steps of a few mm at most.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence as Several
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ import numpy as np
 from scopemap.errors import CalibrationError, ScopemapError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.io.datasets.pose_depth import OTHERS, Agreement
-from scopemap.io.datasets.survey import RIGID_TOLERANCE, DepthRecord, Survey, deviation, extent_mm, positions_of
+from scopemap.io.datasets.survey import RIGID_TOLERANCE, DepthFigures, Survey, deviation, extent_mm, positions_of
 from scopemap.io.images import frame_number
 
 Severity = Literal["error", "warning", "info"]
@@ -47,7 +47,7 @@ _OTHER_DEPTH_TIMES = 30.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found: how bad it is, a short code, one sentence."""
+    """A fault or an assumption: its severity, a short code, one sentence."""
 
     severity: Severity
     code: str
@@ -74,17 +74,14 @@ def check_reading(survey: Survey) -> list[Finding]:
         first, *others = survey.truth_faults
         more = f" (and {len(others)} more such errors)" if others else ""
         found.append(Finding("error", "truth-unreadable", first + more))
-    if survey.announced is not None and not survey.stopped:
-        read = {frame.index for frame in survey.frames}
-        missing = [index for index in survey.announced if index not in read]
-        if missing:
-            found.append(Finding("warning", "frame-unreadable", f"cannot be read: {_frames(missing)}"))
-    if len(survey.frames) < 2 and not survey.stopped:
-        found.append(Finding("error", "frame-few", f"{len(survey.frames)} readable frame(s), two are needed"))
-    named = [Finding("warning", "source", warning) for warning in survey.warnings[:_NAMED]]
-    if len(survey.warnings) > _NAMED:
-        named.append(Finding("warning", "source", f"and {len(survey.warnings) - _NAMED} more warnings of the reader"))
-    return found + named
+    if not survey.stopped:
+        missing = sorted(set(survey.announced or []) - {frame.index for frame in survey.frames})
+        found += _about(missing, "frame-unreadable", "cannot be read: {}")
+        if len(survey.frames) < 2:
+            found.append(Finding("error", "frame-few", f"{len(survey.frames)} readable frame(s), two are needed"))
+    warnings = survey.sequence.warnings
+    more_warnings = [f"and {len(warnings) - _NAMED} more warnings of the reader"] * (len(warnings) > _NAMED)
+    return found + [Finding("warning", "source", warning) for warning in warnings[:_NAMED] + more_warnings]
 
 
 def check_numbers(survey: Survey) -> list[Finding]:
@@ -94,28 +91,23 @@ def check_numbers(survey: Survey) -> list[Finding]:
     steps = np.diff(numbers)
     if not steps.size:
         return found
-    if (steps < 0).any():
-        found.append(Finding("error", "number-unsorted", f"numbers go back after {_frames(numbers[:-1][steps < 0])}"))
-    repeated = [number for number, times in Counter(numbers.tolist()).items() if times > 1]
-    if repeated:
-        found.append(Finding("error", "number-repeated", f"there more than once: {_frames(repeated)}"))
     usual = Counter(steps.tolist()).most_common(1)[0][0]
-    before = numbers[:-1][steps > max(usual, 1)]
-    found += _about(before, "number-gap", "numbers are missing after {}")
+    found += _about(numbers[:-1][steps < 0], "number-unsorted", "numbers go back after {}", "error")
+    found += _about(_repeated(numbers.tolist()), "number-repeated", "there more than once: {}", "error")
+    found += _about(numbers[:-1][steps > max(usual, 1)], "number-gap", "numbers are missing after {}")
     if usual > 1:
         found.append(Finding("info", "number-step", f"frames are numbered in steps of {usual}"))
     return found
 
 
-def check_pictures(survey: Survey) -> list[Finding]:
+def check_frames(survey: Survey) -> list[Finding]:
     """Black frames, frames of one colour, frames that repeat the one before."""
     black = [f.index for f in survey.frames if f.brightest < _BLACK_LEVEL]
-    even = [f.index for f in survey.frames if f.spread < _LEAST_SPREAD and f.brightest >= _BLACK_LEVEL]
-    again = [f.index for f in survey.frames if f.repeats and f.brightest >= _BLACK_LEVEL]
+    lit = [f for f in survey.frames if f.brightest >= _BLACK_LEVEL]
     return [
         *_about(black, "frame-black", "black: {}"),
-        *_about(even, "frame-constant", "of one colour: {}"),
-        *_about(again, "frame-repeated", "the same picture as before: {}"),
+        *_about([f.index for f in lit if f.spread < _LEAST_SPREAD], "frame-constant", "of one colour: {}"),
+        *_about([f.index for f in lit if f.is_repeat], "frame-repeated", "the same picture as before: {}"),
     ]
 
 
@@ -123,11 +115,9 @@ def check_times(survey: Survey) -> list[Finding]:
     """Time stamps that do not increase, or not evenly."""
     numbers, times_s = (np.array([getattr(f, key) for f in survey.frames]) for key in ("index", "time_s"))
     steps_s = np.diff(times_s)
-    if not steps_s.size:
-        return []
     wrong = ~(steps_s > 0)
-    if wrong.any():
-        return [Finding("error", "time-order", f"time does not increase after {_frames(numbers[:-1][wrong])}")]
+    if wrong.any() or not steps_s.size:
+        return _about(numbers[:-1][wrong], "time-order", "time does not increase after {}", "error")
     rates_s = steps_s / np.maximum(np.diff(numbers), 1)
     median_s = float(np.median(rates_s))
     uneven = np.abs(rates_s / median_s - 1) > _UNEVEN
@@ -137,8 +127,8 @@ def check_times(survey: Survey) -> list[Finding]:
 
 def check_camera(survey: Survey) -> list[Finding]:
     """Whether a stated camera can be one of an endoscope."""
-    camera = survey.camera
-    if not survey.calibrated:
+    camera = survey.sequence.rectifier.source.central
+    if not survey.sequence.calibrated:
         return [Finding("info", "camera-assumed", "no calibration was found: the focal length is a guess (--camera)")]
     size = f"images of {camera.width}x{camera.height} px"
     widths = camera.fx / camera.width
@@ -148,14 +138,11 @@ def check_camera(survey: Survey) -> list[Finding]:
         found.append(Finding("error", "camera-focal", message))
     centre = ((camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height)
     if not all(_MIDDLE[0] <= share <= _MIDDLE[1] for share in centre):
-        message = f"the principal point {camera.cx:.4g}, {camera.cy:.4g} px lies outside the middle half of {size}"
+        message = f"the principal point {camera.cx:.4g}, {camera.cy:.4g} px is outside the middle half of {size}"
         found.append(Finding("warning", "camera-centre", message))
-    aspect = camera.fy / camera.fx / survey.pixel_aspect
-    if abs(aspect - 1) > _ASPECT_TOLERANCE:
-        message = (
-            f"focal lengths {camera.fx:.4g} and {camera.fy:.4g} px differ by more than a tenth: are pixels square?"
-        )
-        found.append(Finding("warning", "camera-aspect", message))
+    if abs(camera.fy / camera.fx / survey.sequence.source.pixel_aspect - 1) > _ASPECT_TOLERANCE:
+        lengths = f"focal lengths {camera.fx:.4g} and {camera.fy:.4g} px"
+        found.append(Finding("warning", "camera-aspect", f"{lengths} differ by more than a tenth: are pixels square?"))
     return found
 
 
@@ -163,9 +150,9 @@ def check_poses(survey: Survey) -> list[Finding]:
     """Frames without a pose, and poses that are no rigid motions."""
     posed = [(frame.index, frame.T_world_camera) for frame in survey.frames if frame.T_world_camera is not None]
     finite = [(index, T) for index, T in posed if np.isfinite(T).all()]
+    odd = [index for index, T in posed if not np.isfinite(T).all()]
     left = [index for index, T in finite if np.linalg.det(T[:3, :3]) < 0]
     bent = [index for index, T in finite if index not in set(left) and deviation(T) > RIGID_TOLERANCE]
-    odd = [index for index, T in posed if not np.isfinite(T).all()]
     return [
         *_missing(survey, [index for index, _ in posed], "pose"),
         *_about(odd, "pose-not-finite", "the pose holds NaN or infinity: {}", "error"),
@@ -175,22 +162,22 @@ def check_poses(survey: Survey) -> list[Finding]:
 
 
 def check_path(survey: Survey) -> list[Finding]:
-    """Jumps of the camera, and sizes of its path that speak of wrong units."""
+    """Jumps of the camera, and sizes of its path that indicate wrong units."""
     frames = survey.rigid
     if len(frames) < 2:
         return []
     numbers = np.array([frame.index for frame in frames])
-    positions_mm, extent = positions_of(frames), extent_mm(positions_of(frames))
     apart = np.maximum(np.diff(numbers), 1)
+    positions_mm = positions_of(frames)
     steps_mm = np.linalg.norm(np.diff(positions_mm, axis=0), axis=1) / apart
     poses = np.stack([frame.T_world_camera for frame in frames if frame.T_world_camera is not None])
     turns_rad = rotation_angle_rad((inverse(poses[:-1]) @ poses[1:])[:, :3, :3]) / apart
+    extent = extent_mm(positions_mm)
     if extent < _STILL_MM and turns_rad.max() < _STILL_RAD:
         return [Finding("warning", "pose-still", "the camera does not move: all poses are the same")]
     moving_mm = steps_mm[steps_mm > 0]
     median_mm = float(np.median(moving_mm)) if moving_mm.size else 0.0
-    far = numbers[1:][_jumps(steps_mm, median_mm)].tolist()
-    turned = numbers[1:][turns_rad > np.radians(_JUMP_DEG)].tolist()
+    far, turned = numbers[1:][_jumps(steps_mm, median_mm)], numbers[1:][turns_rad > np.radians(_JUMP_DEG)]
     return [
         *_path_unit(median_mm, extent),
         *_about(far, "pose-jump", f"the camera jumps, more than {_JUMP:g} times the usual {median_mm:.3g} mm, to {{}}"),
@@ -201,21 +188,22 @@ def check_path(survey: Survey) -> list[Finding]:
 def check_depth(survey: Survey) -> list[Finding]:
     """Frames without depth, and depth that is empty, flat, coarse, impossible or of another unit."""
     known = [(frame.index, frame.depth) for frame in survey.frames if frame.depth is not None]
-    full = [(index, depth) for index, depth in known if depth.looked_at]
-    flat = [index for index, depth in full if depth.is_constant]
+    full = [(index, depth) for index, depth in known if depth.known_count]
+    usual_mm = float(np.median([depth.median_mm for _, depth in full])) if full else _DEPTH_MM[0]
+    times = _OTHER_DEPTH_TIMES
+    jumps = [i for i, depth in full if not 1 / times < depth.median_mm / usual_mm < times]
     return [
         *_missing(survey, [index for index, _ in known], "depth"),
         *_about([i for i, d in known if d.impossible_share > 0], "depth-impossible",
                 "depth is infinite, zero or negative in places: {}", "error"),
         *_about([i for i, d in known if 1 - d.known_share > _MOST_UNKNOWN], "depth-unknown",
                 f"depth is unknown in more than {_MOST_UNKNOWN:.0%} of the pixels: {{}}"),
-        *_about(flat, "depth-constant", "depth is the same everywhere: {}"),
+        *_about([i for i, d in full if d.is_constant], "depth-constant", "depth is the same everywhere: {}"),
         *_about([i for i, d in full if _is_coarse(d)], "depth-coarse",
                 f"depth has fewer than {_COARSE} different values, as of 8 bit or whole units: {{}}"),
-        *_depth_unit([depth.median_mm for _, depth in full], survey.dataset in _ROOMS),
-        *_about(_of_another_depth(full), "depth-jump",
-                f"the median depth is {_OTHER_DEPTH_TIMES:g} times that of the others, or a {_OTHER_DEPTH_TIMES:g}th: "
-                "{}, of another unit?"),
+        *_depth_unit(usual_mm, survey.sequence.source.name in _ROOMS),
+        *_about(jumps, "depth-jump",
+                f"the median depth is {times:g} times that of the others, or a {times:g}th: {{}}, of another unit?"),
     ]  # fmt: skip
 
 
@@ -223,10 +211,10 @@ def check_agreement(survey: Survey) -> list[Finding]:
     """Whether depth fits depth through the poses, and whether it would fit far better by another convention."""
     if not survey.agreements:
         return []
-    near = survey.agreements[0]
-    for agreement in survey.agreements:
-        # Frames far apart may well see nothing in common.
-        found = _better(agreement) if agreement is near or np.isfinite(agreement.given) else []
+    near, *later = survey.agreements
+    # Frames far apart may well see nothing in common.
+    for agreement in [near, *(one for one in later if np.isfinite(one.given))]:
+        found = _better(agreement)
         if found:
             return found
     if not np.isfinite(near.given):
@@ -238,7 +226,7 @@ def check_agreement(survey: Survey) -> list[Finding]:
         return [Finding("error", "pose-depth-disagree", f"{off}: poses, depth or camera do not belong together")]
     limit = max(_OUTLYING, _OUTLYING_TIMES * near.given)
     return _about(
-        [index for index, error in survey.off.items() if error > limit],
+        [index for index, error in (survey.depth_errors or {}).items() if error > limit],
         "pose-depth-frame",
         f"depth moved by the poses is off by more than {limit:.2%}, usually by {near.given:.2%}: {{}}",
     )
@@ -246,42 +234,35 @@ def check_agreement(survey: Survey) -> list[Finding]:
 
 def check_assumptions(survey: Survey) -> list[Finding]:
     """What the reader assumed."""
-    return [Finding("info", "assumed", note) for note in survey.notes]
+    return [Finding("info", "assumed", note) for note in survey.sequence.notes]
 
 
 CHECKS = (
-    check_reading,
-    check_numbers,
-    check_pictures,
-    check_times,
-    check_camera,
-    check_poses,
-    check_path,
-    check_depth,
-    check_agreement,
-    check_assumptions,
+    *(check_reading, check_numbers, check_frames, check_times, check_camera),
+    *(check_poses, check_path, check_depth, check_agreement, check_assumptions),
 )
+
+
+def _repeated(numbers: list[int]) -> list[int]:
+    return [number for number, times in Counter(numbers).items() if times > 1]
 
 
 def _numbers_in_names(survey: Survey, numbers: np.ndarray) -> list[Finding]:
     """Names whose numbers repeat or go back make a reader count: poses and depth then belong to positions."""
     names = [frame.name for frame in survey.frames]
-    if not np.array_equal(numbers, np.arange(len(numbers))) or any(_TIME_STAMP.search(name) for name in names):
-        return []
     own = [number for name in names if (number := frame_number(Path(name))) is not None]
-    if len(own) < len(names):
+    counted = np.array_equal(numbers, np.arange(len(numbers))) and not any(_TIME_STAMP.search(name) for name in names)
+    if not counted or len(own) < len(names):
         return []
-    counted = "so frames are counted, and a pose or depth by number may belong to another"
-    repeated = [number for number, times in Counter(own).items() if times > 1]
-    if repeated:
-        return [Finding("error", "number-repeated", f"names repeat the number of {_frames(repeated)}, {counted}")]
-    if (np.diff(own) < 0).any():
-        return [Finding("error", "number-unsorted", f"numbers in the names go back, {counted}")]
-    return []
+    effect = "so frames are counted, and a pose or depth by number may belong to another"
+    repeated = _repeated(own)
+    if not repeated and (np.diff(own) < 0).any():
+        return [Finding("error", "number-unsorted", f"numbers in the names go back, {effect}")]
+    return _about(repeated, "number-repeated", f"names repeat the number of {{}}, {effect}", "error")
 
 
 def _better(agreement: Agreement) -> list[Finding]:
-    """The convention that fits far better than the poses as given, and than no motion at all."""
+    """Return the convention that fits far better than the poses as given, and than no motion at all."""
     best = int(np.argmin(agreement.others))
     error, other = agreement.given, agreement.others[best]
     limit = min(error / _FAR_BETTER, agreement.at_rest / _FAR_BETTER, _LARGEST_ERROR)
@@ -313,8 +294,7 @@ def _path_unit(median_mm: float, extent: float) -> list[Finding]:
     return []
 
 
-def _depth_unit(medians_mm: list[float], is_room: bool) -> list[Finding]:
-    median_mm = float(np.median(medians_mm)) if medians_mm else _DEPTH_MM[0]
+def _depth_unit(median_mm: float, is_room: bool) -> list[Finding]:
     if _DEPTH_MM[0] <= median_mm <= _DEPTH_MM[1]:
         return []
     if is_room and _DEPTH_MM[1] < median_mm <= _ROOM_MM:
@@ -323,36 +303,23 @@ def _depth_unit(medians_mm: list[float], is_room: bool) -> list[Finding]:
     return [Finding("warning", "depth-unit", f"a median depth of {median_mm:.4g} mm looks like {unit}")]
 
 
-def _of_another_depth(full: list[tuple[int, DepthRecord]]) -> list[int]:
-    """Frames whose depth is of another order of magnitude than that of most."""
-    usual_mm = float(np.median([depth.median_mm for _, depth in full])) if full else 1.0
-    return [i for i, d in full if not 1 / _OTHER_DEPTH_TIMES < d.median_mm / usual_mm < _OTHER_DEPTH_TIMES]
-
-
-def _is_coarse(depth: DepthRecord) -> bool:
-    return not depth.is_constant and depth.distinct < _COARSE and depth.looked_at >= _COUNTED_IN
+def _is_coarse(depth: DepthFigures) -> bool:
+    return not depth.is_constant and depth.distinct < _COARSE and depth.known_count >= _COUNTED_IN
 
 
 def _missing(survey: Survey, known: list[int], what: str) -> list[Finding]:
-    """A few frames without truth are a fault; truth of a few frames is how the data set is."""
-    without = sorted({frame.index for frame in survey.frames} - set(known))
-    if not known or not without:
-        return []
-    total = len(survey.frames)
-    severity: Severity = "warning" if 2 * len(known) >= total else "info"
-    message = f"{len(without)} of {total} frames have no {what}: {_frames(without)}"
-    return [Finding(severity, f"{what}-missing", message)]
+    """Frames without truth: a fault where they are few, an info where most have none."""
+    without = sorted({frame.index for frame in survey.frames} - set(known)) if known else []
+    severity: Severity = "warning" if 2 * len(known) >= len(survey.frames) else "info"
+    message = f"{len(without)} of {len(survey.frames)} frames have no {what}: {{}}"
+    return _about(without, f"{what}-missing", message, severity)
 
 
-def _about(
-    numbers: Several[int] | np.ndarray, code: str, message: str, severity: Severity = "warning"
-) -> list[Finding]:
+def _about(numbers: Iterable[int], code: str, message: str, severity: Severity = "warning") -> list[Finding]:
     """Return one finding about the frames with these numbers, none where there are none."""
-    return [Finding(severity, code, message.format(_frames(numbers)))] if len(numbers) else []
-
-
-def _frames(numbers: Several[int] | np.ndarray) -> str:
-    if len(numbers) == 1:
-        return f"frame {numbers[0]}"
-    named = ", ".join(str(number) for number in numbers[:_NAMED])
-    return f"{len(numbers)} frames ({named}{', ...' if len(numbers) > _NAMED else ''})"
+    chosen = [int(number) for number in numbers]
+    if not chosen:
+        return []
+    named = ", ".join(map(str, chosen[:_NAMED])) + ", ..." * (len(chosen) > _NAMED)
+    frames = f"frame {chosen[0]}" if len(chosen) == 1 else f"{len(chosen)} frames ({named})"
+    return [Finding(severity, code, message.format(frames))]

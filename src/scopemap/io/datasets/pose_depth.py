@@ -1,6 +1,6 @@
 """Whether poses and depth belong together: the depth of a frame, moved by the poses, against the depth of a later one.
 
-The same is done with what the poses would be by other conventions, since a wrong one shows by fitting far better.
+The same is done with the motion that other conventions would give: a wrong convention shows by fitting far better.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ LAGS = (10, 30, 90)
 LEAST_OVERLAP = 0.2
 _KEPT_EVERY = 5
 _MOST_POINTS = 20_000
-_OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-_OTHER_HAND = np.diag([1.0, -1.0, 1.0, 1.0])
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LEFT_HANDED = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Convention:
     """One way to read a pair of poses.
 
-    code : short name. looks_like : what it says about poses that fit by it. T_b_a : the motion (4, 4) from camera a to
-    camera b of the stored poses (T_a, T_b).
+    code : of the finding. looks_like : what the poses look like that fit by it. T_b_a : the motion (4, 4) from camera a
+    to camera b of the stored poses (T_a, T_b).
     """
 
     code: str
@@ -35,38 +35,28 @@ class Convention:
     T_b_a: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def _scaled(T: np.ndarray, factor: float) -> np.ndarray:
-    scaled = T.copy()
-    scaled[:3, 3] *= factor
-    return scaled
+def _motion(T_world_a: np.ndarray, T_world_b: np.ndarray, factor: float = 1.0) -> np.ndarray:
+    """Return the motion of camera-to-world poses, its translation times `factor`."""
+    T_b_a = inverse(T_world_b) @ T_world_a
+    T_b_a[:3, 3] *= factor
+    return T_b_a
 
 
-def _motion(T_world_a: np.ndarray, T_world_b: np.ndarray) -> np.ndarray:
-    return inverse(T_world_b) @ T_world_a
-
-
-AS_GIVEN = Convention("as-given", "camera-to-world in mm", _motion)
 OTHERS = (
-    Convention("poses-inverted", "world-to-camera", lambda T_a, T_b: T_b @ inverse(T_a)),
+    Convention("poses-inverted", "world-to-camera", lambda a, b: b @ inverse(a)),
     Convention(
         "poses-opengl",
         "those of a camera with y up and z to the back (OpenGL)",
-        lambda T_a, T_b: _OTHER_AXES @ _motion(T_a, T_b) @ _OTHER_AXES,
+        lambda a, b: _OPENGL @ _motion(a, b) @ _OPENGL,
     ),
     Convention(
         "poses-mirrored",
         "left-handed (y up, as in Unity)",
-        lambda T_a, T_b: _OTHER_HAND @ _motion(T_a, T_b) @ _OTHER_HAND,
+        lambda a, b: _LEFT_HANDED @ _motion(a, b) @ _LEFT_HANDED,
     ),
-    Convention(
-        "pose-depth-unit", "metres (or the depth like micrometres)", lambda T_a, T_b: _scaled(_motion(T_a, T_b), 1000.0)
-    ),
-    Convention(
-        "pose-depth-unit", "micrometres (or the depth like metres)", lambda T_a, T_b: _scaled(_motion(T_a, T_b), 0.001)
-    ),
+    Convention("pose-depth-unit", "metres (or the depth like micrometres)", lambda a, b: _motion(a, b, 1e3)),
+    Convention("pose-depth-unit", "micrometres (or the depth like metres)", lambda a, b: _motion(a, b, 1e-3)),
 )
-_AT_REST = Convention("at-rest", "a camera at rest", lambda T_a, T_b: np.eye(4))
-_MEASURED = (AS_GIVEN, _AT_REST, *OTHERS)
 
 
 @dataclass(frozen=True)
@@ -109,11 +99,12 @@ class PoseDepthTest:
         now = self._count
         keep = now % _KEPT_EVERY == 0
         for lag in LAGS:
-            # A slow camera needs the long lags; few pairs of these do.
+            # A slow camera needs the long lags; few pairs of these suffice.
             if now and (lag == LAGS[0] or (keep and now >= lag)):
                 depth_a_mm, T_world_a = self._kept[max(now - lag, 0) // _KEPT_EVERY * _KEPT_EVERY]
                 points = self._rays * depth_a_mm[:: self._step, :: self._step, None]
-                motions = [convention.T_b_a(T_world_a, T_world_camera) for convention in _MEASURED]
+                motions = [_motion(T_world_a, T_world_camera), np.eye(4)]
+                motions += [convention.T_b_a(T_world_a, T_world_camera) for convention in OTHERS]
                 self._errors[lag].append([self._error(transform(T_b_a, points), depth_mm) for T_b_a in motions])
         if keep:
             self._kept[now] = (depth_mm, T_world_camera)
@@ -128,17 +119,13 @@ class PoseDepthTest:
     @property
     def agreements(self) -> tuple[Agreement, ...]:
         """What was found so far, by lag; nothing of lags that no pair has."""
-        found = []
-        for lag, errors in self._errors.items():
-            if errors:
-                given, at_rest, *others = np.median(errors, axis=0).tolist()
-                found.append(Agreement(lag, len(errors), given, at_rest, tuple(others)))
-        return tuple(found)
+        medians = {lag: np.median(errors, axis=0).tolist() for lag, errors in self._errors.items() if errors}
+        return tuple(Agreement(lag, len(self._errors[lag]), m[0], m[1], tuple(m[2:])) for lag, m in medians.items())
 
     def _error(self, points: np.ndarray, depth_mm: np.ndarray) -> float:
-        """Return the median relative distance along the axis of points (h, w, 3) from the depth, infinite if apart."""
+        """Return the median relative error along the axis of points (h, w, 3), infinite without enough overlap."""
         u, v = np.moveaxis(self._camera.project(points), -1, 0)
-        # OpenCV's fixed-point coordinates hold neither NaN nor what lies far outside.
+        # OpenCV's fixed-point coordinates hold neither NaN nor what is far outside.
         u, v = (np.clip(np.nan_to_num(w, nan=-9.0), -9.0, 16_000.0).astype(np.float32) for w in (u, v))
         there_mm = cv2.remap(depth_mm, u, v, cv2.INTER_LINEAR, borderValue=float("nan"))
         seen = (there_mm > 0) & np.isfinite(there_mm) & (points[..., 2] > 0)

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.io.datasets.pose_depth import Agreement, PoseDepthTest
 from scopemap.io.sequence import Sequence
@@ -22,11 +21,11 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
-class DepthRecord:
+class DepthFigures:
     """Figures of one frame's depth, lengths in mm; NaN where nothing is known.
 
     known_share : of the pixels. impossible_share : infinite, zero or negative. distinct : number of different values.
-    looked_at : number of known pixels that `distinct` was counted in.
+    known_count : number of known pixels that `distinct` was counted in.
     """
 
     known_share: float
@@ -35,7 +34,7 @@ class DepthRecord:
     median_mm: float
     farthest_mm: float
     distinct: int
-    looked_at: int
+    known_count: int
 
     @property
     def is_constant(self) -> bool:
@@ -44,12 +43,12 @@ class DepthRecord:
 
 
 @dataclass(frozen=True)
-class FrameRecord:
+class FrameFigures:
     """Figures of one frame.
 
     brightest : level, of 255, that 1 % of the pixels exceed. spread : largest standard deviation of a channel.
-    repeats : whether it shows what the frame before it shows, but for lossy coding. T_world_camera : as the source has
-    it, or None.
+    is_repeat : whether it shows what the frame before it shows, but for lossy coding. T_world_camera : as the source
+    has it, or None.
     """
 
     index: int
@@ -57,73 +56,61 @@ class FrameRecord:
     name: str
     brightest: float
     spread: float
-    repeats: bool
+    is_repeat: bool
     T_world_camera: np.ndarray | None
-    depth: DepthRecord | None
+    depth: DepthFigures | None
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What one pass over a data set found.
+    """Result of one pass over a data set.
 
     Attributes
     ----------
-    dataset : name of the reader. camera : as pinhole, of the images' size. calibrated : whether it is known.
-    camera_source : how. pixel_aspect : width of a pixel over its height.
-    announced : numbers of the frames that should be there, None where only reading on tells.
+    sequence : what was read.
     frames : what could be read.
     agreements : of poses and depth, by growing lag; empty where there are no two frames with both.
-    off : relative error of a frame's depth against that of one about 10 before it, moved by the poses, by frame number.
-    stopped : the error that ended the reading, or "". truth_faults : errors in reading poses and depth, each with the
-    first frame that it concerns.
-    notes, warnings : the source's.
+    depth_errors : relative error of a frame's depth against that of one about 10 before it, moved by the poses, by
+        frame number.
+    stopped : the error that ended the reading, or "".
+    truth_faults : errors in reading poses and depth, each with the first frame that it concerns.
     """
 
-    dataset: str
-    camera: PinholeCamera
-    calibrated: bool
-    camera_source: str
-    pixel_aspect: float
-    announced: tuple[int, ...] | None
-    frames: tuple[FrameRecord, ...]
-    agreements: tuple[Agreement, ...]
-    off: dict[int, float]
-    stopped: str
-    truth_faults: tuple[str, ...]
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    sequence: Sequence
+    frames: tuple[FrameFigures, ...]
+    agreements: tuple[Agreement, ...] = ()
+    depth_errors: dict[int, float] | None = None
+    stopped: str = ""
+    truth_faults: tuple[str, ...] = ()
 
     @property
-    def posed(self) -> list[FrameRecord]:
-        """Frames with a pose."""
-        return [frame for frame in self.frames if frame.T_world_camera is not None]
+    def announced(self) -> list[int] | None:
+        """Numbers of the frames that should be there, None where only reading on tells."""
+        stamps = self.sequence.source.stamps(self.sequence.selection)
+        return None if stamps is None else [index for index, _ in stamps]
 
     @property
-    def rigid(self) -> list[FrameRecord]:
+    def rigid(self) -> list[FrameFigures]:
         """Frames with a pose that is a rigid motion."""
-        return [frame for frame in self.posed if is_rigid(frame.T_world_camera)]
-
-    @property
-    def deep(self) -> list[FrameRecord]:
-        """Frames with depth."""
-        return [frame for frame in self.frames if frame.depth is not None]
+        return [frame for frame in self.frames if is_rigid(frame.T_world_camera)]
 
     @property
     def figures(self) -> dict[str, Any]:
         """Figures of the whole, lengths in mm; those of what is not there are left out."""
         numbers = [frame.index for frame in self.frames]
         times_s = [frame.time_s for frame in self.frames]
-        camera = self.camera
-        found: dict[str, Any] = {"dataset": self.dataset, "frames": len(numbers)}
+        camera = self.sequence.rectifier.source.central
+        found: dict[str, Any] = {"dataset": self.sequence.source.name, "frames": len(numbers)}
         if numbers:
             found |= {"first_number": min(numbers), "last_number": max(numbers), "span_s": max(times_s) - min(times_s)}
-        found |= {"width": camera.width, "height": camera.height, "camera": self.camera_source}
+        found |= {"width": camera.width, "height": camera.height, "camera": self.sequence.camera_source}
         found |= {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
-        found |= {"with_pose": len(self.posed), "with_depth": len(self.deep)}
+        found |= {"with_pose": sum(frame.T_world_camera is not None for frame in self.frames)}
+        found |= {"with_depth": sum(frame.depth is not None for frame in self.frames)}
         if self.rigid:
             positions_mm = positions_of(self.rigid)
             found |= {"path_mm": path_length_mm(positions_mm), "extent_mm": extent_mm(positions_mm)}
-        depths = [frame.depth for frame in self.deep if frame.depth is not None and frame.depth.looked_at]
+        depths = [frame.depth for frame in self.frames if frame.depth is not None and frame.depth.known_count]
         if depths:
             names = ("nearest_mm", "median_mm", "farthest_mm", "known_share")
             found |= {f"depth_{name}": float(np.median([getattr(depth, name) for depth in depths])) for name in names}
@@ -139,11 +126,11 @@ def deviation(T: np.ndarray) -> float:
 
 
 def is_rigid(T: np.ndarray | None) -> bool:
-    """Whether `T` (4, 4) is a rotation and a translation."""
+    """Return whether `T` (4, 4) is a rotation and a translation."""
     return T is not None and bool(np.isfinite(T).all() and deviation(T) <= RIGID_TOLERANCE and np.linalg.det(T) > 0)
 
 
-def positions_of(frames: list[FrameRecord]) -> np.ndarray:
+def positions_of(frames: list[FrameFigures]) -> np.ndarray:
     """Return the camera centres (N, 3), mm, of frames with a pose."""
     return np.array([frame.T_world_camera[:3, 3] for frame in frames if frame.T_world_camera is not None])
 
@@ -156,58 +143,50 @@ def extent_mm(positions_mm: np.ndarray) -> float:
 def survey(sequence: Sequence, listener: Callable[[int, int | None], None] | None = None) -> Survey:
     """Read the sequence once, frame by frame, calling `listener(frames read, frames in all or None)` after each.
 
-    What cannot be read is part of what was found: no `ScopemapError` leaves.
+    No `ScopemapError` is raised: what cannot be read is part of the result.
     """
-    source, camera = sequence.source, sequence.rectifier.source.central
-    stamps = source.stamps(sequence.selection)
     faults: dict[str, int] = {}
-    records: list[FrameRecord] = []
+    frames: list[FrameFigures] = []
     test, compared = PoseDepthTest(sequence.camera), list[int]()
     stopped = ""
     try:
-        for record in _records(sequence, test, compared, faults):
-            records.append(record)
+        for frame in _figures(sequence, test, compared, faults):
+            frames.append(frame)
             if listener is not None:
-                listener(len(records), sequence.count)
+                listener(len(frames), sequence.count)
     except ScopemapError as error:
         stopped = str(error)
-    return Survey(
-        dataset=source.name,
-        camera=camera,
-        calibrated=sequence.calibrated,
-        camera_source=sequence.camera_source,
-        pixel_aspect=source.pixel_aspect,
-        announced=None if stamps is None else tuple(index for index, _ in stamps),
-        frames=tuple(records),
-        agreements=test.agreements,
-        off=dict(zip(compared[1:], test.near_errors, strict=True)),
-        stopped=stopped,
-        truth_faults=tuple(f"frame {index}: {fault}" for fault, index in faults.items()),
-        notes=tuple(sequence.notes),
-        warnings=tuple(sequence.warnings),
-    )
+    errors = dict(zip(compared[1:], test.near_errors, strict=True))
+    truth_faults = tuple(f"frame {index}: {fault}" for fault, index in faults.items())
+    return Survey(sequence, tuple(frames), test.agreements, errors, stopped, truth_faults)
 
 
-def _records(
+def _figures(
     sequence: Sequence, test: PoseDepthTest, compared: list[int], faults: dict[str, int]
-) -> Iterator[FrameRecord]:
+) -> Iterator[FrameFigures]:
     before: np.ndarray | None = None
     for frame in sequence.source.frames(sequence.selection):
         T_world_camera, depth_mm = _truth(sequence, frame.index, faults)
-        depth = None if depth_mm is None else _depth_record(depth_mm)
-        if depth_mm is not None and depth is not None and depth.looked_at and not depth.is_constant:
+        depth = None if depth_mm is None else _depth_figures(depth_mm)
+        if (
+            depth_mm is not None
+            and depth is not None
+            and depth.known_count
+            and not depth.is_constant
+            and is_rigid(T_world_camera)
+        ):
             working_mm = _attempt(partial(sequence.depth_rectifier.nearest, depth_mm), frame.index, faults)
-            if working_mm is not None and T_world_camera is not None and is_rigid(T_world_camera):
+            if working_mm is not None and T_world_camera is not None:
                 test.add(working_mm, T_world_camera)
                 compared.append(frame.index)
-        sample = _thinned(frame.rgb)
-        yield FrameRecord(
+        sample = _subsampled(frame.rgb)
+        yield FrameFigures(
             frame.index,
             frame.time_s,
             frame.name,
             brightest=float(np.percentile(sample, 99)),
             spread=float(sample.std(axis=(0, 1)).max()),
-            repeats=before is not None and before.shape == sample.shape and is_repeat(sample, before),
+            is_repeat=before is not None and before.shape == sample.shape and is_repeat(sample, before),
             T_world_camera=T_world_camera,
             depth=depth,
         )
@@ -218,7 +197,7 @@ def _truth(sequence: Sequence, index: int, faults: dict[str, int]) -> tuple[np.n
     truth = _attempt(partial(sequence.source.truth, index), index, faults)
     if truth is not None:
         return truth.T_world_camera, truth.depth_mm
-    # Depth that cannot be read does not take the pose with it.
+    # The pose is known where only the depth cannot be read.
     return _attempt(partial(sequence.source.pose, index), index, faults), None
 
 
@@ -230,22 +209,16 @@ def _attempt(read: Callable[[], _T], index: int, faults: dict[str, int]) -> _T |
     return None
 
 
-def _depth_record(depth_mm: np.ndarray) -> DepthRecord:
-    sample = _thinned(depth_mm)
+def _depth_figures(depth_mm: np.ndarray) -> DepthFigures:
+    sample = _subsampled(depth_mm)
     stated = sample[~np.isnan(sample)]
     known = stated[np.isfinite(stated) & (stated > 0)]
-    nearest, median, farthest = np.percentile(known, (0, 50, 100)) if known.size else (np.nan,) * 3
-    return DepthRecord(
-        known_share=known.size / max(sample.size, 1),
-        impossible_share=(stated.size - known.size) / max(sample.size, 1),
-        nearest_mm=float(nearest),
-        median_mm=float(median),
-        farthest_mm=float(farthest),
-        distinct=np.unique(known).size,
-        looked_at=known.size,
-    )
+    nearest, median, farthest = np.percentile(known, (0, 50, 100)).tolist() if known.size else (np.nan,) * 3
+    size = max(sample.size, 1)
+    impossible = (stated.size - known.size) / size
+    return DepthFigures(known.size / size, impossible, nearest, median, farthest, np.unique(known).size, known.size)
 
 
-def _thinned(image: np.ndarray) -> np.ndarray:
+def _subsampled(image: np.ndarray) -> np.ndarray:
     step = max(1, int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / _MOST_PIXELS))))
     return image[::step, ::step]
