@@ -1,23 +1,22 @@
-"""The whole path on a phantom, measured against its truth: what `scopemap demo` does.
+"""Reconstructs a phantom and measures the result against its truth, for `scopemap demo`.
 
     OUT/phantom   frames, true poses, depth and surface     OUT/run   what `scopemap run` would write
     OUT/pictures  trajectory.png, mesh.png, depth.png
 
-Needs no connection and no weights but the package's own: ScopeNet's depth, DIS flow, structural similarity.
+Needs no network access and no weights but those of the package: ScopeNet's depth, DIS flow, structural similarity.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 
+from scopemap.benchmark.entry import is_rendered
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.evaluation.depth import evaluate_depth, mean_depth_report
@@ -28,31 +27,31 @@ from scopemap.io.sequence import Sequence
 from scopemap.phantom import PhantomSpec, write_phantom
 from scopemap.pipeline import Step
 from scopemap.reconstruction import Reconstruction, prepare_folder
-from scopemap.report.pictures import draw_depths, draw_mesh, draw_trajectories
+from scopemap.report.depth_figures import draw_depths
+from scopemap.report.mesh_figures import draw_mesh, draw_trajectories
 from scopemap.runner import Observer, reconstruct
 from scopemap.trajectory.formats.opening import read_trajectory
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
 """The phantom of the demonstration."""
 
-# RAFT and LPIPS would be used where their weights happen to lie; figures must not depend on that.
+# RAFT and LPIPS would be used where their weights are installed; the figures must not depend on that.
 _WITHOUT_WEIGHTS = {"networks.flow": "dis", "networks.perceptual": "structure"}
 _DRAWN_FRAMES = 4
-_MISSING = float("nan")
 
 
 @dataclass(frozen=True)
-class Figures:
-    """How far a run is from the truth; NaN where nothing could be measured.
+class DemoFigures:
+    """Errors of a run; NaN where nothing could be measured.
 
     Attributes
     ----------
-    frames, tracked : all frames and those not lost; path_mm : length of the true path.
-    ate_sim3_mm, ate_origin_mm : RMSE of the position after Sim(3), and with only the first poses put onto each other.
-    scale : factor that Sim(3) found, true over estimated.
+    frames, tracked : all frames and those not lost. path_mm : length of the true path.
+    ate_sim3_mm, ate_origin_mm : RMSE of the position after Sim(3), and with only the first poses aligned.
+    scale : factor of Sim(3), true over estimated.
     rotation_mean_deg, rotation_max_deg : rotation error since the first frame, no alignment.
     mesh_accuracy_mm, mesh_median_mm : distance of the mesh (moved by Sim(3)) to the true surface, mean and median.
-    mesh_completeness_mm : mean distance of the true surface, as far as it was seen, to the mesh.
+    mesh_completeness_mm : mean distance of the seen part of the true surface to the mesh.
     depth_abs_rel, raw_depth_abs_rel : mean relative error of refined and of raw depth, each frame scaled by its median.
     """
 
@@ -86,18 +85,25 @@ class Demonstration:
         return match(self.result.trajectory, read_trajectory(self.sequence.path), "sim3")
 
     @property
+    def aligned_mesh(self) -> trimesh.Trimesh:
+        """The reconstructed surface after Sim(3), true world mm."""
+        mesh = self.result.mesh.copy()
+        mesh.vertices = self.matched.similarity.transform_points(np.asarray(mesh.vertices))
+        return mesh
+
+    @property
     def true_mesh(self) -> trimesh.Trimesh:
         """The surface that the camera saw, true world mm."""
         return trimesh.load_mesh(self.sequence.path / "mesh_truth.ply", process=False)
 
 
 def demo_config(settings: dict[str, Any]) -> Config:
-    """Return the default preset without anything that would look for weights, then `settings` (dotted names)."""
+    """Return the default preset without optional weights, then `settings` (dotted names)."""
     return Config.load("default", settings=_WITHOUT_WEIGHTS | settings)
 
 
 def prepare_out(out: Path, *, overwrite: bool) -> None:
-    """Make the folders; an earlier demonstration's run and pictures go if `overwrite`, else `InputError`."""
+    """Make the folders. An earlier demonstration's run is removed if `overwrite`, else it is an `InputError`."""
     prepare_folder(out / "run", overwrite=overwrite)
     try:
         (out / "pictures").mkdir(exist_ok=True)
@@ -126,79 +132,51 @@ def run_on_phantom(out: Path, config: Config, observers: tuple[Observer, ...] = 
     return Demonstration(sequence, result, raw_mm, refined_mm)
 
 
-def measure(demonstration: Demonstration) -> Figures:
+def measure(demo: Demonstration) -> DemoFigures:
     """Compare poses, mesh and depth with the truth; raises `AlignmentError` where hardly a frame was tracked."""
-    matched = demonstration.matched
-    sim3 = pose_report(matched)
-    truth = read_trajectory(demonstration.sequence.path)
-    origin = pose_report(match(demonstration.result.trajectory, truth, "origin"))
-    return Figures(
+    sim3, truth = pose_report(demo.matched), read_trajectory(demo.sequence.path)
+    accuracy_mm = median_mm = completeness_mm = float("nan")
+    if len(demo.result.mesh.faces):
+        surface = compare_surfaces(demo.aligned_mesh, demo.true_mesh)
+        accuracy_mm, median_mm = surface.accuracy.mean_mm, surface.accuracy.median_mm
+        completeness_mm = surface.completeness.mean_mm
+    return DemoFigures(
         frames=sim3.frames,
         tracked=sim3.tracked,
         path_mm=truth.path_length_mm,
         ate_sim3_mm=sim3.ate_rmse_mm,
-        ate_origin_mm=origin.ate_rmse_mm,
+        ate_origin_mm=pose_report(match(demo.result.trajectory, truth, "origin")).ate_rmse_mm,
         scale=sim3.scale,
         rotation_mean_deg=sim3.rotation_unaligned_mean_deg,
         rotation_max_deg=sim3.rotation_unaligned_max_deg,
-        **_mesh_figures(demonstration, matched),
-        depth_abs_rel=_abs_rel(demonstration.sequence, demonstration.refined_mm),
-        raw_depth_abs_rel=_abs_rel(demonstration.sequence, demonstration.raw_mm),
+        mesh_accuracy_mm=accuracy_mm,
+        mesh_median_mm=median_mm,
+        mesh_completeness_mm=completeness_mm,
+        depth_abs_rel=_abs_rel(demo.sequence, demo.refined_mm),
+        raw_depth_abs_rel=_abs_rel(demo.sequence, demo.raw_mm),
     )
 
 
-def draw(demonstration: Demonstration, folder: Path) -> list[Path]:
+def draw(demo: Demonstration, folder: Path) -> list[Path]:
     """Draw trajectory.png (estimate green, truth red), mesh.png and depth.png into `folder`; return the files."""
     files = [folder / name for name in ("trajectory.png", "mesh.png", "depth.png")]
-    matched = demonstration.matched
+    matched = demo.matched
     estimate_mm = np.where(matched.tracked[:, None], matched.aligned[:, :3, 3], np.nan)
     draw_trajectories(estimate_mm, matched.reference[:, :3, 3], files[0])
-    mesh = _moved_to_truth(demonstration, matched)
-    draw_mesh(mesh, files[1], matched.reference[0], demonstration.true_mesh)
-    _draw_some_depths(demonstration, files[2])
+    draw_mesh(demo.aligned_mesh, files[1], matched.reference[0], demo.true_mesh)
+    indices = sorted(demo.raw_mm)
+    chosen = {indices[place] for place in np.linspace(0, len(indices) - 1, _DRAWN_FRAMES).astype(int)}
+    shown = [(frame, truth) for frame, truth in demo.sequence if frame.index in chosen]
+    depths: dict[str, list[np.ndarray | None]] = {
+        "raw depth": [demo.raw_mm[frame.index] for frame, _ in shown],
+        "refined depth": [demo.refined_mm[frame.index] for frame, _ in shown],
+        "true depth": [None if truth is None else truth.depth_mm for _, truth in shown],
+    }
+    draw_depths([frame.rgb for frame, _ in shown], depths, files[2])
     return files
-
-
-def is_rendered(folder: Path, spec: PhantomSpec) -> bool:
-    """Whether `folder` holds this very phantom, whole; its mesh is what is written last."""
-    try:
-        description = json.loads((folder / "phantom.json").read_text())
-    except (OSError, ValueError):
-        return False
-    wanted = json.loads(json.dumps(asdict(spec), default=str))
-    same = description.get("spec") == wanted and description.get("made_by") == f"scopemap {version('scopemap')}"
-    return same and (folder / "mesh_truth.ply").is_file()
-
-
-def _moved_to_truth(demonstration: Demonstration, matched: MatchedTrajectories) -> trimesh.Trimesh:
-    mesh = demonstration.result.mesh.copy()
-    mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
-    return mesh
-
-
-def _mesh_figures(demonstration: Demonstration, matched: MatchedTrajectories) -> dict[str, float]:
-    names = ("mesh_accuracy_mm", "mesh_median_mm", "mesh_completeness_mm")
-    if not len(demonstration.result.mesh.faces):
-        return dict.fromkeys(names, _MISSING)
-    report = compare_surfaces(_moved_to_truth(demonstration, matched), demonstration.true_mesh)
-    values = (report.accuracy.mean_mm, report.accuracy.median_mm, report.completeness.mean_mm)
-    return dict(zip(names, values, strict=True))
 
 
 def _abs_rel(sequence: Sequence, depth_mm: dict[int, np.ndarray]) -> float:
     pairs = [(depth_mm[frame.index], truth.depth_mm) for frame, truth in sequence if truth is not None]
     reports = [evaluate_depth(found, true, scaling="median") for found, true in pairs if true is not None]
     return mean_depth_report(reports).abs_rel
-
-
-def _draw_some_depths(demonstration: Demonstration, file: Path) -> None:
-    indices = np.array(sorted(demonstration.raw_mm))
-    chosen = indices[np.linspace(0, len(indices) - 1, min(_DRAWN_FRAMES, len(indices))).astype(int)].tolist()
-    shown = [(frame, truth) for frame, truth in demonstration.sequence if frame.index in chosen]
-    draw_depths(
-        [frame.rgb for frame, _ in shown],
-        [demonstration.raw_mm[frame.index] for frame, _ in shown],
-        [demonstration.refined_mm[frame.index] for frame, _ in shown],
-        [None if truth is None else truth.depth_mm for _, truth in shown],
-        file,
-    )

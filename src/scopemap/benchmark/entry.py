@@ -1,10 +1,11 @@
-"""Entry: one method on one sequence with one seed, as it is handed to a process of its own."""
+"""Entry: one method on one sequence with one seed, the unit that a process of its own runs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,16 +17,17 @@ from scopemap.config import Config
 from scopemap.errors import SettingsError
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
+from scopemap.phantom import PhantomSpec, write_phantom
 
 FILE_NAME = "entry.json"
 
 
 class Entry(BaseModel):
-    """One row-to-be.
+    """One row of a benchmark before it is run.
 
     Attributes
     ----------
-    sequence, method, protocol, settings, seed : of the plan. data : the folder that --data names.
+    sequence, method, protocol, settings, seed : of the plan. data : the folder of --data.
     out : the benchmark's folder.
     """
 
@@ -41,31 +43,36 @@ class Entry(BaseModel):
 
     @property
     def label(self) -> str:
-        """Name for people and, made safe, for folders: the seed stands in it where it is not 0."""
+        """Name of the sequence, with the seed where it is not 0."""
         return self.sequence.name + (f", seed {self.seed}" if self.seed else "")
 
     @property
     def folder(self) -> Path:
-        """Where the run is kept."""
+        """Folder of entry.json, result.json and log.txt."""
         return self.out / "runs" / folder_name(self.label) / folder_name(self.method.name)
 
     @property
+    def run_folder(self) -> Path:
+        """Folder of the run's own files."""
+        return self.folder / "run"
+
+    @property
     def source(self) -> Path:
-        """The sequence's own folder or file; a phantom's is made below `out`."""
+        """Folder or file of the sequence; a phantom is rendered below `out`."""
         if self.sequence.phantom is not None:
             return self.out / "phantoms" / folder_name(self.label)
         return _below(self.data, self.sequence.path)
 
     @property
     def flows(self) -> Path:
-        """Where flow is kept for all methods; a sequence that the plan describes otherwise has another place."""
+        """Folder of the flow that all methods of this sequence are measured with."""
         return self.out / "flows" / f"{folder_name(self.label)}-{_digest([self.sequence.model_dump(mode='json')])[:8]}"
 
     @property
     def key(self) -> str:
-        """Fingerprint of all that decides the figures but the code: the plan's words, and the files that it names.
+        """Fingerprint of everything that decides the figures but the code: the plan, and the files that it names.
 
-        A file or folder stands for its content by its size and time. Another --data with the same files is the same.
+        A file or folder is represented by its size and time; the folder of --data itself does not count.
         """
         described = self.model_dump(mode="json", exclude={"out", "data"})
         named = [self.method.files.format(sequence=self.sequence.name, seed=self.seed), self.sequence.camera or ""]
@@ -76,34 +83,42 @@ class Entry(BaseModel):
     def open(self) -> Sequence:
         """Open the sequence; raises as `open_sequence`."""
         plan = self.sequence
-        camera = None if plan.camera is None else _below(self.data, plan.camera)
-        frames = None if plan.frames is None else slice(*plan.frames)
-        settings = Config.load(settings=self.settings | plan.settings).input
         return open_sequence(
-            self.source, dataset=plan.dataset, camera=camera, size=plan.size, frames=frames, settings=settings
+            self.source,
+            dataset=plan.dataset,
+            camera=None if plan.camera is None else _below(self.data, plan.camera),
+            size=plan.size,
+            frames=None if plan.frames is None else slice(*plan.frames),
+            settings=Config.load(settings=self.settings | plan.settings).input,
         )
 
     def shared_settings(self) -> dict[str, Any]:
-        """Return the settings that all methods are given on this sequence."""
+        """Return the settings that all methods get on this sequence."""
         settings = self.settings | self.sequence.settings
         kind, _, folder = self.sequence.depth.partition(":")
         if kind == "true":
-            # C3VDv2 and EndoGSLAM keep depth apart; 8 bit is depth, too, when it is the truth.
+            # C3VDv2 and EndoGSLAM keep depth in a folder of its own; 8-bit true depth is depth, not disparity.
             frames = self.source if self.sequence.phantom is not None else self.open().path
-            apart = frames / "depth"
-            settings |= {"depth.backend": f"files:{apart if apart.is_dir() else frames}"}
-            settings |= {"depth.files_kind": "measured"}
+            depth = frames / "depth" if (frames / "depth").is_dir() else frames
+            settings |= {"depth.backend": f"files:{depth}", "depth.files_kind": "measured"}
         elif kind == "files":
             settings["depth.backend"] = f"files:{_below(self.data, folder)}"
         elif kind:
             settings["depth.backend"] = self.sequence.depth
         if kind:
-            # A preset may ask for a metric network: the depth that a plan names stands for itself.
+            # A preset may ask for a metric network: the plan's depth is used without one.
             settings.setdefault("depth.anchor", "auto")
         if self.sequence.near_far_mm is not None:
             settings |= {"depth.near_far_mm": self.sequence.near_far_mm, "depth.anchor": "near-far"}
         Config.load(settings=settings)
         return settings
+
+    def render_phantom(self) -> None:
+        """Render the sequence's phantom, if it is one, unless an earlier entry did."""
+        if self.sequence.phantom is not None:
+            spec = spec_of(self.sequence.phantom, self.seed, self.data)
+            if not is_rendered(self.source, spec):
+                write_phantom(spec, self.source)
 
     def save(self) -> Path:
         """Write the entry into its folder and return the file."""
@@ -119,11 +134,11 @@ class Entry(BaseModel):
 
 
 def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out: Path) -> Iterator[Entry]:
-    """Yield the plan's rows, sequence by sequence; seeds beyond the first make sense where something is random."""
+    """Yield the plan's entries, sequence by sequence; further seeds only where something depends on the seed."""
     for sequence in sequences:
         for seed in plan.seeds:
             for method in plan.method:
-                if seed == plan.seeds[0] or _depends_on_seed(sequence, method):
+                if seed == plan.seeds[0] or sequence.phantom is not None or "{seed}" in method.files:
                     yield Entry(
                         sequence=sequence,
                         method=method,
@@ -135,20 +150,19 @@ def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out
                     )
 
 
-def render_phantom(entry: Entry) -> None:
-    """Render the phantom of an entry, unless an earlier row did so."""
-    from scopemap.benchmark.demonstration import is_rendered
-    from scopemap.phantom import write_phantom
-
-    if entry.sequence.phantom is None:
-        return
-    spec = spec_of(entry.sequence.phantom, entry.seed, entry.data)
-    if not is_rendered(entry.source, spec):
-        write_phantom(spec, entry.source)
+def is_rendered(folder: Path, spec: PhantomSpec) -> bool:
+    """Whether `folder` holds the phantom of `spec`, complete; its mesh is written last."""
+    try:
+        description = json.loads((folder / "phantom.json").read_text())
+    except (OSError, ValueError):
+        return False
+    wanted = json.loads(json.dumps(asdict(spec), default=str))
+    same = description.get("spec") == wanted and description.get("made_by") == f"scopemap {version('scopemap')}"
+    return same and (folder / "mesh_truth.ply").is_file()
 
 
 def _stamp(path: Path) -> list[int]:
-    """Return size and time of a file, or number, size and latest time of the files in a folder; [] for neither."""
+    """Return number, size and latest time of a file or of the files in a folder; [] where there is none."""
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     stats = [file.stat() for file in files]
     return [len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)] if stats else []
@@ -158,11 +172,7 @@ def _digest(tree: Any) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
 
 
-def _depends_on_seed(sequence: SequencePlan, method: MethodPlan) -> bool:
-    return sequence.phantom is not None or "{seed}" in method.files
-
-
 def _below(data: Path | None, path: str) -> Path:
     if data is None:
-        raise SettingsError(f"'{path}' lies below the folder that --data names: give it")
+        raise SettingsError(f"give --data, the folder of '{path}'")
     return data / path

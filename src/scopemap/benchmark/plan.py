@@ -1,35 +1,4 @@
-"""A benchmark's plan: which sequences, which methods, how they are scored; read from TOML.
-
-title = "colonoscopy"
-seeds = [0]
-
-[protocol]
-align = "sim3"
-
-[settings]                      # shared by all methods
-"fusion.voxel_mm" = 1.0
-
-[[sequence]]
-name = "cecum_t1_a"
-path = "c3vd/cecum_t1_a"        # below the folder that --data names; may hold * and ?
-depth = "files:c3vd/cecum_t1_a_depth_anything"
-near_far_mm = [13.5, 100.0]
-
-[[sequence]]
-name = "colon"
-phantom = { scene = "colon", frames = 90 }   # rendered with each seed
-depth = "true"
-
-method_sets = ["odometries"]    # methods that come with scopemap; more can follow
-
-[[method]]
-name = "ours, Gauss-Newton"
-settings = { "tracking.solver" = "gauss-newton" }
-
-[[method]]
-name = "Park"
-use = "park"
-"""
+"""Plan of a benchmark: which sequences, which methods, how runs are scored; read from TOML (docs/benchmark.md)."""
 
 from __future__ import annotations
 
@@ -56,7 +25,7 @@ _PLANS, _METHOD_SETS = "plans", "method_sets"
 
 
 class _Part(BaseModel):
-    """A table of the plan: frozen, no unknown key."""
+    """A part of the plan: frozen, unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -66,12 +35,13 @@ class ProtocolPlan(_Part):
 
     Attributes
     ----------
-    align : of the trajectory; mesh and depth in mm follow it where they are compared with the truth.
-    protocols : named protocols of other papers that are computed beside ours (`evaluation.protocols.PROTOCOLS`).
-    surface, depth, consistency : whether these are measured, where there is a truth for them. icp : the mesh also after
-        a refinement by ICP. flow : for consistency, the same for all methods, named as `networks.flow`.
-    depth_scaling : of predicted depth before it is compared with true depth.
-    depth_range_mm : of true depth that counts; clip_depth : whether predicted depth is then clipped to it.
+    align : alignment of the trajectory, also applied to mesh and depth in mm.
+    protocols : protocols of other papers, measured as well (`evaluation.protocols.PROTOCOLS`).
+    surface, depth, consistency : whether these are measured, where there is a truth for them.
+    icp : measure the mesh also after a refinement by ICP.
+    flow : for consistency, the same for all methods, named as `networks.flow`.
+    depth_scaling : scaling of predicted depth before it is compared with true depth.
+    depth_range_mm : range of true depth that counts. clip_depth : whether predicted depth is clipped to it.
     """
 
     align: AlignMode = "sim3"
@@ -100,14 +70,14 @@ class SequencePlan(_Part):
 
     Attributes
     ----------
-    name : for tables; of a pattern's finds, what stands before their path below the data folder.
+    name : for tables; before the path of each sequence that a pattern finds.
     path : below the data folder. A pattern finds folders and videos, with `dataset` only those that its reader knows.
-    phantom : settings of a `PhantomSpec` instead of a path; its `path_file` lies below the data folder, its `seed` is
+    phantom : settings of a `PhantomSpec` instead of a path; its `path_file` is below the data folder, its `seed` is
         added to the benchmark's.
     dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].
-    depth : "" as the settings say; "true" the depth files of a C3VD, 7-Scenes or phantom folder; "files:FOLDER" below
-        the data folder; else a name that `depth.backend` knows.
-    near_far_mm : metric anchor of the first frame. align : instead of the protocol's.
+    depth : "": from the settings; "true": the depth files of a C3VD, 7-Scenes or phantom folder; "files:FOLDER" below
+        the data folder; else a name of `depth.backend`.
+    near_far_mm : metric anchor of the first frame. align : replaces the protocol's.
     settings : dotted names to values, for this sequence.
     """
 
@@ -141,9 +111,9 @@ class MethodPlan(_Part):
 
     Attributes
     ----------
-    name : for tables and folders. use : which (`benchmark.methods.registry.METHODS`).
+    name : for tables and folders. use : "scopemap", "import", or a baseline (`benchmark.methods.registry.BASELINES`).
     preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
-    files : of `use = "import"`: trajectory below the data folder, with {sequence} and {seed} where they belong.
+    files : of `use = "import"`: trajectory below the data folder; may hold {sequence} and {seed}.
     unit, kind : of these files.
     """
 
@@ -206,43 +176,46 @@ def shipped_plans() -> list[str]:
 
 
 def found_sequences(plan: Plan, data: Path | None) -> tuple[list[SequencePlan], list[str]]:
-    """Return the plan's sequences with patterns replaced by what they find, and a line for each that is not there.
+    """Return the plan's sequences with patterns replaced by what they find, and a note for each that is missing.
 
-    Raises `InputError` where none is.
+    Raises `InputError` where all are missing.
     """
     found: list[SequencePlan] = []
     missing: list[str] = []
     for sequence in plan.sequence:
         if sequence.phantom is not None:
             found.append(sequence)
-            continue
-        if data is None:
+        elif data is None:
             missing.append(f"{sequence.path}: needs --data, the folder that holds it")
-            continue
-        places = _places(sequence, data)
-        if not places:
-            missing.append(f"{sequence.path}: nothing like that in {data}")
-        for place in places:
-            path = place.relative_to(data).as_posix() if place.is_relative_to(data) else str(place)
-            exact = path == sequence.path
-            name = sequence.name if exact and sequence.name else " ".join(filter(None, (sequence.name, path)))
-            found.append(sequence.model_copy(update={"path": path, "name": name}))
+        else:
+            matches = _matches(sequence, data)
+            found += [_at(sequence, path, data) for path in matches]
+            missing += [] if matches else [f"{sequence.path}: nothing like that in {data}"]
     if not found:
         raise InputError(f"no sequence of the plan '{plan.title}' is there: {missing[0]}")
     return found, missing
 
 
-def _places(sequence: SequencePlan, data: Path) -> list[Path]:
-    """Return the path itself if it is there, else what it finds as a pattern."""
+def _at(sequence: SequencePlan, path: Path, data: Path) -> SequencePlan:
+    below = path.relative_to(data).as_posix() if path.is_relative_to(data) else str(path)
+    named = sequence.name and below == sequence.path
+    name = sequence.name if named else " ".join(filter(None, (sequence.name, below)))
+    return sequence.model_copy(update={"path": below, "name": name})
+
+
+def _matches(sequence: SequencePlan, data: Path) -> list[Path]:
+    """Return the path itself if it exists, else the folders and videos that it finds as a pattern."""
     if (data / sequence.path).exists():
         return [data / sequence.path]
     if Path(sequence.path).is_absolute():
         return []
-    places = [p for p in sorted(data.glob(sequence.path)) if p.is_dir() or _is_video(p)]
+    paths = [p for p in sorted(data.glob(sequence.path)) if p.is_dir() or _is_video(p)]
     if sequence.dataset is None:
-        return places
-    knows = DATASETS[sequence.dataset].recognises
-    return [p for p in places if knows(p) or (p.is_dir() and any(map(knows, filter(Path.is_dir, p.iterdir()))))]
+        return paths
+    recognises = DATASETS[sequence.dataset].recognises
+    return [
+        p for p in paths if recognises(p) or (p.is_dir() and any(map(recognises, filter(Path.is_dir, p.iterdir()))))
+    ]
 
 
 def _is_video(path: Path) -> bool:
@@ -250,7 +223,7 @@ def _is_video(path: Path) -> bool:
 
 
 def spec_of(phantom: dict[str, Any], seed: int, data: Path | None = None) -> PhantomSpec:
-    """Return what a plan's phantom is, its seed moved by `seed`; raises `SettingsError`."""
+    """Return the phantom of a plan, `seed` added to its own; raises `SettingsError`."""
     settings = dict(phantom)
     events = parse_events(str(settings.pop("events", "")))
     if "path_file" in settings and data is not None:

@@ -1,4 +1,4 @@
-"""RunResult: what one method reached on one sequence, as it is kept in `result.json` of the run's folder."""
+"""RunResult: the figures of one method on one sequence, kept as `result.json` in the run's folder."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from typing import Any, Literal
 from scopemap.errors import InputError
 
 FILE_NAME = "result.json"
-Status = Literal["done", "failed"]
+Figures = dict[str, dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """One row of the benchmark.
+    """One row of a benchmark.
 
     Attributes
     ----------
-    sequence, method, seed : what was run; names as the plan gives them.
-    status : "failed" where the method died; `error` then says how, in one line.
+    sequence, method, seed : what was run; names as in the plan.
+    status : "failed" where the method died; `error` is the reason, in one line.
     figures : groups of figures by name: "poses" (the keys of `PoseReport`), "paper" (`PaperReport`), "depth",
         "consistency", "surface", and one group per named protocol. A group that could not be measured is absent, a
-        figure that could not be is NaN (null in the file).
-    timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; the only part that two runs of
-        the same plan do not share.
-    facts : where it was run and with what: machine, commit, versions, settings, alignment, quality of the truth.
+        figure that could not be measured is NaN (null in the file).
+    timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; two runs of the same plan may
+        differ here and nowhere else.
+    facts : machine, commit, versions, settings, alignment, quality of the truth.
     """
 
     sequence: str
     method: str
     seed: int = 0
-    status: Status = "done"
+    status: Literal["done", "failed"] = "done"
     error: str = ""
-    figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    figures: Figures = field(default_factory=dict)
     timing: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
 
     def figure(self, group: str, name: str) -> float:
-        """Return one figure, of a part as "part.name"; NaN where it is absent or could not be measured."""
+        """Return one figure, a nested one as "part.name"; NaN where it is absent or was not measured."""
         value: Any = self.figures.get(group, {})
         for part in name.split("."):
             value = value.get(part) if isinstance(value, dict) else None
@@ -49,7 +49,7 @@ class RunResult:
     def save(self, folder: Path) -> None:
         """Write `result.json`; the file appears whole or not at all."""
         draft = Path(folder) / f"{FILE_NAME}.part"
-        draft.write_text(json.dumps(_nan_to_null(asdict(self)), indent=2) + "\n", encoding="utf-8")
+        draft.write_text(json.dumps(without_nan(asdict(self)), indent=2) + "\n", encoding="utf-8")
         draft.replace(Path(folder) / FILE_NAME)
 
     @classmethod
@@ -62,9 +62,10 @@ class RunResult:
             raise InputError(f"cannot read the result of a benchmark run {path}: {error}") from None
 
 
-def _nan_to_null(tree: Any) -> Any:
+def without_nan(tree: Any) -> Any:
+    """Return nested dictionaries and lists with None for numbers that are not finite, which JSON does not have."""
     if isinstance(tree, dict):
-        return {key: _nan_to_null(value) for key, value in tree.items()}
+        return {key: without_nan(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
-        return [_nan_to_null(value) for value in tree]
+        return [without_nan(value) for value in tree]
     return None if isinstance(tree, float) and not math.isfinite(tree) else tree

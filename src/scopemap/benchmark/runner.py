@@ -1,34 +1,44 @@
-"""Runs a plan: every entry in a process of its own, resumable, and a method that dies is a row that says so.
+"""Runs a plan: each entry in a process of its own, with a time limit. A second call continues an interrupted one.
 
-OUT/plan.json    OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/
-OUT/tables/      OUT/figures/     OUT/results.md
+OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/
+
+A method may use all memory, crash in foreign code or call exit: its row says so and the benchmark continues. The
+process of an entry is `python -m scopemap.benchmark.runner ENTRY.json`, so peak memory is its own.
 """
 
 from __future__ import annotations
 
+import math
+import os
+import platform
 import shutil
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import TextIO
+from typing import Any
 
 from scopemap.benchmark.entry import Entry, entries_of
+from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences
 from scopemap.benchmark.result import FILE_NAME, RunResult
-from scopemap.benchmark.worker import RUN, failed, source_commit
-from scopemap.errors import InputError, SettingsError
+from scopemap.benchmark.scoring import score
+from scopemap.errors import InputError, ScopemapError, SettingsError
+from scopemap.io.sequence import Sequence
 
 Listener = Callable[[Entry, RunResult, bool], None]
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What a plan gave: its entries in order with their results, and what there is to say of them."""
+    """The entries of a plan in order, their results, and notes on both."""
 
     plan: Plan
     entries: list[Entry]
@@ -45,33 +55,72 @@ def run_plan(
     listener: Listener | None = None,
     timeout_s: float | None = None,
 ) -> Benchmark:
-    """Run what is not done yet and return all rows.
+    """Run the entries that are not done yet and return all rows.
 
-    A row is done when its `result.json` bears the fingerprint of the entry: settings, sequence, method, protocol, seed.
-    Failed rows are kept, too, unless `retry`. `listener` is told of each row, and whether it was there already.
-    `timeout_s` ends a method that takes longer; it fails.
+    An entry is done when its `result.json` has its fingerprint: settings, sequence, method, protocol, seed. Failed rows
+    are kept, too, unless `retry`. `listener` is called with each row, and whether it was kept. A method that takes
+    longer than `timeout_s` is ended and fails.
 
-    Raises `InputError` where no sequence is there or `out` cannot be written.
+    Raises `InputError` where no sequence is found or `out` cannot be written.
     """
-    out = Path(out).resolve()
-    sequences, notes = found_sequences(plan, None if data is None else Path(data).resolve())
+    out, data = Path(out).resolve(), None if data is None else Path(data).resolve()
+    sequences, notes = found_sequences(plan, data)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write a benchmark to {out}: {error.strerror or error}") from None
-    results, entries = [], list(entries_of(plan, sequences, None if data is None else Path(data).resolve(), out))
+    entries = list(entries_of(plan, sequences, data, out))
     _check(plan, entries, data)
+    results = []
     for entry in entries:
-        known = _known(entry, retry=retry)
-        result = known or _isolated(entry, timeout_s)
-        results.append(result)
+        kept = _kept(entry, retry=retry)
+        results.append(kept or _run_in_process(entry, timeout_s))
         if listener:
-            listener(entry, result, known is not None)
-    return Benchmark(plan, entries, results, notes + _mixed(results))
+            listener(entry, results[-1], kept is not None)
+    return Benchmark(plan, entries, results, notes + _commits_note(results))
+
+
+def run_entry(entry: Entry) -> RunResult:
+    """Run a method on its sequence in this process, score it, and return the row; a `ScopemapError` is a failed row."""
+    try:
+        entry.render_phantom()
+        sequence = entry.open()
+        method = create_method(entry.method, entry.data)
+        task = Task(sequence, entry.shared_settings(), entry.seed, entry.sequence.name)
+        timing = method.run(task, entry.run_folder)
+        memory_mb = _peak_memory_mb()
+        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
+    except ScopemapError as error:
+        return _failed(entry, str(error))
+    return RunResult(
+        entry.label,
+        entry.method.name,
+        entry.seed,
+        figures=figures,
+        timing=_timing(timing) | {"peak_memory_mb": memory_mb},
+        facts=_facts(entry) | {"truth": _quality_of_truth(sequence)},
+    )
+
+
+def worker_command(file: Path) -> list[str]:
+    """Return the command that runs the entry in `file`."""
+    return [sys.executable, "-m", "scopemap.benchmark.runner", str(file)]
+
+
+def end_with_parent() -> None:
+    """End this process soon after the process that started it: nobody would read the row."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        signal.raise_signal(signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _check(plan: Plan, entries: list[Entry], data: Path | None) -> None:
-    """Raise `SettingsError` before anything runs for what would fail in every row, or let rows overwrite each other."""
+    """Raise `SettingsError` before anything runs for unknown methods and for two entries with one folder."""
     for method in plan.method:
         create_method(method, data)
     folders = Counter(entry.folder for entry in entries)
@@ -83,8 +132,8 @@ def _check(plan: Plan, entries: list[Entry], data: Path | None) -> None:
             )
 
 
-def _known(entry: Entry, *, retry: bool) -> RunResult | None:
-    """Return the row that an earlier run of the plan left, if it is this one."""
+def _kept(entry: Entry, *, retry: bool) -> RunResult | None:
+    """Return the row of an earlier call, if it belongs to this entry."""
     try:
         result = RunResult.load(entry.folder)
     except InputError:  # none, or a damaged one
@@ -93,55 +142,94 @@ def _known(entry: Entry, *, retry: bool) -> RunResult | None:
     return None if stale else result
 
 
-def _isolated(entry: Entry, timeout_s: float | None) -> RunResult:
-    """Run an entry in a process of its own; whatever becomes of it, there is a row."""
+def _run_in_process(entry: Entry, timeout_s: float | None) -> RunResult:
+    """Run an entry in a process of its own and return its row, whatever happens to the process."""
     (entry.folder / FILE_NAME).unlink(missing_ok=True)
-    # What an interrupted run left would be refused, or be taken for this one's.
-    shutil.rmtree(entry.folder / RUN, ignore_errors=True)
-    file = entry.save()
-    log = entry.folder / "log.txt"
+    shutil.rmtree(entry.run_folder, ignore_errors=True)
+    command, log = worker_command(entry.save()), entry.folder / "log.txt"
     with log.open("w", encoding="utf-8") as output:
-        code = _run_worker(file, output, timeout_s)
-    # A row that was saved stands, even if foreign code crashed while the process came to its end.
-    if (entry.folder / FILE_NAME).is_file():
-        return RunResult.load(entry.folder)
-    fault = f"took longer than {timeout_s:g} s" if code is None else "" if code == 0 else _cause(code, log)
-    result = failed(entry, fault or "ended without a result")
-    result.save(entry.folder)
-    return result
-
-
-def worker_command(file: Path) -> list[str]:
-    """Return the command that runs the entry in `file`."""
-    return [sys.executable, "-m", "scopemap.benchmark.worker", str(file)]
-
-
-def _run_worker(file: Path, output: TextIO, timeout_s: float | None) -> int | None:
-    """Return the worker's exit code, None where it had to be ended; it ends by itself when this process does."""
-    # The open end of this pipe is how the worker knows that somebody still waits for it.
-    with subprocess.Popen(
-        worker_command(file), stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
-    ) as worker:
         try:
-            return worker.wait(timeout_s)
+            code = subprocess.run(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, timeout=timeout_s
+            ).returncode
+            error = _cause(code, log) if code else "ended without a result"
         except subprocess.TimeoutExpired:
-            return None
-        finally:
-            if worker.poll() is None:
-                worker.kill()
+            error = f"took longer than {timeout_s:g} s"
+    # A saved row is valid even if foreign code crashed at the end of the process.
+    if not (entry.folder / FILE_NAME).is_file():
+        _failed(entry, error).save(entry.folder)
+    return RunResult.load(entry.folder)
 
 
 def _cause(code: int, log: Path) -> str:
     if code < 0:
-        name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
-        return f"killed by {name}"
+        return f"killed by {signal.Signals(-code).name}"
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else f"ended with exit code {code}"
 
 
-def _mixed(results: list[RunResult]) -> list[str]:
-    """Say so where rows were made by other code than this: figures of two commits are no comparison."""
+def _failed(entry: Entry, error: str) -> RunResult:
+    return RunResult(entry.label, entry.method.name, entry.seed, "failed", error, facts=_facts(entry))
+
+
+def _facts(entry: Entry) -> dict[str, Any]:
+    """Return where and with what an entry is run."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {
+        "key": entry.key,
+        "align": entry.sequence.align or entry.protocol.align,
+        "versions": {name: version(name) for name in ("scopemap", "numpy", "torch", "numba")},
+        "commit": source_commit(),
+        "machine": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores",
+    }
+
+
+def _quality_of_truth(sequence: Sequence) -> str:
+    """Return the source of the true poses ("exact", "kinematic", ...), "" where there are none."""
+    stamps = sequence.source.stamps(sequence.selection)
+    truth = sequence.source.truth(stamps[0][0]) if stamps else None
+    return truth.quality if truth else ""
+
+
+def _timing(timing: Timing) -> dict[str, float]:
+    stages = {f"seconds_{stage.replace(' ', '_')}": seconds for stage, seconds in timing.seconds.items()}
+    return {"ms_per_frame": timing.ms_per_frame, "track_ms_per_frame": timing.track_ms_per_frame, **stages}
+
+
+def _peak_memory_mb() -> float:
+    """Return the peak memory of this process, MB; NaN where the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return math.nan
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def source_commit() -> str:
+    """Return the commit of the source tree of this package, "+" where it was changed; "" where it is in none."""
+    try:
+        # The package may be installed inside another project's repository, whose commits say nothing of it.
+        _git("ls-files", "--error-unmatch", Path(__file__).name)
+        return _git("describe", "--always", "--abbrev=10", "--dirty=+", "--exclude=*")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _git(*arguments: str) -> str:
+    folder = Path(__file__).resolve().parent
+    return subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _commits_note(results: list[RunResult]) -> list[str]:
+    """Return a note where rows come from different commits: their figures do not compare."""
     commits = sorted({str(result.facts.get("commit", "")) for result in results} | {source_commit()})
     if len(commits) < 2:
         return []
-    return [f"rows come from different commits of scopemap ({', '.join(commits)}); a new --out folder redoes all"]
+    return [f"rows come from different commits of scopemap ({', '.join(commits)}); a new --out folder runs all again"]
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    given = Entry.load(Path(sys.argv[1]))
+    run_entry(given).save(given.folder)

@@ -1,17 +1,17 @@
-"""One run's folder against the truth of its sequence: the same figures for every method."""
+"""Scores a run's folder against the truth of its sequence: the same figures for every method."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 
-from scopemap.benchmark.flow_store import FlowStore
 from scopemap.benchmark.plan import ProtocolPlan
+from scopemap.benchmark.result import Figures
 from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
@@ -23,7 +23,9 @@ from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
 from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
+from scopemap.flow.consistency import pair_flow
 from scopemap.flow.create import create_flow
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.geometry.align import AlignMode, Similarity
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
@@ -33,7 +35,7 @@ from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 
-Figures = dict[str, dict[str, Any]]
+_CONSISTENCY_PX = 1.0
 _MOST_VIEWS = 40
 
 
@@ -44,11 +46,10 @@ def score(
     align: AlignMode | None = None,
     flows: Path | None = None,
 ) -> Figures:
-    """Return all figures that the truth of a sequence gives for a run's folder, by group.
+    """Return all figures of a run's folder that the truth of its sequence allows, by group.
 
-    `align` takes the place of the protocol's; `flows` is a folder in which flow is kept for the next method. Groups
-    without a truth are left out. A trajectory that cannot be aligned (too few frames tracked) has "poses" with what can
-    be said without.
+    `align` replaces the protocol's; `flows` is a folder that keeps the flow for the next method. A group without a
+    truth is left out. A trajectory that cannot be aligned (too few frames tracked) has "poses" without errors.
     """
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
@@ -56,37 +57,36 @@ def score(
         surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
         figures |= {"surface": surface} if surface else {}
     depth = DepthReader(folder)
-    if depth.present:
-        if protocol.depth:
-            figures |= _depth(depth, sequence, protocol)
-        if protocol.consistency:
-            figures |= _consistency(depth, sequence, estimate, protocol, flows)
+    if depth.present and protocol.depth:
+        figures |= _depth(depth, sequence, protocol)
+    if depth.present and protocol.consistency:
+        figures |= _consistency(depth, sequence, estimate, protocol, flows)
     return figures
 
 
 def pose_groups(
     estimate: Trajectory, reference: Trajectory | None, protocol: ProtocolPlan, align: AlignMode
 ) -> tuple[Figures, MatchedTrajectories | None]:
-    """Return "poses", "paper" and the named protocols' groups, and the alignment; without one only what needs none."""
-    figures: Figures = {"poses": _without_truth(estimate.tracked)}
-    # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the common start.
+    """Return "poses", "paper" and the named protocols' groups, and the alignment.
+
+    Without an alignment, "poses" holds the figures that need no truth, by the names of `PoseReport`.
+    """
     matched = None
     if reference is not None:
+        # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
         matched = _matched(estimate, reference, align) or _matched(estimate, reference, "origin")
     if matched is None or reference is None:
-        return figures, None
-    figures |= {"poses": asdict(pose_report(matched)), "paper": paper_figures(matched)}
-    return figures | _by_protocols(estimate, reference, protocol.protocols), matched
-
-
-def _without_truth(tracked: np.ndarray) -> dict[str, Any]:
-    """Return what a run says of itself; the names are those of `PoseReport`."""
-    return {
-        "frames": len(tracked),
-        "tracked": int(np.count_nonzero(tracked)),
-        "longest_tracked": longest_run(tracked),
-        "frames_until_loss": frames_until_loss(tracked),
-    }
+        tracked = estimate.tracked
+        own = {"frames": len(tracked), "tracked": int(np.count_nonzero(tracked))}
+        own |= {"longest_tracked": longest_run(tracked), "frames_until_loss": frames_until_loss(tracked)}
+        return {"poses": own}, None
+    figures: Figures = {"poses": asdict(pose_report(matched)), "paper": paper_figures(matched)}
+    for name in protocol.protocols:
+        # A protocol's own fit may fail where ours does not: then it has no figures.
+        with suppress(AlignmentError):
+            report = PROTOCOLS[name](estimate, reference)
+            figures[name] = report.figures | {"description": report.description, "source": report.source}
+    return figures, matched
 
 
 def _matched(estimate: Trajectory, reference: Trajectory, align: AlignMode) -> MatchedTrajectories | None:
@@ -96,24 +96,13 @@ def _matched(estimate: Trajectory, reference: Trajectory, align: AlignMode) -> M
         return None
 
 
-def _by_protocols(estimate: Trajectory, reference: Trajectory, names: tuple[str, ...]) -> Figures:
-    figures: Figures = {}
-    for name in names:
-        try:
-            report = PROTOCOLS[name](estimate, reference)
-            figures[name] = report.figures | {"description": report.description, "source": report.source}
-        except AlignmentError:  # a protocol's own fit may fail where ours does not: then it has no figure
-            continue
-    return figures
-
-
 def surface_figures_of(
     run: Path, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
 ) -> dict[str, float]:
-    """Return the figures of a run's mesh.ply against the true surface in a data set's folder; {} where there is none.
+    """Return the figures of a run's mesh.ply against the true surface of a data set; {} where there is none.
 
-    With a sequence, the part of the true surface that its views show is found, where the data set does not say it
-    itself. `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
+    With a sequence, the part of the true surface that its views show is found, where the data set does not state it.
+    `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
     """
     file = run / "mesh.ply"
     true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
@@ -122,7 +111,7 @@ def surface_figures_of(
     try:
         mesh = trimesh.load_mesh(file, process=False)
         moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
-    except Exception as error:  # the readers of mesh files raise whatever their parsers raise
+    except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"cannot read the mesh {file}: {error}") from error
     camera = None
     if true_surface.T_view is not None:
@@ -131,24 +120,30 @@ def surface_figures_of(
 
 
 def _seen_surface(sequence: Sequence) -> TrueSurface | None:
+    """Return the true surface with the part that the sequence's frames show."""
     surface = read_true_surface(sequence.path)
-    every = sequence.selection == slice(None)
-    # What a data set calls seen holds for its whole clip.
-    if surface is None or (surface.seen is not None and every) or surface.T_view is not None:
+    whole_clip = sequence.selection == slice(None)
+    # What a data set states as seen is valid for its whole clip.
+    if surface is None or (surface.seen is not None and whole_clip) or surface.T_view is not None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
     chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MOST_VIEWS))]}
-    truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
-    views = {t.index: (t.T_world_camera, t.depth_mm) for t in truths if t.T_world_camera is not None}
-    known = {index: (T, depth_mm) for index, (T, depth_mm) in views.items() if depth_mm is not None}
-    return surface.seen_by(sequence.camera, known.values(), indices=list(known)) if known else surface
+    views = {
+        truth.index: (truth.T_world_camera, truth.depth_mm)
+        for frame, truth in sequence
+        if frame.index in chosen
+        and truth is not None
+        and truth.T_world_camera is not None
+        and truth.depth_mm is not None
+    }
+    return surface.seen_by(sequence.camera, views.values(), indices=list(views)) if views else surface
 
 
 def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:
     """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
 
-    True depth counts in the range that the data set's users evaluate (`DEPTH_RANGES_MM`). Raises `InputError` where the
-    run kept no depth, or was made with another camera than the data set gives, or the data set knows no depth.
+    True depth counts within the range that is usual for the data set (`DEPTH_RANGES_MM`). Raises `InputError` where the
+    run kept no depth, or its camera is not that of the data set, or the data set has no true depth.
     """
     depth = DepthReader(run)
     if not depth.present:
@@ -178,17 +173,16 @@ def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for frame, truth in sequence:
-            found_mm = depth.read(frame.index)
-            if truth is not None and truth.depth_mm is not None and found_mm is not None:
-                yield found_mm, truth.depth_mm
+            estimated_mm = depth.read(frame.index)
+            if truth is not None and truth.depth_mm is not None and estimated_mm is not None:
+                yield estimated_mm, truth.depth_mm
 
     return pairs
 
 
 def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
-    pairs = _true_pairs(depth, sequence)
     report = evaluate_depth_sequence(
-        pairs,
+        _true_pairs(depth, sequence),
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
         clip_prediction=protocol.clip_depth,
@@ -205,31 +199,55 @@ def _consistency(
     protocol: ProtocolPlan,
     flows: Path | None = None,
 ) -> Figures:
-    """Measure depth over time; where depth has a truth it is brought to its scale first, one factor for all frames."""
+    """Measure depth over time, after one scale factor for all frames where true depth is known."""
     scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
-    flow = FlowStore(estimator, None if flows is None else flows / estimator.name)
-    poses = dict(zip(estimate.indices.tolist(), range(len(estimate)), strict=True))
+    folder = None if flows is None else flows / estimator.name
+    poses = {
+        index: estimate.T_world_camera[row]
+        for row, index in enumerate(estimate.indices.tolist())
+        if estimate.tracked[row]
+    }
     before: np.ndarray | None = None
     for frame, truth in sequence:
-        # Highlights move with the lamp, and what lies outside the field of view is no tissue: the same mask for all.
+        # Highlights move with the lamp, and pixels outside the field of view show no tissue: one mask for all methods.
         valid = masker(frame).valid
-        found = (None, None) if before is None else flow.to_previous(frame.index, before, frame.rgb)
+        found = (None, None) if before is None else flow_to_previous(estimator, frame.index, before, frame.rgb, folder)
         link = matcher.match(frame.rgb, valid, *found)
         before = frame.rgb
         depth_mm = depth.read(frame.index)
-        row = poses.get(frame.index)
-        known = row is not None and bool(estimate.tracked[row])
         meter.add(
             DepthFrame(
                 np.full(valid.shape, np.nan, np.float32) if depth_mm is None else depth_mm,
                 valid,
-                estimate.T_world_camera[row] if known and row is not None else None,
+                poses.get(frame.index),
                 None if truth is None else truth.T_world_camera,
                 None if truth is None else truth.depth_mm,
             ),
             link,
         )
-    return {"consistency": asdict(meter.report()) | {"flow": flow.name}}
+    return {"consistency": asdict(meter.report()) | {"flow": estimator.name}}
+
+
+def flow_to_previous(
+    estimator: FlowEstimator, index: int, rgb_previous: np.ndarray, rgb_current: np.ndarray, folder: Path | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return flow (H, W, 2) float32 px from frame `index` to the one before, and its consistent pixels (H, W) bool.
+
+    `folder` keeps the flow of one sequence and one estimator, so that all methods are measured with the same one. Half
+    precision (0.03 px at most for flows below 64 px), with and without a folder.
+    """
+    file = None if folder is None else folder / f"{index:06d}.npz"
+    if file is not None and file.is_file():
+        with np.load(file) as kept:
+            return kept["to_previous"].astype(np.float32), kept["consistent"]
+    found = pair_flow(estimator, rgb_previous, rgb_current, _CONSISTENCY_PX)
+    half = found.to_previous.astype(np.float16)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        draft = file.with_suffix(".part.npz")
+        np.savez_compressed(draft, to_previous=half, consistent=found.consistent)
+        draft.replace(file)
+    return half.astype(np.float32), found.consistent

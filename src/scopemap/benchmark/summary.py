@@ -1,122 +1,104 @@
-"""The runs of one method on one sequence, over the seeds, as one row of a table."""
+"""The runs of each method on each sequence, over all seeds, as one row of a data frame."""
 
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from typing import Any
 
 from scopemap.benchmark.result import RunResult
-from scopemap.benchmark.table import Value
+from scopemap.benchmark.table import SPREAD, pd
 
 MIN_COVERAGE = 0.9
-"""Share of the frames that a method must track for its figures to compete: who loses the hard frames errs less."""
+"""Share of the frames that a method must track for its figures to compete: a method that loses the hard frames has
+smaller errors."""
 
 _LONGEST_ERROR = 80
+# Columns of text, and where the runs keep their words: rows compete where the figures were measured alike.
+_WORDS = {"alignment": "poses.align", "flow": "consistency.flow", "scaling": "depth.scaling"}
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What one method reached on one sequence.
+def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
+    """Return one row per sequence and method, both in the order in which they first appear.
 
-    Attributes
-    ----------
-    sequence, method : names as the plan gives them. runs : one per seed, failed ones included.
-    frames_of_sequence : the most frames with a true pose that any method's run on the sequence has; one that ended
-        early has fewer.
+    Figures are medians over the seeds, by "group.name" ("timing.ms_per_frame"), with half their range under the same
+    name and `SPREAD`. Columns of text are "sequence", "method", "runs", "frames tracked", "alignment", "flow",
+    "scaling", "failure"; others "done", "competes", "tracked", "frames". A sequence whose name ends with its seed
+    ("colon, seed 1"), as a plan's entries are called, is that sequence.
     """
+    runs = _runs(results)
+    order = {name: place for place, name in enumerate(dict.fromkeys(runs["sequence"]))}
+    runs = runs.sort_values("sequence", key=lambda names: names.map(order), kind="stable", ignore_index=True)
+    by = [runs["sequence"], runs["method"]]
+    figures = runs.drop(columns=["sequence", "method", "done", "error", *_columns_of(runs, str | list)])
+    figures = figures.map(lambda cell: cell if isinstance(cell, int | float) and math.isfinite(cell) else math.nan)
+    figures = figures.astype(float)
+    over_seeds = figures.groupby(by, sort=False)
+    half_range = (0.5 * (over_seeds.max() - over_seeds.min())).where(over_seeds.count() > 1)
+    rows = over_seeds.median().join(half_range.add_suffix(SPREAD))
 
-    sequence: str
-    method: str
-    runs: tuple[RunResult, ...]
-    frames_of_sequence: int = 0
-
-    @property
-    def done(self) -> tuple[RunResult, ...]:
-        """The runs that came to an end."""
-        return tuple(run for run in self.runs if run.status == "done")
-
-    @property
-    def failure(self) -> str:
-        """Why no run came to an end, in one short line; empty where one did."""
-        if self.done:
-            return ""
-        reason = " ".join(self.runs[0].error.split())
-        short = reason if len(reason) <= _LONGEST_ERROR else f"{reason[: _LONGEST_ERROR - 1]}…"
-        return f"failed: {short}" if short else "failed"
-
-    @property
-    def count(self) -> str:
-        """Number of runs, and how many of them came to an end where not all did."""
-        return str(len(self.runs)) if len(self.done) == len(self.runs) else f"{len(self.done)} of {len(self.runs)}"
-
-    @property
-    def frames(self) -> tuple[int, int]:
-        """Tracked frames and those of the sequence, of all finished runs together; zeros where no poses were scored."""
-        tracked = [run.figure("poses", "tracked") for run in self.done]
-        scored = [int(count) for count in tracked if math.isfinite(count)]
-        return sum(scored), len(scored) * self.frames_of_sequence
-
-    @property
-    def coverage(self) -> float:
-        """Share of the sequence's frames that were tracked, 0..1; NaN where no poses were scored."""
-        tracked, frames = self.frames
-        return tracked / frames if frames else math.nan
-
-    @property
-    def tracked(self) -> str:
-        """Frames tracked, for people: "270 of 276"; empty where no poses were scored."""
-        tracked, frames = self.frames
-        return f"{tracked} of {frames}" if frames else ""
-
-    @property
-    def competes(self) -> bool:
-        """Whether its figures may be called the best: every run came to an end and tracked enough frames."""
-        return len(self.done) == len(self.runs) and not self.coverage < MIN_COVERAGE
-
-    def value(self, group: str, key: str) -> Value:
-        """Return a figure over the runs, as `over_seeds` joins them; NaN where there is none.
-
-        Group "timing" is `RunResult.timing`; points in the key lead into groups within the group ("opw.mean_mm").
-        """
-        if group == "timing":
-            # A time that was not measured is null in the file.
-            times = [run.timing.get(key) for run in self.done]
-            return over_seeds([math.nan if time is None else time for time in times])
-        return over_seeds([run.figure(group, key) for run in self.done])
-
-    def text(self, group: str, key: str) -> str:
-        """Return a word that is kept among the figures ("align" of "poses"); runs that differ are all named."""
-        words = [run.figures.get(group, {}).get(key) for run in self.done]
-        return "/".join(dict.fromkeys(word for word in words if isinstance(word, str)))
+    count, rows["done"] = over_seeds.size(), runs["done"].groupby(by, sort=False).sum()
+    tracked = over_seeds["poses.tracked"]
+    longest = figures["poses.frames"].groupby(runs["sequence"]).max()
+    rows["tracked"] = tracked.sum()
+    # A run that ended early has fewer frames than the sequence: the others are lost.
+    rows["frames"] = tracked.count() * longest.reindex(rows.index.get_level_values("sequence")).to_numpy()
+    rows["competes"] = (rows["done"] == count) & ~(rows["tracked"] / rows["frames"] < MIN_COVERAGE)
+    rows["runs"] = [str(n) if done == n else f"{done} of {n}" for n, done in zip(count, rows["done"], strict=True)]
+    rows["frames tracked"] = of_frames(rows)
+    for name, column in _WORDS.items():
+        words = runs.get(column, pd.Series("", index=runs.index))
+        rows[name] = words.groupby(by, sort=False).agg(joined)
+    errors = runs["error"].groupby(by, sort=False).first()
+    rows["failure"] = ["" if done else _failure(error) for done, error in zip(rows["done"], errors, strict=True)]
+    return rows.reset_index()
 
 
-def summarise(results: Iterable[RunResult]) -> tuple[Summary, ...]:
-    """Group results by sequence, then method, both in the order in which they first appear; runs by seed.
+def of_frames(rows: pd.DataFrame) -> list[str]:
+    """Return "270 of 276" for the columns "tracked" and "frames"; "" where no poses were scored."""
+    pairs = zip(rows["tracked"], rows["frames"], strict=True)
+    return [f"{tracked:.0f} of {frames:.0f}" if frames > 0 else "" for tracked, frames in pairs]
 
-    A sequence that bears its seed behind its name ("colon, seed 1"), as those of a plan do, is that sequence.
-    """
-    runs: dict[str, dict[str, list[RunResult]]] = {}
-    for result in results:
-        sequence = result.sequence.removesuffix(f", seed {result.seed}")
-        runs.setdefault(sequence, {}).setdefault(result.method, []).append(result)
-    return tuple(
-        Summary(sequence, method, tuple(sorted(of_method, key=lambda run: run.seed)), _frames(of_sequence))
-        for sequence, of_sequence in runs.items()
-        for method, of_method in of_sequence.items()
+
+def joined(words: Iterable[Any]) -> str:
+    """Return the different words, joined by "/"; cells that are no text or empty do not count."""
+    return "/".join(dict.fromkeys(word for word in words if isinstance(word, str) and word))
+
+
+def _runs(results: Iterable[RunResult]) -> pd.DataFrame:
+    """Return one row per run, its figures under "group.name", stages also in milliseconds per frame."""
+    runs = pd.json_normalize(
+        [
+            {
+                "sequence": result.sequence.removesuffix(f", seed {result.seed}"),
+                "method": result.method,
+                "done": result.status == "done",
+                "error": result.error,
+                "poses": {"frames": math.nan, "tracked": math.nan},
+                **result.figures,
+                "timing": _with_stages(result),
+            }
+            for result in results
+        ]
     )
+    return runs.reindex(columns=[*runs, *{"poses.frames", "poses.tracked"} - set(runs)])
 
 
-def _frames(of_sequence: dict[str, list[RunResult]]) -> int:
-    counts = [run.figure("poses", "frames") for of_method in of_sequence.values() for run in of_method]
-    return int(max((count for count in counts if math.isfinite(count)), default=0))
+def _with_stages(result: RunResult) -> dict[str, float]:
+    frames = result.figure("poses", "frames")
+    stages = {
+        f"ms_of_{key.removeprefix('seconds_')}": 1e3 * seconds / frames
+        for key, seconds in result.timing.items()
+        if key.startswith("seconds_") and key != "seconds_total" and seconds and frames > 0
+    }
+    return result.timing | stages
 
 
-def over_seeds(values: Sequence[float]) -> Value:
-    """Return the mean of one or two known values, the median of more; the spread is half their range if several."""
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
-        return Value(math.nan)
-    centre = statistics.median(known) if len(known) >= 3 else statistics.fmean(known)
-    return Value(centre, 0.5 * (max(known) - min(known)) if len(known) > 1 else math.nan)
+def _columns_of(runs: pd.DataFrame, kind: Any) -> list[str]:
+    return [name for name in runs if runs[name].map(lambda cell: isinstance(cell, kind)).any()]
+
+
+def _failure(error: str) -> str:
+    reason = " ".join(error.split())
+    short = reason if len(reason) <= _LONGEST_ERROR else f"{reason[: _LONGEST_ERROR - 1]}…"
+    return f"failed: {short}" if short else "failed"

@@ -1,237 +1,189 @@
-"""A table and its three forms: Markdown for people, CSV for programs, LaTeX (booktabs) for papers.
+"""Table: figures of methods with the best ones marked, as Markdown, CSV and LaTeX (booktabs).
 
-All forms are functions of the table alone: no date, no order of a set, no width of a terminal.
+Rows are a data frame. Its columns are texts, the figures by their keys ("poses.ate_rmse_mm"), what is printed behind a
+figure's "±" ("poses.ate_rmse_mm ±"), "failure" (empty where the method came to an end) and "competes" (whether figures
+of the row may be the best).
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
+
+from scopemap.errors import SettingsError
+
+try:
+    import pandas as pd
+except ImportError:  # the only door to pandas: `bench` and `compare` stop here, before they run anything
+    raise SettingsError("tables of runs need pandas: pip install 'scopemap[bench]'") from None
 
 Better = Literal["lower", "higher", "one", ""]
 """Which value of a column is the best: the lowest, the highest, the nearest to 1; empty: none is."""
 
+SPREAD = " ±"
+"""Behind the key of a figure: its half range over the seeds, NaN for one seed."""
+
 _ARROWS = {"lower": " ↓", "higher": " ↑", "one": " →1", "": ""}
 _LATEX_ARROWS = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "one": r" $\to 1$", "": ""}
-_LATEX = {
-    **{letter: f"\\{letter}" for letter in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    # Behind a line's end LaTeX would take it for an option.
-    "[": "{[}",
-    "±": r"$\pm$",
-}
+_LATEX = str.maketrans(
+    {letter: f"\\{letter}" for letter in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$"}
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
+    # At the start of a line LaTeX would take it for an option of the line break before.
+    | {"[": "{[}"}
+)
 _MARKDOWN = re.compile(r"[\\`*|<>]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 
 
 @dataclass(frozen=True)
-class Value:
-    """A figure and, where it is known, what is printed behind "±"; NaN is an empty cell."""
-
-    mean: float
-    spread: float = math.nan
-
-
-Cell = str | Value
-
-
-@dataclass(frozen=True)
-class Column:
-    """How a column is headed and its figures are printed.
+class Figure:
+    """A column of figures.
 
     Attributes
     ----------
-    title, unit : of the head; the unit may be empty. better : which value is the best.
-    digits : behind the point; None marks a column of text. spread : what stands behind "±", for the CSV's head.
-    timing : whether two runs of the same plan may differ here.
+    key : of the figure, "group.name". title, unit : of the head. digits : behind the point.
+    better : which value is the best. factor : from the stored to the printed unit.
+    spread_key : what stands behind "±"; empty: the half range over the seeds, if `seeds`.
     """
 
+    key: str
     title: str
     unit: str = ""
-    better: Better = ""
-    digits: int | None = None
-    spread: str = "spread"
-    timing: bool = False
+    digits: int = 3
+    better: Better = "lower"
+    spread_key: str = ""
+    factor: float = 1.0
+    seeds: bool = False
 
     @property
     def head(self) -> str:
         """Title and unit."""
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
+    @property
+    def csv_heads(self) -> tuple[str, str]:
+        """Heads of the column and of its spread in a CSV file."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        spread = "std" if self.spread_key else "half range over seeds"
+        return f"{self.title}{unit}", f"{self.title} {spread}{unit}"
+
+    def values(self, rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+        """Return the figures and what stands behind "±", both in the printed unit, NaN where there is none."""
+        spread_key = self.spread_key or (self.key + SPREAD if self.seeds else "")
+        found = rows.reindex(columns=[self.key, spread_key]).astype(float) * self.factor
+        return found[self.key], found[spread_key]
+
+    def text(self, value: float, spread: float = math.nan) -> str:
+        """Return a figure as it is printed; "" for NaN."""
+        if math.isnan(value):
+            return ""
+        number = f"{value:.{self.digits}f}"
+        number = number.removeprefix("-") if float(number) == 0 else number
+        return number if math.isnan(spread) else f"{number} ± {spread:.{self.digits}f}"
+
+    def best(self, values: pd.Series, groups: Sequence[pd.Series]) -> pd.Series:
+        """Return which values are the best of their group, as printed; NaN and single values do not compete."""
+        if not self.better:
+            return pd.Series(False, index=values.index)
+        cost = values.map(lambda value: round(value, self.digits))
+        cost = {"lower": cost, "higher": -cost, "one": (cost - 1).abs().round(9)}[self.better]
+        grouped = cost.groupby(list(groups))
+        return (cost == grouped.transform("min")) & (grouped.transform("count") > 1)
+
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under columns.
+    """Rows under columns of text and of figures.
 
     Attributes
     ----------
-    name : of its files. title, caption : for people; the caption says how the figures were reached.
-    rows : each as long as `columns`. marks : (row, column) of the best values, printed bold.
+    name : of its files. title, caption : for readers; the caption says how the figures were measured.
+    texts : names of the columns of text. figures : the other columns. rows : see the module's docstring.
+    compete_within : columns of `rows`; values compete where these are equal.
     """
 
     name: str
     title: str
     caption: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    marks: frozenset[tuple[int, int]] = frozenset()
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise ValueError(f"table '{self.name}': a row of {len(row)} cells under {len(self.columns)} columns")
-
-    def without_timing(self) -> Table:
-        """Return the table without the columns that two runs of the same plan do not share."""
-        return self._only([place for place, column in enumerate(self.columns) if not column.timing])
+    texts: tuple[str, ...]
+    figures: tuple[Figure, ...]
+    rows: pd.DataFrame
+    compete_within: tuple[str, ...] = ()
 
     def without_empty(self) -> Table:
-        """Return the table without the columns in which no row has a figure."""
-        empty = {
-            place
-            for place in range(len(self.columns))
-            if all(isinstance(cell := row[place], Value) and not math.isfinite(cell.mean) for row in self.rows)
-        }
-        return self._only([place for place in range(len(self.columns)) if place not in empty])
-
-    def _only(self, kept: list[int]) -> Table:
-        return replace(
-            self,
-            columns=tuple(self.columns[place] for place in kept),
-            rows=tuple(tuple(row[place] for place in kept) for row in self.rows),
-            marks=frozenset((row, kept.index(place)) for row, place in self.marks if place in kept),
-        )
+        """Return the table without the columns in which no row has a text or a figure."""
+        texts = tuple(text for text in self.texts if (self.rows[text] != "").any())
+        figures = tuple(figure for figure in self.figures if figure.values(self.rows)[0].notna().any())
+        return replace(self, texts=texts, figures=figures or self.figures[:1])
 
     def markdown(self) -> str:
         """Return the rows as a Markdown table, without title and caption."""
-        heads = [escape_markdown(column.head) + _ARROWS[column.better] for column in self.columns]
-        rules = ["---" if column.digits is None else "---:" for column in self.columns]
-        lines = [heads, rules] + [
-            [self._cell(row, place, bold="**{}**", markdown=True) for place in range(len(self.columns))]
-            for row in range(len(self.rows))
-        ]
+        heads = [escape_markdown(text) for text in self.texts]
+        heads += [escape_markdown(figure.head) + _ARROWS[figure.better] for figure in self.figures]
+        rules = ["---"] * len(self.texts) + ["---:"] * len(self.figures)
+        lines = [heads, rules, *self._cells(escape_markdown, "**{}**").to_numpy().tolist()]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def csv(self) -> str:
         """Return the rows as CSV: figures to six significant digits, what stands behind "±" in a column of its own."""
-        with_spread = {
-            place
-            for place in range(len(self.columns))
-            for row in self.rows
-            if isinstance(cell := row[place], Value) and math.isfinite(cell.spread)
-        }
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self._csv_heads(with_spread))
-        for row in self.rows:
-            writer.writerow([part for place, cell in enumerate(row) for part in _csv_parts(cell, place in with_spread)])
-        return text.getvalue()
+        cells = self.rows[list(self.texts)].map(_one_line)
+        for number, figure in enumerate(self.figures):
+            values, spreads = (column.map(_six_digits) for column in figure.values(self.rows))
+            cells[figure.csv_heads[0]] = values if number else values.where(self.rows["failure"] == "", self._failures)
+            if (spreads != "").any():
+                cells[figure.csv_heads[1]] = spreads
+        return str(cells.to_csv(index=False, lineterminator="\n"))
 
     def latex(self) -> str:
         """Return a floating table; its document needs the packages booktabs and graphicx."""
-        layout = "".join("l" if column.digits is None else "r" for column in self.columns)
-        heads = [_escape_latex(column.head) + _LATEX_ARROWS[column.better] for column in self.columns]
-        lines = [
-            "% needs \\usepackage{booktabs,graphicx}",
-            r"\begin{table*}",
-            r"\centering",
-            rf"\caption{{{_escape_latex(f'{self.title}. {self.caption}')}}}",
-            rf"\label{{tab:{re.sub('[^A-Za-z0-9-]+', '-', self.name)}}}",
-            r"\resizebox{\textwidth}{!}{%",
-            rf"\begin{{tabular}}{{{layout}}}",
-            r"\toprule",
-            " & ".join(heads) + r" \\",
-            *self._latex_rows(),
-            r"\bottomrule",
-            r"\end{tabular}}",
-            r"\end{table*}",
+        cells = self._cells(_escape_latex, r"\textbf{{{}}}")
+        cells.columns = [_escape_latex(text) for text in self.texts] + [
+            _escape_latex(figure.head) + _LATEX_ARROWS[figure.better] for figure in self.figures
         ]
-        return "\n".join(lines) + "\n"
+        layout = "l" * len(self.texts) + "r" * len(self.figures)
+        tabular = cells.to_latex(index=False, escape=False, column_format=layout)
+        return (
+            "% needs \\usepackage{booktabs,graphicx}\n\\begin{table*}\n\\centering\n"
+            f"\\caption{{{_escape_latex(f'{self.title}. {self.caption}')}}}\n"
+            f"\\label{{tab:{re.sub('[^A-Za-z0-9-]+', '-', self.name)}}}\n"
+            f"\\resizebox{{\\textwidth}}{{!}}{{%\n{tabular.rstrip()}}}\n\\end{{table*}}\n"
+        )
 
-    def _latex_rows(self) -> list[str]:
-        lines = [r"\midrule"] if self.rows else []
-        firsts = [row[0] for row in self.rows]
-        # A rule where the first column changes, unless it changes with every row: then it groups nothing.
-        grouped = any(above == below for above, below in pairwise(firsts))
-        for row, first in enumerate(firsts):
-            if grouped and row and firsts[row - 1] != first:
-                lines.append(r"\midrule")
-            cells = [
-                self._cell(row, place, bold=r"\textbf{{{}}}", markdown=False) for place in range(len(self.columns))
-            ]
-            lines.append(" & ".join(cells) + r" \\")
-        return lines
+    @property
+    def _failures(self) -> pd.Series:
+        return self.rows["failure"].map(_one_line)
 
-    def _cell(self, row: int, place: int, *, bold: str, markdown: bool) -> str:
-        cell, digits = self.rows[row][place], self.columns[place].digits
-        plain = cell if isinstance(cell, str) else _shown(cell, digits)
-        text = escape_markdown(plain) if markdown else _escape_latex(plain)
-        return bold.format(text) if (row, place) in self.marks else text
-
-    def _csv_heads(self, with_spread: set[int]) -> list[str]:
-        heads = []
-        for place, column in enumerate(self.columns):
-            unit = f" [{column.unit}]" if column.unit else ""
-            heads.append(column.title + unit)
-            if place in with_spread:
-                heads.append(f"{column.title} {column.spread}{unit}")
-        return heads
+    def _cells(self, escape: Callable[[str], str], bold: str) -> pd.DataFrame:
+        """Return the cells as texts; the first figure of a row that failed is the failure."""
+        cells = self.rows[list(self.texts)].map(escape)
+        groups = [self.rows[name] for name in self.compete_within]
+        for number, figure in enumerate(self.figures):
+            values, spreads = figure.values(self.rows)
+            texts = [figure.text(value, spread) for value, spread in zip(values, spreads, strict=True)]
+            column = pd.Series(texts, index=cells.index, dtype=object).map(escape)
+            best = figure.best(values.where(self.rows["competes"]), groups or [values.map(bool)])
+            column = column.where(~best, column.map(bold.format))
+            cells[figure.head] = (
+                column if number else column.where(self.rows["failure"] == "", self._failures.map(escape))
+            )
+        return cells
 
 
-def best_of(values: list[float], better: Better, digits: int) -> list[int]:
-    """Return the places of the best values, as they are printed with `digits`; none where fewer than two compete."""
-    known = [place for place, value in enumerate(values) if math.isfinite(value)]
-    if len(known) < 2 or not better:
-        return []
-    ranks = {place: _rank(round(values[place], digits), better) for place in known}
-    return [place for place in known if ranks[place] == min(ranks.values())]
-
-
-def _rank(value: float, better: Better) -> float:
-    """Lower is better, whatever the column says."""
-    if better == "higher":
-        return -value
-    # Rounded again: 1.1 - 1 and 1 - 0.9 differ in the last bit.
-    return round(abs(value - 1.0), 9) if better == "one" else value
-
-
-def _shown(value: Value, digits: int | None) -> str:
-    if not math.isfinite(value.mean):
-        return ""
-    text = _number(value.mean, digits)
-    return f"{text} ± {_number(value.spread, digits)}" if math.isfinite(value.spread) else text
-
-
-def _number(value: float, digits: int | None) -> str:
-    text = f"{value:.{digits or 0}f}"
-    return text.removeprefix("-") if float(text) == 0 else text
-
-
-def _csv_parts(cell: Cell, with_spread: bool) -> list[str]:
-    if isinstance(cell, str):
-        parts = [_one_line(cell), ""]
-    else:
-        parts = [f"{part:.6g}" if math.isfinite(part) else "" for part in (cell.mean, cell.spread)]
-    return parts if with_spread else parts[:1]
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
+def _one_line(text: Any) -> str:
+    return " ".join(str(text).split())
 
 
 def escape_markdown(text: str) -> str:
-    """Return text as one line that Markdown shows as it is, in a cell of a table, too."""
+    """Return text as one line that Markdown shows as it is, also in a cell of a table."""
     return _MARKDOWN.sub(r"\\\g<0>", _one_line(text))
 
 
 def _escape_latex(text: str) -> str:
-    return "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
+    return _one_line(text).translate(_LATEX)
+
+
+def _six_digits(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"

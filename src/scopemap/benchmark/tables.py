@@ -1,46 +1,70 @@
-"""All tables of a benchmark, and their files.
+"""All tables of a benchmark, and their files. `tables.toml` lists the columns.
 
-A group of figures that no run has is no table. The figures of a named protocol stand in a table of that name and
-nowhere else.
+A group of figures that no run has is no table. The figures of a named protocol stand in a table of its name only.
+
+Tables 1 to 3 have the form of arXiv 2508.11282: our figures as measured, the paper's rows as printed. The paper's rows
+come from other data, after an alignment and with an RPE over an interval that it does not state: they are marked as
+published and never compete, and their RPE has a column of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
+from typing import Any, Literal
 
-from scopemap.benchmark.layout import SEEDS, Figure, lay_out, line_of
-from scopemap.benchmark.paper_tables import paper_tables
-from scopemap.benchmark.protocol_tables import protocol_tables
 from scopemap.benchmark.result import RunResult
-from scopemap.benchmark.sections import OVERVIEW, SECTIONS, TIMED, Section
-from scopemap.benchmark.summary import Summary, summarise
-from scopemap.benchmark.table import Table, escape_markdown
+from scopemap.benchmark.summary import joined, of_frames, summarise
+from scopemap.benchmark.table import SPREAD, Figure, Table, escape_markdown, pd
 from scopemap.errors import InputError
 
-TIMING_COLUMNS = tuple(figure.title for figure in TIMED)
-"""Titles of the overview's columns that two runs of one plan do not share; `Table.without_timing` leaves them out. The
-table "time" holds nothing else."""
+PublishedTable = Literal["table1_pose_scared", "table2_methods_scared", "table3_ablation_scared"]
 
+_SECTIONS = {"tracking": "poses", "consistency": "consistency", "depth": "depth", "surface": "surface"}
+_OWN_GROUPS = {"paper", *_SECTIONS.values()}
 _FACTS = ("machine", "device", "commit", "versions", "truth")
+_UNITS = {"_mm": "mm", "_deg": "deg", "_rad": "rad", "_percent": "%", "_px": "px", "_s": "s"}
+# The paper's columns and the figures of `PaperReport`. The interval of its RPE is not stated: it is none of ours.
+_PUBLISHED_COLUMNS = {
+    "framework": "method",
+    "variant": "method",
+    "T_avg_mm": "paper.t_avg_mm",
+    "T_avg_std": "paper.t_std_mm",
+    "R_avg": "paper.r_avg_rad",
+    "R_avg_std": "paper.r_std_rad",
+    "RMSE_mm": "paper.rmse_mm",
+    "T_fin_mm": "paper.t_fin_mm",
+    "R_fin": "paper.r_fin_rad",
+    "RPE_mm": "paper.rpe_unstated_mm",
+    "RPE_std": "paper.rpe_unstated_std_mm",
+    "T_max_mm": "paper.t_max_mm",
+    "R_max": "paper.r_max_rad",
+    "T_below_avg_percent": "paper.t_below_avg_percent",
+    "R_below_avg_percent": "paper.r_below_avg_percent",
+    "TLR": "paper.tlr",
+}
 
 
 def benchmark_tables(results: Iterable[RunResult], *, paper_units: bool = False) -> tuple[Table, ...]:
-    """Return all tables that the results give something for, the overview first and the times last.
+    """Return all tables that the results have figures for, the overview first and the times last.
 
-    Rows stand in the order in which sequences and methods first appear; a method that died is a row that says so, and
-    why in the overview. `paper_units`: angles of tables 1 to 3 in radians instead of degrees.
+    Rows stand in the order in which sequences and methods first appear. A method that died is a row with "failed", in
+    the overview with the reason. `paper_units`: angles of tables 1 to 3 in radians instead of degrees.
     """
     results = tuple(results)
-    summaries = summarise(results)
-    measured = [section for section in SECTIONS if _is_measured(section, summaries)]
+    rows = summarise(results)
+    short = rows.assign(failure=rows["failure"].where(rows["failure"] == "", "failed"))
+    groups = list(dict.fromkeys(group for result in results for group in result.figures))
     return (
-        section_table(OVERVIEW, summaries),
-        *paper_tables(summaries, paper_units=paper_units),
-        *(section_table(section, summaries).without_empty() for section in measured),
-        *protocol_tables(summaries),
-        _times(results),
+        read_table("overview", rows),
+        *_paper_tables(short, paper_units),
+        *(read_table(name, short).without_empty() for name, group in _SECTIONS.items() if group in groups),
+        *(_protocol_table(group, short, results) for group in groups if group not in _OWN_GROUPS),
+        _times(short),
     )
 
 
@@ -73,52 +97,105 @@ def write_tables(
     return tuple(Path(folder) / name for name in texts)
 
 
-def section_table(section: Section, summaries: Sequence[Summary]) -> Table:
-    """Return a section's table, one row per sequence and method; columns of text that would be empty are left out."""
-    head, *place = section.word
-    words = [s.text(*place) for s in summaries]
-    texts = {
-        "sequence": [s.sequence for s in summaries],
-        "method": [s.method for s in summaries],
-        "runs": [s.count for s in summaries],
-        "frames tracked": [s.tracked for s in summaries],
-        head: words,
-    }
-    kept = {head: column for head, column in texts.items() if any(column)}
-    lines = [
-        line_of(summary, row, section.figures, reached=(word,), reason=section is OVERVIEW)
-        for summary, row, word in zip(summaries, zip(*kept.values(), strict=True), words, strict=True)
-    ]
-    return lay_out(Table(section.name, section.title, section.caption, (), ()), tuple(kept), section.figures, lines)
+def read_table(name: str, rows: pd.DataFrame, *, paper_units: bool = False) -> Table:
+    """Return the table of `tables.toml` with these rows; columns of text that are empty everywhere are left out."""
+    file = resources.files("scopemap.benchmark") / "tables.toml"
+    tree = tomllib.loads(file.read_text(encoding="utf-8"))
+    phrases = tree["phrases"] | {"angles": tree["phrases"]["radians" if paper_units else "degrees"]}
+    table = tree[name]
+    kept = tuple(text for text in table["texts"] if name.startswith("table") or (rows[text] != "").any())
+    figures = tuple(_figure(figure, paper_units) for figure in table["figures"])
+    caption = table["caption"].format(**phrases)
+    return Table(name, table["title"], caption, kept, figures, rows, tuple(table["compete_within"]))
 
 
-def _is_measured(section: Section, summaries: Sequence[Summary]) -> bool:
-    return any(section.group in run.figures for summary in summaries for run in summary.runs)
+def _figure(column: dict[str, Any], paper_units: bool) -> Figure:
+    if column.get("unit") != "angle":
+        return Figure(**column)
+    unit, factor = ("rad", 1.0) if paper_units else ("deg", math.degrees(1))
+    return Figure(**column | {"unit": unit, "factor": factor})
 
 
-def _times(results: Sequence[RunResult]) -> Table:
-    summaries = summarise(replace(result, timing=_per_frame(result)) for result in results)
-    stages = sorted({key for s in summaries for run in s.done for key in run.timing if key.startswith("ms_of_")})
-    figures = [
-        *TIMED,
-        *(Figure("timing", stage, stage.removeprefix("ms_of_").replace("_", " "), "ms", 1, "") for stage in stages),
-        Figure("timing", "seconds_total", "whole run", "s", 1, ""),
-    ]
-    caption = (
-        "Wall time. Per frame: from the first finished frame to the last; tracking: the odometry alone. Stages: "
-        "their sum over the run by its frames; stages in two threads overlap. Whole run: with start-up. Peak "
-        f"memory: of the process that ran the method. {SEEDS}."
+# ---- tables 1 to 3
+
+
+def _paper_tables(rows: pd.DataFrame, paper_units: bool) -> Iterator[Table]:
+    if not rows.reindex(columns=["paper.t_avg_mm"]).notna().any(axis=None):
+        return
+    published: tuple[PublishedTable, ...] = ("table1_pose_scared", "table2_methods_scared", "table3_ablation_scared")
+    for number, file in enumerate(published, start=1):
+        ours = (_means_over_sequences(rows) if number == 2 else rows).assign(source="measured")
+        both = pd.concat([ours, published_rows(file)], ignore_index=True)
+        both = both.rename(columns={"method": "variant" if number == 3 else "framework"})
+        yield read_table(f"table{number}", both, paper_units=paper_units)
+
+
+def published_rows(table: PublishedTable) -> pd.DataFrame:
+    """Return the rows of one of the paper's tables, in its order, with the columns of `summarise`: mm and rad."""
+    with (resources.files("scopemap.benchmark") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
+        rows = pd.read_csv(file).rename(columns=_PUBLISHED_COLUMNS)
+    texts = {"frames tracked": "", "sequences": "", "alignment": "not stated", "failure": "", "source": "published"}
+    return rows.assign(competes=False, **texts)
+
+
+def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per method: means over its sequences that came to an end."""
+    sequences, methods = rows["sequence"].nunique(), rows["method"].unique()
+    done = rows[rows["failure"] == ""].groupby("method", sort=False)
+    finished = done.size().reindex(methods, fill_value=0)
+    scored = done["paper.t_avg_mm"].count().reindex(methods, fill_value=0)
+    whole = rows.groupby("method")["competes"].agg(lambda runs: len(runs) == sequences and bool(runs.all()))
+    return (
+        done.mean(numeric_only=True)
+        .reindex(methods)
+        .assign(
+            **{"frames tracked": of_frames(done[["tracked", "frames"]].sum().reindex(methods))},
+            sequences=[f"{count} of {sequences}" for count in finished],
+            alignment=done["alignment"].agg(joined).reindex(methods, fill_value=""),
+            failure=["" if count else "failed" for count in finished],
+            competes=whole & (scored == finished),
+        )
+        .reset_index()
     )
-    lines = [line_of(s, (s.sequence, s.method, s.count), figures) for s in summaries]
-    return lay_out(Table("time", "Time and memory", caption, (), ()), ("sequence", "method", "runs"), figures, lines)
 
 
-def _per_frame(result: RunResult) -> dict[str, float]:
-    """Return the timing with the stages as milliseconds per frame, where the number of frames is known."""
-    frames = result.figures.get("poses", {}).get("frames")
-    stages = {key.removeprefix("seconds_"): s for key, s in result.timing.items() if key.startswith("seconds_")}
-    stages.pop("total", None)
-    return result.timing | ({f"ms_of_{stage}": 1e3 * s / frames for stage, s in stages.items() if s} if frames else {})
+# ---- other tables
+
+
+def _protocol_table(group: str, rows: pd.DataFrame, results: Sequence[RunResult]) -> Table:
+    """Return the figures of another paper's protocol: one row per sequence and figure, one column per method.
+
+    Figures have five significant digits, for they may be counts as well as hundredths of a radian.
+    """
+    words = next(result.figures[group] for result in results if group in result.figures)
+    keys = [name for name in rows if name.startswith(f"{group}.") and not name.endswith(SPREAD)]
+    lines = []
+    for sequence, here in rows.groupby("sequence", sort=False):
+        by_method = here.set_index("method")
+        tracked = by_method["frames tracked"].where(by_method["failure"] == "", "failed")
+        lines.append({"sequence": sequence, "figure": "frames tracked", "unit": "", **tracked})
+        for key in keys:
+            name = key.rpartition(".")[2]
+            suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
+            named = {"figure": name.removesuffix(suffix).replace("_", " "), "unit": _UNITS.get(suffix, "")}
+            values = by_method[key].map(lambda value: "" if math.isnan(value) else f"{value:.5g}")
+            lines.append({"sequence": sequence, **named, **values})
+    table = pd.DataFrame(lines).fillna("").assign(failure="", competes=False)
+    caption = words.get("description", f"As the protocol {group} defines them.")
+    caption += f" Source: {words['source']}." if "source" in words else ""
+    caption += " Not to be compared with figures of another protocol. Over several seeds: median."
+    texts = ("sequence", "figure", "unit", *dict.fromkeys(rows["method"]))
+    return Table(f"protocol-{group}", f"Protocol {group}", caption, texts, (), table)
+
+
+def _times(rows: pd.DataFrame) -> Table:
+    table = read_table("time", rows)
+    keys = sorted(key for key in rows if key.startswith("timing.ms_of_") and not key.endswith(SPREAD))
+    stages = [Figure(key, key.removeprefix("timing.ms_of_").replace("_", " "), "ms", 1, "") for key in keys]
+    return replace(table, figures=(*table.figures[:-1], *stages, table.figures[-1]))
+
+
+# ---- files
 
 
 def _document(results: Sequence[RunResult], tables: Sequence[Table], title: str, notes: Sequence[str]) -> str:
@@ -131,7 +208,7 @@ def _document(results: Sequence[RunResult], tables: Sequence[Table], title: str,
 
 
 def _stated(results: Sequence[RunResult], name: str) -> str:
-    """Return a fact of all results; where they differ, each that occurs."""
+    """Return a fact of all results; where they differ, each value that occurs."""
     facts = [fact for result in results if (fact := result.facts.get(name))]
     texts = [
         ", ".join(f"{k} {v}" for k, v in fact.items()) if isinstance(fact, Mapping) else str(fact) for fact in facts

@@ -1,4 +1,4 @@
-"""Opening a data set for its truth as a run read it: the same size, the same view of two, the same camera."""
+"""Opens a data set for its truth as a run read it: same size, same view of a stereo picture, same camera."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ _SAME_CAMERA_PX = 0.01
 def open_truth(run: Path, truth: Path) -> Sequence:
     """Return the data set in `truth`, rectified as the run in folder `run` rectified its input.
 
-    The camera is the data set's own; where that is unknown, does not fit or is not the run's, it is the one that the
-    run kept, so that depth is compared pixel by pixel. Any folder or file may stand for a run: what it does not say is
-    left to the data set. Raises as `open_sequence`.
+    The camera is the data set's own. Where that is unknown, does not fit or is not the run's, it is the camera that the
+    run kept, so that depth is compared pixel by pixel. `run` may be any folder or file: what it does not state is taken
+    from the data set. Raises as `open_sequence`.
     """
-    size, settings = working_size(run), _input_settings(run)
+    camera, settings = _camera_of(run), _input_settings(run)
+    size = None if camera is None else (int(camera["width"]), int(camera["height"]))
     if settings.stereo != "auto" and open_source(truth).name not in OF_UNKNOWN_VIEWS:
-        settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader knows which view is meant
+        settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader chooses the view
     kept = run / "source_camera.yaml"
     try:
         sequence = open_sequence(truth, size=size, settings=settings)
@@ -38,32 +39,26 @@ def open_truth(run: Path, truth: Path) -> Sequence:
 
 
 def is_camera_of(run: Path, sequence: Sequence) -> bool:
-    """Whether the working camera of a run is that of the sequence; `InputError` where nothing tells the run's."""
+    """Whether the working camera of a run is that of the sequence; raises `InputError` where the run's is unknown."""
     camera = _camera_of(run)
+    if camera is None:
+        raise InputError(f"cannot read the camera of the run {run} from its provenance.json")
     return all(
         abs(camera[name] - getattr(sequence.camera, name)) <= _SAME_CAMERA_PX for name in ("fx", "fy", "cx", "cy")
     )
 
 
-def working_size(run: Path) -> tuple[int, int] | None:
-    """Return the working size (width, height) of a run, which its depth maps have; None where nothing tells."""
-    try:
-        camera = _camera_of(run)
-    except InputError:
-        return None
-    return int(camera["width"]), int(camera["height"])
-
-
-def _camera_of(run: Path) -> dict[str, float]:
+def _camera_of(run: Path) -> dict[str, float] | None:
+    """Return the working camera of a run, whose size its depth maps have; None where it is unknown."""
     try:
         camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
         return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot tell the camera of the run {run} from its provenance.json: {error}") from None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _input_settings(run: Path) -> InputSettings:
-    """How the run read its input; truth is thinned by nothing: frames are found by their numbers."""
+    """Return how the run read its input, but for skipped frames: the truth is needed for every frame number."""
     file = run / "config.toml"
     try:
         settings = Config.load(file=file).input if file.is_file() else InputSettings()

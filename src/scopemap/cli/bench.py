@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scopemap.cli.figures import without_nan
+from scopemap.benchmark.result import without_nan
 from scopemap.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 def bench(
     plan: Annotated[
         str | None,
-        typer.Argument(metavar="PLAN", help="A TOML file, or a plan that comes along; left out: lists these."),
+        typer.Argument(
+            metavar="PLAN", help="A TOML file, or one of the plans of the package; without it these are listed."
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for runs, tables and figures; go on there if it has some.")
+        Path | None, typer.Option(help="Folder for runs, tables and figures; continues what is there.")
     ] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder that the plan's paths lie below.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the plan's paths.")] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
     timeout_s: Annotated[
         float | None, typer.Option("--timeout", min=1, help="Seconds after which a run is ended.")
@@ -42,21 +44,20 @@ def bench(
         return
     if out is None:
         raise typer.BadParameter("needed with a plan: the folder for runs, tables and figures", param_hint="--out")
-    from scopemap.benchmark.presentation import Shown, present
+    from scopemap.benchmark.figures import FinishedRun, write_results
     from scopemap.benchmark.runner import run_plan
-    from scopemap.benchmark.worker import RUN
 
     def tell(entry: Entry, result: RunResult, known: bool) -> None:
         if not (quiet or as_json):
             typer.echo(_line(result, known))
 
     benchmark = run_plan(read_plan(plan), out, data=data, retry=retry, timeout_s=timeout_s, listener=tell)
-    rows = [
-        Shown(result, entry.folder / RUN, entry.open)
+    runs = [
+        FinishedRun(result, entry.run_folder, entry.open)
         for entry, result in zip(benchmark.entries, benchmark.results, strict=True)
     ]
     title = benchmark.plan.title
-    files = present(rows, out, title=title, notes=benchmark.notes, paper_units=paper_units)
+    files = write_results(runs, out, title=title, notes=benchmark.notes, paper_units=paper_units)
     for note in [] if quiet else benchmark.notes:
         typer.echo(f"note: {note}", err=True)
     if as_json:

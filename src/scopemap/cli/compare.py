@@ -9,13 +9,13 @@ from typing import Annotated
 
 import typer
 
+from scopemap.benchmark.result import without_nan
 from scopemap.cli.evaluate import AlignChoice, UnitChoice
-from scopemap.cli.figures import without_nan
 from scopemap.cli.options import AsJson, Quiet
 
 
 def compare(
-    places: Annotated[
+    paths: Annotated[
         list[Path],
         typer.Argument(metavar="DIR...", help="Runs' folders, a benchmark's runs, or trajectory files of any system."),
     ],
@@ -26,7 +26,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
     names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
     align: Annotated[
-        AlignChoice, typer.Option(help="Fit before measuring; a benchmark's runs stand as they were measured.")
+        AlignChoice, typer.Option(help="Alignment; a benchmark's runs keep the figures that they were measured with.")
     ] = AlignChoice.SIM3,
     unit: Annotated[
         UnitChoice, typer.Option(help="Unit of trajectory files that do not say their own.")
@@ -39,20 +39,21 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Measure runs against one truth, and print and write their tables and figures."""
-    from scopemap.benchmark.comparison import compared
+    from scopemap.benchmark.comparison import compare as compare_runs
+    from scopemap.benchmark.figures import write_results
     from scopemap.benchmark.plan import ProtocolPlan
-    from scopemap.benchmark.presentation import present
     from scopemap.benchmark.tables import benchmark_tables
 
     protocol = ProtocolPlan(align=align.value, consistency=consistency)
     given = [name.strip() for name in names.split(",")] if names else []
-    rows = compared(places, truth, protocol, names=given, unit=unit.value)
-    files = [] if out is None else present(rows, out, title="Comparison", paper_units=paper_units)
+    runs = compare_runs(paths, truth, protocol, names=given, unit=unit.value)
+    results = [run.result for run in runs]
+    files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
     if as_json:
-        typer.echo(json.dumps(without_nan([asdict(row.result) for row in rows]), indent=2))
+        typer.echo(json.dumps(without_nan([asdict(result) for result in results]), indent=2))
     elif not quiet:
-        overview = benchmark_tables([row.result for row in rows])[0]
-        typer.echo(overview.without_empty().markdown())
+        overview = benchmark_tables(results)[0].without_empty()
+        typer.echo(overview.markdown())
         typer.echo(overview.caption)
         if files:
             typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables")

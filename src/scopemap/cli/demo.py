@@ -1,4 +1,4 @@
-"""`scopemap demo`: render a phantom, run the path on it, say how far it is from the truth."""
+"""`scopemap demo`: render a phantom, reconstruct it, and measure the result against the truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress, run_progress
 
 if TYPE_CHECKING:
-    from scopemap.benchmark.demonstration import Figures
+    from scopemap.benchmark.demonstration import DemoFigures
 
 
 def demo(
@@ -59,13 +59,13 @@ def _tell(text: str, silent: bool) -> None:
         typer.echo(text, err=True)
 
 
-def _summary(figures: Figures, out: Path, pictures: list[Path], seconds: float) -> dict[str, object]:
+def _summary(figures: DemoFigures, out: Path, pictures: list[Path], seconds: float) -> dict[str, object]:
     known = {key: None if math.isnan(value) else value for key, value in asdict(figures).items()}
     places = {"phantom": str(out / "phantom"), "run": str(out / "run"), "pictures": [str(file) for file in pictures]}
     return known | places | {"seconds": round(seconds, 1)}
 
 
-def _lines(figures: Figures, out: Path, seconds: float) -> list[str]:
+def _lines(figures: DemoFigures, out: Path, seconds: float) -> list[str]:
     f, run, pictures = figures, out / "run", out / "pictures"
     return [
         f"{f.tracked} of {f.frames} frames tracked over a true path of {f.path_mm:.1f} mm, in {seconds:.0f} s",

@@ -14,6 +14,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from scopemap.benchmark.result import without_nan
+
 _LABELS = {
     "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",
     "ate_hold_rmse_mm": "ATE RMSE, lost frames held (mm)",
@@ -74,15 +76,6 @@ def show(figures: dict[str, Any], form: OutputForm) -> None:
         typer.echo(_one_line(figures))
     else:
         _tables(figures)
-
-
-def without_nan(tree: Any) -> Any:
-    """Return a tree of dictionaries and lists with null where a number is not finite, as JSON wants it."""
-    if isinstance(tree, dict):
-        return {key: without_nan(value) for key, value in tree.items()}
-    if isinstance(tree, list | tuple):
-        return [without_nan(value) for value in tree]
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

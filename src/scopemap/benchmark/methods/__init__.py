@@ -1,5 +1,1 @@
-"""Ours and the baselines, behind one signature."""
-
-from scopemap.benchmark.methods.method import Method, Task, Timing
-
-__all__ = ["Method", "Task", "Timing"]
+"""The program's own method and the baselines, with one interface."""

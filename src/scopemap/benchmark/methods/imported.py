@@ -1,4 +1,4 @@
-"""A trajectory that some other system wrote, scored as if it had been run here."""
+"""ImportedTrajectory: a trajectory file of another system, scored as a run of this one."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from scopemap.trajectory.trajectory import Trajectory, write_tum
 
 
 class ImportedTrajectory:
-    """Reads the file of a sequence and seed; frames for which it has no pose are lost.
+    """Reads the file of a sequence and seed; frames without a pose in it are lost.
 
-    Raises `InputError` where the file is missing or none of its poses belongs to a frame.
+    Raises `InputError` where the file is missing or none of its poses matches a frame.
     """
 
     def __init__(self, plan: MethodPlan, data: Path | None) -> None:
         if data is None:
-            raise SettingsError(f"method '{plan.name}': imported trajectories lie below the folder that --data names")
+            raise SettingsError(f"method '{plan.name}': give --data, the folder of the imported trajectories")
         self._plan, self._data = plan, data
 
     def run(self, task: Task, out: Path) -> Timing:
-        """Write the trajectory as a run's folder; nothing is known of the time it took."""
+        """Write the trajectory as a run's folder; its time is unknown."""
         file = self._data / self._plan.files.format(sequence=task.name, seed=task.seed)
         read = read_trajectory(file, unit=self._plan.unit, kind=self._plan.kind)
         frames = [(frame.index, frame.time_s, frame.name) for frame in task.sequence.frames()]
@@ -38,30 +38,28 @@ class ImportedTrajectory:
         out.mkdir(parents=True, exist_ok=True)
         write_tum(out / "trajectory.tum", poses)
         with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
-            rows = zip(frames, poses.status.tolist(), strict=True)
-            csv.writer(table).writerows(
-                [["index", "time_s", "name", "status"]]
-                + [[index, f"{time_s:.6f}", name, status] for (index, time_s, name), status in rows]
-            )
+            writer = csv.writer(table)
+            writer.writerow(["index", "time_s", "name", "status"])
+            for (index, time_s, name), status in zip(frames, poses.status.tolist(), strict=True):
+                writer.writerow([index, f"{time_s:.6f}", name, status])
         facts = {"input": str(task.sequence.path), "imported": str(file), "convention": read.source}
         (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         return Timing()
 
 
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:
-    """Return the trajectory on frames (N,), by number where it has numbers, else by time; the others are lost.
+    """Return the trajectory at the frames (N,), matched by number where it has numbers, else by time.
 
-    A lost frame repeats the pose before it (the first known one at the start).
+    Frames without a pose are lost and repeat the pose before them (at the start, the first known one).
     """
-    frames = Trajectory(indices, times_s, np.tile(np.eye(4), (len(indices), 1, 1)), np.full(len(indices), "lost"))
+    status = np.full(len(indices), "lost", dtype="<U7")
+    frames = Trajectory(indices, times_s, np.tile(np.eye(4), (len(indices), 1, 1)), status)
     known = trajectory.rows(trajectory.tracked)
     rows_known, rows = associate(known, frames)
-    status = np.full(len(indices), "lost", dtype="<U7")
-    status[rows] = "ok"
-    if len(rows):
-        status[rows[0]] = "initial"
-    place = np.full(len(indices), -1)
-    place[rows] = rows_known
-    last = np.maximum.accumulate(place)
+    status = status.copy()
+    status[rows], status[rows[:1]] = "ok", "initial"
+    source = np.full(len(indices), -1)
+    source[rows] = rows_known
+    last = np.maximum.accumulate(source)
     last[last < 0] = rows_known[0] if len(rows) else 0
     return Trajectory(indices, times_s, known.T_world_camera[last], status)

@@ -1,57 +1,64 @@
-"""Open3D's odometries, frame to frame: two on colour and depth, two on point clouds. MIT licence, extra `baselines`.
+"""Open3D's odometries from frame to frame: two on colour and depth, two on point clouds. MIT, extra `baselines`.
 
-Steinbruecker: photometric only (Steinbruecker, Sturm and Cremers, "Real-time visual odometry from dense RGB-D images",
-ICCV Workshops 2011). Park: photometric and geometric term (Park, Zhou and Koltun, "Colored point cloud registration
-revisited", ICCV 2017). Point-to-point (Besl and McKay, 1992) and point-to-plane ICP (Chen and Medioni, 1992).
+steinbruecker: photometric term (Steinbruecker, Sturm and Cremers, "Real-time visual odometry from dense RGB-D images",
+ICCV Workshops 2011). park: photometric and geometric term (Park, Zhou and Koltun, "Colored point cloud registration
+revisited", ICCV 2017). point-to-point ICP (Besl and McKay, 1992), point-to-plane ICP (Chen and Medioni, 1992).
 
-Open3D's own defaults hold wherever they can. They are made for rooms in metres, so one of its units is 100 mm here:
-the depths of two pixels that correspond may then differ by 0.03 units = 3 mm. Every frame is aligned to the last one
-that was tracked, from no motion. Open3D calls it a success, with no motion, where no pixels correspond or its linear
-system is singular; here the frame is lost then, and the reason says so.
+Open3D's defaults are kept. They are made for rooms in metres, so one Open3D unit is 100 mm here: the depths of two
+corresponding pixels may differ by 0.03 units = 3 mm. Each frame is aligned to the last tracked one, starting from the
+identity. Open3D reports success and the identity where no pixels correspond or its linear system is singular; here the
+frame is lost then, with the reason.
 """
 
 from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
-from scopemap.tracking import FrameTracker, Track
+from scopemap.tracking import Track
 
 UNIT_MM = 100.0
-"""Length of one of Open3D's units, mm."""
+"""Length of one Open3D unit, mm."""
 
 _DEPTH_MAX_UNITS = 5.0
 _VOXEL_MM = 1.0
-_ICP_REACH_MM = 3.0
-_LEAST_SHARE = 0.1  # of the image with known depth, as our own tracker asks by default
+_ICP_MAX_DISTANCE_MM = 3.0
+_MIN_KNOWN_SHARE = 0.1  # of the image with known depth, the default of our own tracker
+_SINGULAR = "Open3D's linear system is singular: it took no step"
+
+RGBD_METHODS = {
+    "steinbruecker": "RGBDOdometryJacobianFromColorTerm",
+    "park": "RGBDOdometryJacobianFromHybridTerm",
+}
+ICP_METHODS = {
+    "point-to-point": "TransformationEstimationPointToPoint",
+    "point-to-plane": "TransformationEstimationPointToPlane",
+}
+"""Open3D's classes by the name of the method."""
 
 
-class _Motion(NamedTuple):
-    """What Open3D found: motion (4, 4) in mm from the current frame to the reference, or what was wrong."""
-
-    T_reference_current: np.ndarray
-    trouble: str = ""
+class _NoMotion(Exception):
+    """Open3D found no motion; the message is the reason."""
 
 
 class _Prepared(NamedTuple):
-    """A frame in Open3D's terms, with what it was made from."""
+    """A frame and its RGBDImage or PointCloud."""
 
     frame: Frame
     data: Any
 
 
 class _RgbdAligner:
-    """Aligns colour and depth; `term` names the class of the Jacobian in `open3d.pipelines.odometry`."""
+    """Aligns colour and depth images."""
 
     def __init__(self, open3d: Any, term: str) -> None:
-        self._open3d = open3d
-        self._term = getattr(open3d.pipelines.odometry, term)()
+        self._open3d, self._odometry = open3d, open3d.pipelines.odometry
+        self._term = getattr(self._odometry, term)()
 
     def prepare(self, frame: Frame) -> Any:
         image, depth = self._open3d.geometry.Image(np.ascontiguousarray(frame.rgb)), _depth_image(self._open3d, frame)
@@ -59,90 +66,87 @@ class _RgbdAligner:
             image, depth, depth_scale=UNIT_MM, depth_trunc=_DEPTH_MAX_UNITS, convert_rgb_to_intensity=True
         )
 
-    def align(self, current: _Prepared, reference: _Prepared) -> _Motion:
-        odometry = self._open3d.pipelines.odometry
-        success, T, information = odometry.compute_rgbd_odometry(
-            current.data,
-            reference.data,
-            _intrinsics(self._open3d, current.frame),
-            np.eye(4),
-            self._term,
-            odometry.OdometryOption(depth_max=_DEPTH_MAX_UNITS),
+    def align(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
+        camera, option = _intrinsics(self._open3d, current.frame), self._odometry.OdometryOption
+        success, T, information = self._odometry.compute_rgbd_odometry(
+            current.data, reference.data, camera, np.eye(4), self._term, option(depth_max=_DEPTH_MAX_UNITS)
         )
         if not success:
-            return _Motion(np.eye(4), "Open3D found no solution")
+            raise _NoMotion("Open3D found no solution")
         if not np.trace(information) > 0:
-            return _Motion(np.eye(4), "Open3D found no pixels that correspond")
-        if _is_identity(T) and not np.array_equal(current.frame.rgb, reference.frame.rgb):
-            return _Motion(np.eye(4), "Open3D's linear system is singular: it took no step")
-        return _Motion(_in_mm(T))
+            raise _NoMotion("Open3D found no pixels that correspond")
+        if np.array_equal(T, np.eye(4)) and not np.array_equal(current.frame.rgb, reference.frame.rgb):
+            raise _NoMotion(_SINGULAR)
+        return np.array(T)
 
 
 class _IcpAligner:
-    """Aligns point clouds; `estimation` names the class in `open3d.pipelines.registration`."""
+    """Aligns point clouds."""
 
     def __init__(self, open3d: Any, estimation: str) -> None:
-        self._open3d, self._estimation_name = open3d, estimation
-        self._estimation = getattr(open3d.pipelines.registration, estimation)()
+        self._open3d, self._registration = open3d, open3d.pipelines.registration
+        self._estimation, self._normals = getattr(self._registration, estimation)(), estimation.endswith("PointToPlane")
 
     def prepare(self, frame: Frame) -> Any:
-        cloud = self._open3d.geometry.PointCloud.create_from_depth_image(
-            _depth_image(self._open3d, frame),
-            _intrinsics(self._open3d, frame),
-            depth_scale=UNIT_MM,
-            depth_trunc=_DEPTH_MAX_UNITS,
-        ).voxel_down_sample(_VOXEL_MM / UNIT_MM)
-        if self._estimation_name == "TransformationEstimationPointToPlane":
+        depth, camera = _depth_image(self._open3d, frame), _intrinsics(self._open3d, frame)
+        create = self._open3d.geometry.PointCloud.create_from_depth_image
+        cloud = create(depth, camera, depth_scale=UNIT_MM, depth_trunc=_DEPTH_MAX_UNITS)
+        cloud = cloud.voxel_down_sample(_VOXEL_MM / UNIT_MM)
+        if self._normals:
             cloud.estimate_normals()
         return cloud
 
-    def align(self, current: _Prepared, reference: _Prepared) -> _Motion:
-        found = self._open3d.pipelines.registration.registration_icp(
-            current.data, reference.data, _ICP_REACH_MM / UNIT_MM, np.eye(4), self._estimation
+    def align(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
+        found = self._registration.registration_icp(
+            current.data, reference.data, _ICP_MAX_DISTANCE_MM / UNIT_MM, np.eye(4), self._estimation
         )
         if not found.fitness > 0:
-            return _Motion(np.eye(4), f"no points of the two clouds lie within {_ICP_REACH_MM:g} mm")
-        if _is_identity(found.transformation) and found.inlier_rmse > 0:
-            return _Motion(np.eye(4), "Open3D's linear system is singular: it took no step")
-        return _Motion(_in_mm(found.transformation))
+            raise _NoMotion(f"no points of the two clouds are within {_ICP_MAX_DISTANCE_MM:g} mm of each other")
+        if np.array_equal(found.transformation, np.eye(4)) and found.inlier_rmse > 0:
+            raise _NoMotion(_SINGULAR)
+        return np.array(found.transformation)
 
 
 class Open3dTracker:
     """A `FrameTracker` that aligns each frame to the last tracked one by an odometry of Open3D.
 
-    Masked pixels and those of unknown depth have depth 0, which Open3D leaves out. A lost frame is no reference: the
-    next one is aligned to the one before it. Nothing is random, but Open3D's threads sum
-    in any order: two runs agree to rounding, not to the last bit.
+    Masked pixels and pixels of unknown depth are not used. Two runs agree to rounding, not to the last bit: Open3D's
+    threads sum in any order.
 
-    method : a key of `OPEN3D_METHODS`. Raises `SettingsError` where Open3D cannot be imported.
+    method : a key of `RGBD_METHODS` or `ICP_METHODS`. Raises `SettingsError` where Open3D cannot be imported.
     """
 
     def __init__(self, method: str) -> None:
         self._open3d = load_open3d()
-        aligner, name = _ALIGNERS[method]
-        self._aligner = aligner(self._open3d, name)
+        self._aligner: _RgbdAligner | _IcpAligner
+        if method in RGBD_METHODS:
+            self._aligner = _RgbdAligner(self._open3d, RGBD_METHODS[method])
+        else:
+            self._aligner = _IcpAligner(self._open3d, ICP_METHODS[method])
         self._reference: _Prepared | None = None
         self._current: _Prepared | None = None
         self._T_world_last = np.eye(4)
 
     def track(self, frame: Frame) -> Track:
-        """Return the pose of a frame with depth, or say why there is none; the first with enough depth is initial."""
-        reference = self._reference.frame.index if self._reference else frame.index
+        """Return the pose of a frame with depth, or why it is lost; the first frame with enough depth is "initial"."""
+        reference = self._reference
+        index = reference.frame.index if reference else frame.index
         known = float(_known(frame).mean())
-        if known < _LEAST_SHARE:
-            return Track(frame.index, "lost", f"only {known:.0%} of the image is usable", self._T_world_last, reference)
+        if known < _MIN_KNOWN_SHARE:
+            return Track(frame.index, "lost", f"only {known:.0%} of the image is usable", self._T_world_last, index)
         self._current = self._prepared(frame)
-        if self._reference is None:
-            return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
-        motion = self._aligned(self._current, self._reference)
-        if motion.trouble:
-            return Track(frame.index, "lost", motion.trouble, self._T_world_last, reference)
-        assert self._reference.frame.T_world_camera is not None
-        self._T_world_last = self._reference.frame.T_world_camera @ motion.T_reference_current
-        return Track(frame.index, "ok", "", self._T_world_last, reference)
+        if reference is None:
+            return Track(frame.index, "initial", "fixes the world", np.eye(4), index)
+        try:
+            T_reference_current = self._motion(self._current, reference)
+        except _NoMotion as reason:
+            return Track(frame.index, "lost", str(reason), self._T_world_last, index)
+        assert reference.frame.T_world_camera is not None
+        self._T_world_last = reference.frame.T_world_camera @ T_reference_current
+        return Track(frame.index, "ok", "", self._T_world_last, index)
 
     def wants_keyframe(self) -> bool:
-        """Return True: the odometry goes from frame to frame."""
+        """Return True: every tracked frame is the reference of the next one."""
         return True
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
@@ -152,30 +156,34 @@ class Open3dTracker:
         """
         if frame.T_world_camera is None:
             raise ValueError("a reference needs a pose")
-        if _known(frame).mean() < _LEAST_SHARE:
+        if _known(frame).mean() < _MIN_KNOWN_SHARE:
             return False
-        tracked = self._current
-        same = tracked is not None and tracked.frame.index == frame.index and _same_input(tracked.frame, frame)
-        # Preparing twice what did not change would be charged to the method's time.
-        self._reference = _Prepared(frame, tracked.data) if same and tracked else self._prepared(frame)
+        current = self._current
+        # Depth that was not refined is not prepared a second time.
+        if current is not None and current.frame.index == frame.index and _same_depth(current.frame, frame):
+            self._reference = _Prepared(frame, current.data)
+        else:
+            self._reference = self._prepared(frame)
         return True
 
     def _prepared(self, frame: Frame) -> _Prepared:
-        with self._quiet():
+        with self._silent():
             return _Prepared(frame, self._aligner.prepare(frame))
 
-    def _aligned(self, current: _Prepared, reference: _Prepared) -> _Motion:
+    def _motion(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
+        """Return `T_reference_current` (4, 4) in mm; raises `_NoMotion`."""
         try:
-            with self._quiet():
-                motion = self._aligner.align(current, reference)
+            with self._silent():
+                T = self._aligner.align(current, reference)
         except RuntimeError as error:
-            return _Motion(np.eye(4), f"Open3D refused: {_plain(str(error))}")
-        if not np.isfinite(motion.T_reference_current).all():
-            return _Motion(np.eye(4), "the alignment diverged")
-        return motion
+            raise _NoMotion(f"Open3D failed: {_last_line(str(error))}") from None
+        if not np.isfinite(T).all():
+            raise _NoMotion("the alignment diverged")
+        T[:3, 3] *= UNIT_MM
+        return T
 
-    def _quiet(self) -> Any:
-        """Context in which Open3D prints nothing; what it would warn of is found in its results."""
+    def _silent(self) -> Any:
+        """Context in which Open3D prints nothing."""
         utility = self._open3d.utility
         return utility.VerbosityContextManager(utility.VerbosityLevel.Error)
 
@@ -186,7 +194,7 @@ def load_open3d() -> Any:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         raise SettingsError(
-            f"running an odometry of Open3D: it cannot be imported ({_plain(str(error))}); pip install "
+            f"an odometry of Open3D cannot run: Open3D cannot be imported ({_last_line(str(error))}); pip install "
             "'scopemap[baselines]', and on Debian apt install libusb-1.0-0 libgl1 libx11-6 libegl1"
         ) from None
 
@@ -198,14 +206,14 @@ def _known(frame: Frame) -> np.ndarray:
     return frame.valid & np.isfinite(frame.depth_mm)
 
 
-def _same_input(one: Frame, other: Frame) -> bool:
+def _same_depth(one: Frame, other: Frame) -> bool:
     assert one.depth_mm is not None
     assert other.depth_mm is not None
-    same_depth = np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
-    return same_depth and np.array_equal(one.valid, other.valid) and np.array_equal(one.rgb, other.rgb)
+    return np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
 
 
 def _depth_image(open3d: Any, frame: Frame) -> Any:
+    """Depth in mm; Open3D leaves out pixels of depth 0."""
     assert frame.depth_mm is not None
     return open3d.geometry.Image(np.where(_known(frame), frame.depth_mm, 0).astype(np.float32))
 
@@ -215,33 +223,7 @@ def _intrinsics(open3d: Any, frame: Frame) -> Any:
     return open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _in_mm(T: np.ndarray) -> np.ndarray:
-    T_mm = np.array(T, dtype=np.float64)
-    T_mm[:3, 3] *= UNIT_MM
-    return T_mm
-
-
-def _is_identity(T: np.ndarray) -> bool:
-    return bool((np.asarray(T) == np.eye(4)).all())
-
-
-def _plain(message: str) -> str:
-    """Return the last line of a message, without colours of a terminal."""
+def _last_line(message: str) -> str:
+    """Return the last line of a message, without terminal colours."""
     lines = re.sub(r"\x1b\[[0-9;]*m", "", message).strip().splitlines()
     return lines[-1].strip() if lines else "no reason given"
-
-
-_ALIGNERS: dict[str, tuple[Callable[[Any, str], _RgbdAligner | _IcpAligner], str]] = {
-    "Steinbruecker (Open3D)": (_RgbdAligner, "RGBDOdometryJacobianFromColorTerm"),
-    "Park (Open3D)": (_RgbdAligner, "RGBDOdometryJacobianFromHybridTerm"),
-    "Point-to-point ICP (Open3D)": (_IcpAligner, "TransformationEstimationPointToPoint"),
-    "Point-to-plane ICP (Open3D)": (_IcpAligner, "TransformationEstimationPointToPlane"),
-}
-
-
-def _factory(method: str) -> Callable[[], FrameTracker]:
-    return lambda: Open3dTracker(method)
-
-
-OPEN3D_METHODS: dict[str, Callable[[], FrameTracker]] = {method: _factory(method) for method in _ALIGNERS}
-"""Makers of the four odometries by their titles in tables; each raises `SettingsError` where Open3D is missing."""

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from scopemap.benchmark.methods.endo_depth_and_motion import create_endo_depth_and_motion
 from scopemap.benchmark.methods.imported import ImportedTrajectory
-from scopemap.benchmark.methods.method import Method
-from scopemap.benchmark.methods.open3d_odometry import OPEN3D_METHODS
-from scopemap.benchmark.methods.pipeline_method import PipelineMethod, TrackerFactory
+from scopemap.benchmark.methods.method import Method, PipelineMethod
+from scopemap.benchmark.methods.open3d_odometry import Open3dTracker
 from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.benchmark.plan import MethodPlan
-from scopemap.config import Config
 from scopemap.errors import SettingsError
-from scopemap.tracking import FrameTracker, Tracker
+from scopemap.tracking import FrameTracker
 
-# Depth as it is and poses as tracked: consistency over time is a part of our method, not of the input that all share.
+# Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
 PLAIN = {
     "mapis.advanced.frame_scale": "none",
     "mapis.paper.blend": "none",
@@ -23,35 +23,23 @@ PLAIN = {
     "mapping.method": "none",
 }
 
+BASELINES: dict[str, Callable[[], FrameTracker]] = {
+    "endo-depth-and-motion": create_endo_depth_and_motion,
+    "steinbruecker": partial(Open3dTracker, "steinbruecker"),
+    "park": partial(Open3dTracker, "park"),
+    "point-to-point": partial(Open3dTracker, "point-to-point"),
+    "point-to-plane": partial(Open3dTracker, "point-to-plane"),
+    "standing-still": StandingStill,
+}
+"""Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
+
 
 def create_method(plan: MethodPlan, data: Path | None) -> Method:
-    """Return the method that a plan names; raises `SettingsError` for an unknown one.
-
-    `data` is the folder below which imported trajectories lie.
-    """
+    """Return the method of a plan; `data` is the folder of imported trajectories. `SettingsError` if unknown."""
     if plan.use == "import":
         return ImportedTrajectory(plan, data)
     if plan.use == "scopemap":
-        return PipelineMethod(_ours, preset=plan.preset, settings=plan.settings)
+        return PipelineMethod(plan.preset, plan.settings)
     if plan.use not in BASELINES:
         raise SettingsError(f"unknown method '{plan.use}': choose one of scopemap, import, {', '.join(BASELINES)}")
-    return PipelineMethod(BASELINES[plan.use], preset=plan.preset, settings=PLAIN | plan.settings)
-
-
-def _ours(config: Config) -> FrameTracker:
-    return Tracker(config.tracking)
-
-
-def _open3d(title: str) -> TrackerFactory:
-    return lambda config: OPEN3D_METHODS[title]()
-
-
-BASELINES: dict[str, TrackerFactory] = {
-    "endo-depth-and-motion": lambda config: create_endo_depth_and_motion(),
-    "steinbruecker": _open3d("Steinbruecker (Open3D)"),
-    "park": _open3d("Park (Open3D)"),
-    "point-to-point": _open3d("Point-to-point ICP (Open3D)"),
-    "point-to-plane": _open3d("Point-to-plane ICP (Open3D)"),
-    "standing-still": lambda config: StandingStill(),
-}
-"""Odometries of others, each on plain depth."""
+    return PipelineMethod(plan.preset, PLAIN | plan.settings, BASELINES[plan.use])

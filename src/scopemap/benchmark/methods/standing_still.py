@@ -1,4 +1,4 @@
-"""StandingStill: an odometry that never moves, so that every table shows what doing nothing scores."""
+"""StandingStill: a tracker whose camera never moves, the score of doing nothing."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from scopemap.frame import Frame
 from scopemap.tracking import Track
 
-_LEAST_SHARE = 0.1  # of the image, as our own tracker asks by default
+_MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
 
 
 class StandingStill:
-    """A `FrameTracker` that answers the first pose for every frame that shows anything.
+    """A `FrameTracker` that returns the first pose for every frame.
 
-    Frames that the others lose for want of usable pixels are lost here, too: standing still must not win by coverage.
-    A trajectory without motion has no scale, so an alignment by Sim(3) may refuse it; errors without alignment, or
-    with the origin alone, stand.
+    Frames with too few usable pixels are lost, as they are for the other methods, so that coverage is comparable. A
+    trajectory without motion has no scale: Sim(3) alignment may refuse it; errors without alignment, or with the origin
+    alone, are measured.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class StandingStill:
         """Return the identity; "lost" where less than a tenth of the image is usable."""
         share = float(frame.valid.mean())
         reference = frame.index if self._first is None else self._first
-        if share < _LEAST_SHARE:
+        if share < _MIN_USABLE_SHARE:
             return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", np.eye(4), reference)
         if self._first is None:
             self._first = frame.index
@@ -33,9 +33,9 @@ class StandingStill:
         return Track(frame.index, "ok", "", np.eye(4), reference)
 
     def wants_keyframe(self) -> bool:
-        """Return False: nothing is compared with anything."""
+        """Return False: it uses no keyframes."""
         return False
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
-        """Return False: a frame is no reference here."""
+        """Return False: it uses no keyframes."""
         return False

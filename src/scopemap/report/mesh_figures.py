@@ -1,0 +1,234 @@
+"""Figures of meshes and camera paths, without a display and without OpenGL: triangles painted from far to near.
+
+Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508.11282).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.errors import check_shape
+from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR, new_figure
+
+_SIDE_PX = 480
+_SUBPIXEL_BITS = 4
+_AMBIENT = 0.35
+_MARGIN_PX = 15
+
+
+@dataclass(frozen=True)
+class MeshView:
+    """Viewpoint of a picture of a mesh: pose (4, 4) in the world, mm, and a pinhole camera."""
+
+    T_world_camera: np.ndarray
+    camera: PinholeCamera
+
+    def project(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points (..., 3), world mm, in the camera, mm, and their pixels (..., 2)."""
+        points = transform(inverse(self.T_world_camera), points_mm)
+        return points, self.camera.project(points)
+
+
+def draw_trajectories(estimate_positions_mm: np.ndarray, reference_positions_mm: np.ndarray | None, file: Path) -> None:
+    """Draw camera positions (N, 3) and, if given, the true ones (M, 3), mm, in three orthogonal views as a PNG.
+
+    A dot marks the start; rows of NaN (lost frames) are gaps.
+    """
+    figure = new_figure(12.0, 4.2)
+    for place, (across, up) in enumerate([(0, 1), (0, 2), (2, 1)], start=1):
+        axes = figure.add_subplot(1, 3, place, aspect="equal", adjustable="datalim")
+        axes.set(xlabel=f"{'xyz'[across]} mm", ylabel=f"{'xyz'[up]} mm")
+        axes.grid(alpha=0.3)
+        for name, (colour, positions) in _paths(estimate_positions_mm, reference_positions_mm).items():
+            axes.plot(positions[:, across], positions[:, up], color=colour, label=name, linewidth=1.6)
+            known = positions[np.isfinite(positions).all(axis=1)]
+            axes.plot(known[:1, across], known[:1, up], "o", color=colour, markersize=7, markeredgecolor="black")
+        if up == 1:
+            axes.invert_yaxis()  # the world's y points down
+    figure.axes[0].legend(title="dot: start")
+    figure.savefig(file)
+
+
+def draw_mesh(
+    mesh: trimesh.Trimesh,
+    file: Path,
+    T_world_view: np.ndarray | None = None,
+    reference_mesh: trimesh.Trimesh | None = None,
+) -> None:
+    """Draw a mesh, world mm, as a PNG: from `T_world_view` (4, 4), and from two sides outside.
+
+    A reference mesh (the truth) is drawn below from the same views. Without `T_world_view` there are only the outside
+    views; an empty mesh gives empty views.
+    """
+    framed = reference_mesh if reference_mesh is not None and not len(mesh.faces) else mesh
+    views = {} if T_world_view is None else {"from the camera": inside_view(T_world_view)}
+    views |= outside_views(framed, T_world_view)
+    meshes = {"": mesh} | ({} if reference_mesh is None else {"truth, ": reference_mesh})
+    figure = new_figure(4.0 * len(views), 4.6 * len(meshes))
+    grid = figure.subplots(len(meshes), len(views), squeeze=False)
+    for row, (prefix, drawn) in zip(grid, meshes.items(), strict=True):
+        for axes, (title, view) in zip(row, views.items(), strict=True):
+            axes.imshow(render_mesh(drawn, view))
+            axes.set_axis_off()
+            axes.set_title(prefix + title)
+    figure.savefig(file)
+
+
+def draw_reconstruction(
+    mesh: trimesh.Trimesh,
+    estimate_positions_mm: np.ndarray,
+    reference_positions_mm: np.ndarray | None,
+    file: Path,
+    T_world_view: np.ndarray | None = None,
+) -> None:
+    """Draw a mesh with the estimated (N, 3) and the true (M, 3) camera positions over it, all world mm, as a PNG.
+
+    Views: from behind `T_world_view` (4, 4), the first camera, and from two sides outside; without it only from
+    outside. A dot marks the start; rows of NaN (lost frames) are gaps.
+    """
+    paths = _paths(estimate_positions_mm, reference_positions_mm)
+    # The truth is drawn first and broader: where both agree it is the edge of the estimate.
+    widths_px = {"truth": 5, "estimate": 2}
+    everywhere = np.concatenate([positions for _, positions in paths.values()])
+    views = {} if T_world_view is None else {"from behind the start": view_from_behind(T_world_view, everywhere)}
+    views |= outside_views(mesh, T_world_view, everywhere)
+    figure = new_figure(4.6 * len(views), 5.2)
+    for axes, (title, view) in zip(figure.subplots(1, len(views), squeeze=False)[0], views.items(), strict=True):
+        picture = render_mesh(mesh, view)
+        for name, (colour, positions) in paths.items():
+            draw_path(picture, view, positions, colour, thickness_px=widths_px[name])
+        axes.imshow(_cropped(picture))
+        axes.set_axis_off()
+        axes.set_title(title)
+    for name, (colour, _) in reversed(paths.items()):
+        figure.axes[0].plot([], [], color=colour, linewidth=widths_px[name], label=name)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title="dot: start")
+    figure.savefig(file)
+
+
+def _paths(estimate_mm: np.ndarray, reference_mm: np.ndarray | None) -> dict[str, tuple[str, np.ndarray]]:
+    """Return colour and positions by name, in the order in which they are drawn."""
+    check_shape("estimate_positions_mm", estimate_mm, (None, 3))
+    if reference_mm is None:
+        return {"estimate": (ESTIMATE_COLOUR, estimate_mm)}
+    check_shape("reference_positions_mm", reference_mm, (None, 3))
+    return {"truth": (TRUTH_COLOUR, reference_mm), "estimate": (ESTIMATE_COLOUR, estimate_mm)}
+
+
+def inside_view(T_world_camera: np.ndarray, field_of_view_rad: float = 1.6) -> MeshView:
+    """Return the square view of a camera at `T_world_camera` (4, 4)."""
+    focal_px = 0.5 * _SIDE_PX / np.tan(0.5 * field_of_view_rad)
+    centre_px = 0.5 * (_SIDE_PX - 1)
+    return MeshView(T_world_camera, PinholeCamera(focal_px, focal_px, centre_px, centre_px, _SIDE_PX, _SIDE_PX))
+
+
+def view_from_behind(T_world_camera: np.ndarray, positions_mm: np.ndarray) -> MeshView:
+    """Return the view along a camera (4, 4) from so far behind that the positions (N, 3), mm, are in view."""
+    known = positions_mm[np.isfinite(positions_mm).all(axis=1)]
+    R, centre = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    view = inside_view(T_world_camera)
+    local = np.concatenate([(known - centre) @ R, np.zeros((1, 3))])
+    # A point is in view where |x| and |y| are below its distance times the tangent of half the angle; 0.8: a margin.
+    tangent = 0.8 * 0.5 * (view.camera.width - 1) / view.camera.fx
+    needed_mm = np.abs(local[:, :2]).max(axis=1) / tangent - local[:, 2]
+    behind_mm = float(needed_mm.max()) + 0.25 * float(np.ptp(local, axis=0).max()) + 1.0
+    return MeshView(se3(R, centre - behind_mm * R[:, 2]), view.camera)
+
+
+def outside_views(
+    mesh: trimesh.Trimesh, T_world_camera: np.ndarray | None = None, positions_mm: np.ndarray | None = None
+) -> Mapping[str, MeshView]:
+    """Return two views of the whole mesh from opposite sides, upright for the camera at `T_world_camera` (4, 4).
+
+    Positions (N, 3), mm, are in view, too; those of NaN do not count.
+    """
+    R = np.eye(3) if T_world_camera is None else T_world_camera[:3, :3]
+    points = [np.empty((0, 3)) if positions_mm is None else positions_mm[np.isfinite(positions_mm).all(axis=1)]]
+    points += [np.asarray(mesh.bounds)] if len(mesh.vertices) else []
+    shown = np.concatenate(points)
+    low, high = (shown.min(axis=0), shown.max(axis=0)) if len(shown) else (np.zeros(3), np.ones(3))
+    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    # From 4 radii away the sphere around the mesh fills a field of view of 2 asin(1/4).
+    angle_rad = 2.1 * float(np.arcsin(0.25))
+    views = {}
+    for name, yaw_rad in (("from outside", -1.0), ("from the other side", 2.1)):
+        R_view = R @ so3_exp(np.array([0.0, yaw_rad, 0.0])) @ so3_exp(np.array([-0.45, 0.0, 0.0]))
+        views[name] = inside_view(se3(R_view, centre - 4.0 * radius * R_view[:, 2]), angle_rad)
+    return views
+
+
+def render_mesh(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
+    """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
+
+    Both sides of a triangle are drawn; triangles that reach behind the camera are left out.
+    """
+    camera = view.camera
+    picture = np.full((camera.height, camera.width, 3), 255, np.uint8)
+    corners, pixels = view.project(np.asarray(mesh.vertices)[mesh.faces])
+    inside = (pixels.max(1) > -1).all(1) & (pixels.min(1) < [camera.width, camera.height]).all(1)
+    drawn = np.flatnonzero(inside & (corners[..., 2] > 0).all(1))
+    drawn = drawn[np.argsort(-corners[drawn, :, 2].mean(1), kind="stable")]
+    colours = np.round(_shades(corners[drawn]) * _face_colours(mesh)[drawn])
+    for outline, colour in zip(_fixed_point(pixels[drawn]), colours.tolist(), strict=True):
+        cv2.fillConvexPoly(picture, outline, colour, cv2.LINE_8, _SUBPIXEL_BITS)
+    return picture
+
+
+def draw_path(
+    picture: np.ndarray, view: MeshView, positions_mm: np.ndarray, colour: str, *, thickness_px: int = 2
+) -> None:
+    """Draw a path of positions (N, 3), world mm, over a picture (H, W, 3) uint8 of a view, in place, its start a dot.
+
+    `colour` is "#rrggbb". The mesh does not hide the path. Rows of NaN, and positions behind the view, are gaps.
+    """
+    rgb = tuple(int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    points, pixels = view.project(positions_mm)
+    shown = points[:, 2] > 0
+    ends = _fixed_point(np.where(shown[:, None], pixels, 0)).tolist()
+    for row in np.flatnonzero(shown[:-1] & shown[1:]):
+        cv2.line(picture, ends[row], ends[row + 1], rgb, thickness_px, cv2.LINE_AA, _SUBPIXEL_BITS)
+    if shown.any():
+        start = ends[int(np.argmax(shown))]
+        for radius_px, filling in ((3 + thickness_px, (0, 0, 0)), (2 + thickness_px, rgb)):
+            cv2.circle(picture, start, radius_px << _SUBPIXEL_BITS, filling, cv2.FILLED, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _fixed_point(pixels: np.ndarray) -> np.ndarray:
+    """Return pixels in OpenCV's fixed point, limited so that they do not overflow."""
+    return np.round(np.clip(pixels, -1e6, 1e6) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+
+
+def _shades(corners: np.ndarray) -> np.ndarray:
+    """(F, 1) brightness 0..1 of triangles (F, 3, 3) in the camera: ambient plus the cosine to the lamp."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    rays = corners.mean(1)
+    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(rays, axis=1)
+    cosine = np.abs((normals * rays).sum(1)) / np.maximum(lengths, 1e-12)
+    return (_AMBIENT + (1 - _AMBIENT) * cosine)[:, None]
+
+
+def _face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(F, 3) mean vertex colours; grey where the mesh has none."""
+    visual = mesh.visual
+    if not isinstance(visual, trimesh.visual.ColorVisuals) or visual.kind != "vertex":
+        return np.full((len(mesh.faces), 3), 190.0)
+    return np.asarray(visual.vertex_colors, dtype=np.float64)[mesh.faces, :3].mean(1)
+
+
+def _cropped(picture: np.ndarray) -> np.ndarray:
+    """Return the square part of a square picture (H, H, 3) that holds all that is not white, and a margin."""
+    rows, columns = np.nonzero((picture != 255).any(axis=-1))
+    if not len(rows):
+        return picture
+    low, high = np.array([rows.min(), columns.min()]), np.array([rows.max(), columns.max()])
+    side = min(int((high - low).max()) + 2 * _MARGIN_PX, len(picture))
+    top, left = np.clip((low + high - side) // 2, 0, len(picture) - side)
+    return picture[top : top + side, left : left + side]
