@@ -10,7 +10,7 @@ from depth_measures import REMOVED, Prediction, SequenceScore
 
 from scopemap.frame import Frame
 from scopemap.report.canvas import new_figure
-from scopemap.report.pictures import colour_depth
+from scopemap.report.depth_figures import colour_depth
 
 _ROWS = 5
 _LARGEST_ERROR = 0.5

@@ -9,7 +9,8 @@ mask, depth = 15.6 / (disparity / 255 + 0.156) mm. Printed: ATE after Sim(3), TL
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +18,7 @@ import cv2
 import numpy as np
 
 from scopemap import open_sequence, read_trajectory
-from scopemap.benchmark.methods.endo_depth_and_motion import create_endo_depth_and_motion
-from scopemap.benchmark.methods.open3d_odometry import OPEN3D_METHODS
-from scopemap.benchmark.methods.timed import TimedTracker
+from scopemap.benchmark.methods.registry import BASELINES
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.depth.files import depth_files
@@ -43,16 +42,19 @@ def frames(clip: Path, count: int | None) -> Iterator[Frame]:
         yield Frame(item.index, item.time_s, rectifier.image(item.rgb), CAMERA, everywhere, depth_mm)
 
 
-def tracked(clip: Path, count: int | None, tracker: FrameTracker) -> Trajectory:
-    """Return the camera's path by one odometry."""
-    rows = []
+def tracked(clip: Path, count: int | None, tracker: FrameTracker) -> tuple[Trajectory, float]:
+    """Return the trajectory of one odometry, and its milliseconds per frame."""
+    rows, seconds = [], 0.0
     for frame in frames(clip, count):
+        started = time.perf_counter()
         track = tracker.track(frame)
         if track.status != "lost" and tracker.wants_keyframe():
             tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=False)
+        seconds += time.perf_counter() - started
         rows.append((frame.index, frame.time_s, track.T_world_camera, track.status))
     indices, times_s, poses, status = zip(*rows, strict=True)
-    return Trajectory(np.array(indices), np.array(times_s), np.stack(poses), np.array(status))
+    trajectory = Trajectory(np.array(indices), np.array(times_s), np.stack(poses), np.array(status))
+    return trajectory, 1e3 * seconds / len(rows)
 
 
 def main() -> None:
@@ -62,17 +64,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     options = parser.parse_args()
     clip = options.data / "endoscopy/c3vd/cecum_t1_a"
-    methods: dict[str, Callable[[], FrameTracker]] = {
-        "Endo-Depth-and-Motion": create_endo_depth_and_motion,
-        **OPEN3D_METHODS,
-    }
     print("| method | ATE | TLR | rotation mean / max | tracking ms |\n|---|---|---|---|---|", flush=True)
-    for name, create in methods.items():
-        tracker = TimedTracker(create())
-        path = tracked(clip, options.frames, tracker)
-        report = pose_report(match(path, read_trajectory(clip), "sim3"))
+    for name in sorted(set(BASELINES) - {"standing-still"}):
+        trajectory, ms = tracked(clip, options.frames, BASELINES[name]())
+        report = pose_report(match(trajectory, read_trajectory(clip), "sim3"))
         rotation = f"{report.rotation_unaligned_mean_deg:.1f} / {report.rotation_unaligned_max_deg:.1f}"
-        ms = 1e3 * tracker.seconds / len(path)
         print(f"| {name} | {report.ate_rmse_mm:.2f} | {report.tlr:.2f} | {rotation} | {ms:.0f} |", flush=True)
 
 

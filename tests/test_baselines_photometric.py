@@ -1,8 +1,7 @@
-"""The tracker after Endo-Depth-and-Motion, standing still, and the clock around a tracker."""
+"""The tracker after Endo-Depth-and-Motion, and standing still."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from tiny_phantom import FRAMES, true_poses, with_true_depth, write_tiny
 
 from scopemap.benchmark.methods.endo_depth_and_motion import SETTINGS, create_endo_depth_and_motion
 from scopemap.benchmark.methods.standing_still import StandingStill
-from scopemap.benchmark.methods.timed import TimedTracker
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, TrackingSettings
 from scopemap.errors import AlignmentError
@@ -22,7 +20,7 @@ from scopemap.geometry.se3 import rotation_angle_rad
 from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner import reconstruct
-from scopemap.tracking import FrameTracker, Track
+from scopemap.tracking import FrameTracker
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.trajectory.formats.opening import read_trajectory
 
@@ -139,48 +137,6 @@ def test_standing_still_never_becomes_a_reference() -> None:
     assert still.track(_frame(6)).keyframe == 5
     assert not still.wants_keyframe()
     assert not still.adopt(_frame(6), measured=True)
-
-
-# ---- the clock
-
-
-class _Slow:
-    """Takes its time, and remembers what it was asked."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[str, int]] = []
-
-    def track(self, frame: Frame) -> Track:
-        time.sleep(0.02)
-        self.asked.append(("track", frame.index))
-        if frame.index > 1:
-            raise RuntimeError("out of frames")
-        return Track(frame.index, "ok", "slowly", np.eye(4), 0)
-
-    def wants_keyframe(self) -> bool:
-        return len(self.asked) == 1
-
-    def adopt(self, frame: Frame, *, measured: bool) -> bool:
-        time.sleep(0.03)
-        self.asked.append(("adopt", frame.index))
-        return measured
-
-
-def test_the_clock_answers_as_the_tracker_does_and_adds_up() -> None:
-    slow = _Slow()
-    timed = TimedTracker(slow)
-    assert timed.seconds == 0
-    assert timed.track(_frame(0)).reason == "slowly"
-    assert timed.wants_keyframe()
-    assert timed.adopt(_frame(0), measured=True)
-    assert not timed.adopt(_frame(0), measured=False)
-    assert not timed.wants_keyframe()
-    with pytest.raises(RuntimeError, match="out of frames"):
-        timed.track(_frame(2))
-    assert slow.asked == [("track", 0), ("adopt", 0), ("adopt", 0), ("track", 2)]
-    assert timed.track_s >= 0.04  # the call that failed included
-    assert timed.adopt_s >= 0.06
-    assert timed.seconds == timed.track_s + timed.adopt_s
 
 
 # ---- real frames

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_trajectories import write_c3vd
 
-from scopemap.benchmark.entry import Entry, entries_of, render_phantom
+from scopemap.benchmark.entry import Entry, entries_of
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
 from scopemap.benchmark.runner import run_plan
@@ -175,9 +175,9 @@ def test_a_phantom_along_a_path_from_a_file_is_rendered_once_for_all_methods(tmp
     old = 'scene = "tube", frames = 5, seed = 4, width = 64, height = 48, events = "black:2-3"'
     new = 'scene = "colon", frames = 3, width = 64, height = 48, path_file = "pose.txt"'
     *_, entry, _ = [row for row in rows_of(SMALL.replace(old, new), tmp_path) if row.method.name == "ours"]
-    render_phantom(entry)
+    entry.render_phantom()
     first = (entry.source / "mesh_truth.ply").stat().st_mtime_ns
-    render_phantom(entry)
+    entry.render_phantom()
     assert (entry.source / "mesh_truth.ply").stat().st_mtime_ns == first
     np.testing.assert_allclose(read_poses(entry.source / "pose.txt")[:, :3, 3].std(axis=0).max(), np.std([0, 1, 2]))
 

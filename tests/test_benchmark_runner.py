@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from scopemap.benchmark import runner
+from scopemap.benchmark.entry import Entry
 from scopemap.benchmark.plan import Plan, read_plan
 from scopemap.benchmark.result import RunResult
 from scopemap.benchmark.runner import Benchmark, run_plan
@@ -30,7 +31,7 @@ protocols = ["evo"]
 
 [[sequence]]
 name = "colon"
-phantom = { scene = "colon", frames = 8, seed = 3, width = 160, height = 128 }
+phantom = { scene = "colon", frames = 6, seed = 3, width = 160, height = 128 }
 depth = "true"
 
 [[method]]
@@ -45,6 +46,31 @@ name = "imported"
 use = "import"
 files = "{sequence}.txt"
 """
+
+
+# A worker that leaves a row: it imports nothing, so it takes no time.
+FINISHES = """
+import json, os, sys, time
+from pathlib import Path
+
+def wait(folder):
+    from scopemap.benchmark.runner import end_with_parent
+    end_with_parent()
+    Path(folder, "draft").write_text(str(os.getpid()))
+    Path(folder, "draft").rename(Path(folder, "pid"))
+    time.sleep(60)
+
+entry, key = Path(sys.argv[1]), sys.argv[2]
+method = json.loads(entry.read_text())["method"]["name"]
+# the work
+row = {"sequence": "colon", "method": method, "figures": {"poses": {"ate_rmse_mm": 1.5}}, "facts": {"key": key}}
+entry.with_name("result.json").write_text(json.dumps(row))
+"""
+
+
+def command(code: str) -> Callable[[Path], list[str]]:
+    """What runs `code` instead of a method."""
+    return lambda file: [sys.executable, "-c", code, str(file), Entry.load(file).key]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +96,7 @@ def test_every_method_is_a_row_and_one_that_dies_says_so(done: tuple[Benchmark, 
     ours, still, imported = done[0].results
     assert [row.status for row in (ours, still, imported)] == ["done", "done", "failed"]
     assert "colon.txt" in imported.error
-    assert ours.figures["poses"]["tracked"] == 8
+    assert ours.figures["poses"]["tracked"] == 6
     assert 0 < ours.figure("poses", "ate_rmse_mm") < still.figure("poses", "ate_rmse_mm")
     assert math.isnan(imported.figure("poses", "ate_rmse_mm"))
     assert {"poses", "paper", "evo", "depth", "surface"} <= set(ours.figures)
@@ -101,32 +127,22 @@ def test_what_is_done_is_not_done_again(
     assert figures(again.results) == figures(done[0].results)
 
 
-def test_a_failed_row_is_run_again_when_asked_or_when_its_file_has_come(
-    plan: Plan, done: tuple[Benchmark, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_and_changed_rows_are_run_again(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = plan.model_copy(update={"method": plan.method[2:]})
-    missing = run_plan(alone, tmp_path, data=tmp_path).results
-    assert run_plan(alone, tmp_path, data=tmp_path).results == missing
-    (tmp_path / "colon.txt").write_bytes((done[1] / "phantoms" / "colon" / "pose.txt").read_bytes())
-    monkeypatch.setattr(runner, "worker_command", lambda file: [sys.executable, "-c", "raise ValueError('once')"])
-    (died,) = run_plan(alone, tmp_path, data=tmp_path).results
-    assert died.error == "ValueError: once"
-    monkeypatch.undo()
-    assert run_plan(alone, tmp_path, data=tmp_path).results == [died]
-    (row,) = run_plan(alone, tmp_path, data=tmp_path, retry=True).results
-    assert row.status == "done"
-    assert row.figure("poses", "ate_rmse_mm") == pytest.approx(0, abs=1e-6)
-    assert math.isnan(row.figure("poses", "no such figure"))
 
+    def run(code: str, changed: Plan = alone, **options: Any) -> RunResult:
+        monkeypatch.setattr(runner, "worker_command", command(code))
+        return run_plan(changed, tmp_path, data=tmp_path, **options).results[0]
 
-def test_a_changed_plan_is_run_again(plan: Plan, done: tuple[Benchmark, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = plan.model_copy(update={"settings": plan.settings | {"tracking.huber": 2.0}, "method": plan.method[:1]})
-    monkeypatch.setattr(runner, "worker_command", lambda file: [sys.executable, "-c", "print('ran')"])
-    (row,) = run_plan(changed, done[1], data=done[1]).results
-    assert (row.status, row.error) == ("failed", "ended without a result")
-    monkeypatch.undo()
-    (again,) = run_plan(plan.model_copy(update={"method": plan.method[:1]}), done[1], data=done[1]).results
-    assert figures([again]) == figures(done[0].results[:1])
+    died = run("raise ValueError('once')")
+    assert (died.status, died.error) == ("failed", "ValueError: once")
+    assert run(FINISHES) == died
+    assert run(FINISHES, retry=True).figure("poses", "ate_rmse_mm") == 1.5
+    assert run("raise ValueError('again')").status == "done"
+    (tmp_path / "colon.txt").write_text("a file that the plan names")
+    assert run("print('ran')").error == "ended without a result"
+    other = alone.model_copy(update={"settings": alone.settings | {"fusion.enabled": False}})
+    assert run(FINISHES, other).status == "done"
 
 
 @pytest.mark.parametrize(
@@ -141,47 +157,42 @@ def test_a_changed_plan_is_run_again(plan: Plan, done: tuple[Benchmark, Path], m
 def test_however_a_method_dies_the_others_go_on(
     code: str, error: str, plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "worker_command", lambda file: [sys.executable, "-c", code])
+    monkeypatch.setattr(runner, "worker_command", command(code))
     rows = run_plan(plan, tmp_path, data=tmp_path, timeout_s=1 if "sleep" in code else None).results
     assert [(row.status, row.error) for row in rows] == [("failed", error)] * 3
 
 
-def test_killed_half_way_and_restarted_it_gives_the_same(
-    plan: Plan, done: tuple[Benchmark, Path], tmp_path: Path
-) -> None:
-    file, out = tmp_path / "plan.toml", tmp_path / "out"
-    file.write_text(PLAN)
-    start = "from scopemap.cli import main; main()"
-    command = [sys.executable, "-c", start, "bench", str(file), "--out", str(out), "--data", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as bench:
-        second = out / "runs" / "colon" / "standing-still" / "entry.json"
-        deadline = time.monotonic() + 120
-        while not second.is_file() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert second.is_file()
-        bench.send_signal(signal.SIGKILL)
-    first = (out / "runs" / "colon" / "ours" / "result.json").read_bytes()
-    assert not second.with_name("result.json").exists()
-    resumed = run_plan(plan, out, data=out)
-    assert (out / "runs" / "colon" / "ours" / "result.json").read_bytes() == first
-    expected = [row.replace(str(done[1]), str(out)) for row in figures(done[0].results)]
-    assert figures(resumed.results) == expected
-
-
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc to see whether a process is alive")
-def test_a_worker_ends_when_its_benchmark_is_gone(tmp_path: Path) -> None:
-    """Started with the pipe's other end closed it ends by itself, long before its work is done."""
-    code = (
-        "from scopemap.benchmark.worker import end_with_parent; import time; end_with_parent(); "
-        "print('up', flush=True); time.sleep(60)"
+def test_killed_half_way_it_continues_and_no_worker_stays(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plan.toml").write_text(PLAN)
+    work, out = FINISHES.replace("# the work", f"if method != 'ours': wait({str(tmp_path)!r})"), tmp_path / "out"
+    start = (
+        "import sys; from pathlib import Path; from scopemap.benchmark import runner, plan; "
+        "command = lambda file, code: [sys.executable, '-c', code, str(file), runner.Entry.load(file).key]; "
+        f"runner.worker_command = lambda file: command(file, {work!r}); "
+        f"runner.run_plan(plan.read_plan({str(tmp_path / 'plan.toml')!r}), Path({str(out)!r}), data=Path({str(out)!r}))"
     )
-    worker = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert worker.stdout is not None
-    assert worker.stdin is not None
-    assert worker.stdout.readline() == b"up\n"
-    worker.stdin.close()
-    assert worker.wait(20) == -signal.SIGTERM
-    assert not os.path.exists(f"/proc/{worker.pid}")
+    with subprocess.Popen([sys.executable, "-c", start]) as bench:
+        waiting = _eventually(lambda: (tmp_path / "pid").is_file())
+        bench.send_signal(signal.SIGKILL)
+    assert waiting
+    process = Path("/proc") / (tmp_path / "pid").read_text()
+    assert _eventually(lambda: not process.exists() or "zombie" in (process / "status").read_text())
+    assert not (out / "runs" / "colon" / "standing-still" / "result.json").exists()
+    monkeypatch.setattr(runner, "worker_command", command(FINISHES))
+    kept: list[bool] = []
+    resumed = run_plan(plan, out, data=out, listener=lambda entry, row, known: kept.append(known))
+    assert kept == [True, False, False]
+    assert {row.status for row in resumed.results} == {"done"}
+
+
+def _eventually(condition: Callable[[], bool], within_s: float = 60.0) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return condition()
 
 
 def test_a_folder_that_cannot_be_is_one_clear_line(plan: Plan, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from scopemap.benchmark import demonstration
-from scopemap.benchmark.demonstration import Demonstration, Figures
+from scopemap.benchmark.demonstration import DemoFigures, Demonstration
 from scopemap.cli import main
 from scopemap.errors import InputError, SettingsError
 from scopemap.io import weights
@@ -52,11 +52,11 @@ def demo(out: Path, nothing_outside: Path) -> Demonstration:
 
 
 @pytest.fixture(scope="module")
-def figures(demo: Demonstration) -> Figures:
+def figures(demo: Demonstration) -> DemoFigures:
     return demonstration.measure(demo)
 
 
-def test_every_frame_is_tracked_near_the_truth(figures: Figures) -> None:
+def test_every_frame_is_tracked_near_the_truth(figures: DemoFigures) -> None:
     assert figures.frames == figures.tracked == TINY.frames
     assert figures.path_mm > 1
     assert 0 < figures.ate_sim3_mm < 0.1 * figures.path_mm
@@ -65,7 +65,7 @@ def test_every_frame_is_tracked_near_the_truth(figures: Figures) -> None:
     assert 0 < figures.rotation_mean_deg <= figures.rotation_max_deg < 2
 
 
-def test_mesh_and_depth_resemble_the_truth(figures: Figures) -> None:
+def test_mesh_and_depth_resemble_the_truth(figures: DemoFigures) -> None:
     assert 0 < figures.mesh_median_mm < 10
     assert figures.mesh_median_mm <= figures.mesh_accuracy_mm < 40
     assert 0 < figures.mesh_completeness_mm < 40
@@ -91,7 +91,7 @@ def test_nothing_from_outside_is_used(demo: Demonstration, nothing_outside: Path
 def test_weights_that_happen_to_be_there_change_nothing() -> None:
     assert demonstration.demo_config({}).networks.perceptual == "structure"
     assert demonstration.demo_config({"networks.perceptual": "lpips"}).networks.perceptual == "lpips"
-    with pytest.raises(SettingsError, match=r"did you mean 'odometry\.huber'"):
+    with pytest.raises(SettingsError, match=r"did you mean 'tracking"):
         demonstration.demo_config({"tracking.hubert": 1})
 
 
@@ -153,7 +153,7 @@ def test_the_command(demo: Demonstration, out: Path, capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     summary = json.loads(said.out)
     assert said.err == ""
-    assert set(Figures.__dataclass_fields__) < set(summary)
+    assert set(DemoFigures.__dataclass_fields__) < set(summary)
     assert summary["tracked"] == TINY.frames
     assert all(Path(file).is_file() for file in summary["pictures"])
 

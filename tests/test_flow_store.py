@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.benchmark.flow_store import FlowStore
+from scopemap.benchmark.scoring import flow_to_previous
 from scopemap.flow.dis import DisFlow
 
 
@@ -28,9 +28,9 @@ def pair() -> tuple[np.ndarray, np.ndarray]:
 
 def test_what_is_read_back_is_what_was_first_returned(tmp_path: Path) -> None:
     Counting.asked = 0
-    first = FlowStore(Counting(), tmp_path / "dis").to_previous(7, *pair())
+    first = flow_to_previous(Counting(), 7, *pair(), tmp_path / "dis")
     once = Counting.asked
-    again = FlowStore(Counting(), tmp_path / "dis").to_previous(7, *pair())
+    again = flow_to_previous(Counting(), 7, *pair(), tmp_path / "dis")
     assert (once, Counting.asked) == (2, 2)
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -40,6 +40,6 @@ def test_what_is_read_back_is_what_was_first_returned(tmp_path: Path) -> None:
 
 
 def test_without_a_folder_nothing_is_kept_and_nothing_changes(tmp_path: Path) -> None:
-    kept = FlowStore(DisFlow(), tmp_path).to_previous(1, *pair())
-    passing = FlowStore(DisFlow()).to_previous(1, *pair())
+    kept = flow_to_previous(DisFlow(), 1, *pair(), tmp_path)
+    passing = flow_to_previous(DisFlow(), 1, *pair())
     np.testing.assert_array_equal(kept[0], passing[0])

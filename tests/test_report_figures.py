@@ -1,0 +1,261 @@
+"""Figures of a run are looked at by their pixels: the right colours in the right places, paths where they project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
+from scopemap.report.depth_figures import DepthScene, colour_depth, draw_depth_change, draw_depths
+from scopemap.report.mesh_figures import (
+    draw_mesh,
+    draw_path,
+    draw_reconstruction,
+    draw_trajectories,
+    inside_view,
+    outside_views,
+    render_mesh,
+    view_from_behind,
+)
+
+NAN = float("nan")
+
+
+def read(file: Path) -> np.ndarray:
+    return cv2.imread(str(file))[..., ::-1]
+
+
+def is_colour(picture: np.ndarray, colour: str) -> np.ndarray:
+    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    return np.asarray(np.abs(picture.astype(int) - rgb).max(-1) < 12)
+
+
+def count_colour(picture: np.ndarray, colour: str) -> int:
+    return int(is_colour(picture, colour).sum())
+
+
+def coloured_ball(centre_mm: tuple[float, float, float], radius_mm: float, rgb: tuple) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius_mm)
+    mesh.apply_translation(centre_mm)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=np.tile(np.uint8(rgb), (len(mesh.vertices), 1)))
+
+
+BALL = coloured_ball((0.0, 0.0, 60.0), 10.0, (120, 120, 220))
+
+
+def test_trajectories_show_estimate_green_and_truth_red(tmp_path: Path) -> None:
+    t = np.linspace(0, 6, 50)
+    estimate = np.stack([np.sin(t), np.cos(t), t], -1) * 10
+    estimate[20:25] = np.nan
+    draw_trajectories(estimate, estimate + 4.0, tmp_path / "both.png")
+    draw_trajectories(estimate, None, tmp_path / "alone.png")
+    both, alone = read(tmp_path / "both.png"), read(tmp_path / "alone.png")
+    assert both.shape[1] > 900
+    assert count_colour(both, ESTIMATE_COLOUR) > 500
+    assert count_colour(both, TRUTH_COLOUR) > 500
+    assert count_colour(alone, ESTIMATE_COLOUR) > 500
+    assert count_colour(alone, TRUTH_COLOUR) == 0
+
+
+def test_a_trajectory_without_any_pose_is_drawn_empty(tmp_path: Path) -> None:
+    draw_trajectories(np.full((5, 3), np.nan), None, tmp_path / "lost.png")
+    assert count_colour(read(tmp_path / "lost.png"), ESTIMATE_COLOUR) < 200
+
+
+def test_pictures_leave_the_backend_alone(tmp_path: Path) -> None:
+    before = matplotlib.get_backend(auto_select=False)
+    draw_trajectories(np.zeros((2, 3)), None, tmp_path / "t.png")
+    assert matplotlib.get_backend(auto_select=False) == before
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(1, 50), st.floats(1, 100))
+def test_depth_colours_are_a_scale(near_mm: float, span_mm: float) -> None:
+    depth = np.linspace(near_mm, near_mm + span_mm, 256)[None].astype(np.float32)
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1][0].tolist()
+    levels = [table.index(colour) for colour in colour_depth(depth, near_mm, near_mm + span_mm)[0].tolist()]
+    assert levels[0] == 0
+    assert levels[-1] == 255
+    assert (np.diff(levels) >= 0).all()
+
+
+def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:
+    depth = np.array([[np.nan, 10.0], [20.0, 500.0]])
+    rgb = colour_depth(depth, 10, 100)
+    assert rgb.dtype == np.uint8
+    assert (rgb[0, 0] == 0).all()
+    assert rgb.any(axis=-1).sum() == 3
+    with pytest.raises(ValueError, match="beyond"):
+        colour_depth(depth, 10, 10)
+
+
+def test_depth_sheet_has_a_column_per_kind(tmp_path: Path) -> None:
+    images = [np.full((60, 80, 3), (250, 0, 250), np.uint8)] * 2
+    depths = [np.linspace(10, 50, 4800).reshape(60, 80)] * 2
+    draw_depths(images, {"raw depth": depths, "refined depth": depths}, tmp_path / "three.png")
+    four = {"raw depth": depths, "refined depth": depths, "true depth": [depths[0], None]}
+    draw_depths(images, four, tmp_path / "four.png")
+    three = read(tmp_path / "three.png")
+    assert read(tmp_path / "four.png").shape[1] > three.shape[1]
+    assert count_colour(three, "#fa00fa") > 2 * 150 * 150
+    unknown = [np.full((60, 80), np.nan)]
+    draw_depths(images[:1], {"raw depth": unknown, "refined depth": unknown}, tmp_path / "unknown.png")
+    assert count_colour(read(tmp_path / "unknown.png"), "#000000") > 2 * 150 * 150
+    with pytest.raises(ValueError, match="as many"):
+        draw_depths(images, {"raw depth": depths[:1]}, tmp_path / "bad.png")
+
+
+def test_a_ball_is_painted_where_it_projects() -> None:
+    view = inside_view(np.eye(4))
+    picture = render_mesh(coloured_ball((10.0, -5.0, 50.0), 8.0, (200, 40, 30)), view)
+    painted = (picture != 255).any(-1)
+    u, v = np.meshgrid(np.arange(view.camera.width), np.arange(view.camera.height))
+    rays = view.camera.unproject(np.stack([u, v], -1))
+    centre = np.array([10.0, -5.0, 50.0])
+    # A ray hits the ball where its distance from the centre is below the radius.
+    miss_mm = np.linalg.norm(np.cross(rays / np.linalg.norm(rays, axis=-1, keepdims=True), centre), axis=-1)
+    assert painted[miss_mm < 7.8].all()
+    assert not painted[miss_mm > 8.2].any()
+    brightest = picture[painted].max(axis=0)
+    assert brightest[0] > 190
+    assert brightest[2] < 35
+
+
+def test_near_things_hide_far_things() -> None:
+    near, far = coloured_ball((0, 0, 40.0), 5.0, (0, 200, 0)), coloured_ball((0, 0, 80.0), 30.0, (200, 0, 0))
+    for meshes in ((near, far), (far, near)):
+        view = inside_view(np.eye(4))
+        picture = render_mesh(trimesh.util.concatenate(meshes), view)
+        middle = picture[view.camera.height // 2, view.camera.width // 2]
+        assert middle[1] > 100
+        assert middle[0] == 0
+
+
+def test_outside_views_hold_the_whole_mesh() -> None:
+    mesh = coloured_ball((300.0, -40.0, 900.0), 55.0, (90, 90, 200))
+    for view in outside_views(mesh, se3(np.eye(3), np.array([300.0, -40.0, 900.0]))).values():
+        pixels = view.camera.project((mesh.vertices - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3])
+        assert pixels.min() >= 0
+        assert pixels.max() <= view.camera.width - 1
+        assert (render_mesh(mesh, view) != 255).any(-1).mean() > 0.15
+
+
+def test_mesh_picture_shows_mesh_and_truth(tmp_path: Path) -> None:
+    mesh, truth = coloured_ball((0, 0, 60.0), 20.0, (0, 0, 220)), coloured_ball((0, 0, 60.0), 20.0, (220, 0, 0))
+    empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    draw_mesh(mesh, tmp_path / "with.png", np.eye(4), truth)
+    draw_mesh(mesh, tmp_path / "without.png")
+    draw_mesh(empty, tmp_path / "empty.png", np.eye(4))
+    both, alone = read(tmp_path / "with.png").astype(int), read(tmp_path / "without.png").astype(int)
+    assert ((both[..., 2] > 60) & (both[..., 0] < 5)).sum() > 5000
+    assert ((both[..., 0] > 60) & (both[..., 2] < 5)).sum() > 5000
+    assert ((alone[..., 0] > 60) & (alone[..., 2] < 5)).sum() == 0
+    assert (read(tmp_path / "empty.png") > 250).mean() > 0.95
+
+
+# ---- depth
+
+
+def test_depth_changes_share_one_scale(tmp_path: Path) -> None:
+    image = np.full((40, 60, 3), (250, 0, 250), np.uint8)
+    flat = np.full((40, 60), 30.0)
+    ramp = flat + np.linspace(0, 10, 60)
+    steady, jumpy, unknown = (flat, flat), (flat, ramp), (flat, np.full_like(flat, NAN))
+    scene = DepthScene("colon", (image, image), {"MAPIS": steady, "plain": jumpy, "lost": unknown})
+    draw_depth_change(scene, tmp_path / "depth.png")
+    picture = read(tmp_path / "depth.png")
+    assert count_colour(picture, "#fa00fa") > 2 * 150 * 100  # the two frames
+    no_change, most = "#ffffcc", "#800026"
+    assert count_colour(picture, no_change) > 150 * 100
+    assert count_colour(picture, most) > 50
+    # Black are the unknown depth and its difference: as many panels as there are frames.
+    assert count_colour(picture, "#000000") > 0.9 * count_colour(picture, "#fa00fa")
+    draw_depth_change(DepthScene("colon", (image, image), {"MAPIS": steady}), tmp_path / "steady.png")
+    assert count_colour(read(tmp_path / "steady.png"), no_change) > 150 * 100
+
+
+# ---- paths over meshes
+
+
+def test_a_path_is_drawn_where_it_projects() -> None:
+    view = inside_view(np.eye(4))
+    picture = render_mesh(BALL, view)
+    path = np.array([[-8.0, 5.0, 40.0], [8.0, 5.0, 40.0], [NAN] * 3, [0.0, -8.0, 40.0], [0.0, -4.0, 40.0]])
+    draw_path(picture, view, path, ESTIMATE_COLOUR)
+    green = is_colour(picture, ESTIMATE_COLOUR)
+    pixels = view.camera.project(path)
+    for share in np.linspace(0.02, 0.98, 20):
+        for start, end in ((0, 1), (3, 4)):
+            u, v = np.round(pixels[start] + share * (pixels[end] - pixels[start])).astype(int)
+            assert green[v - 1 : v + 2, u - 1 : u + 2].any()
+    rows, columns = np.nonzero(green)
+    # The start is a dot.
+    assert columns.min() >= pixels[0, 0] - 6
+    assert columns.max() <= pixels[1, 0] + 2
+    # The gap: nothing between the two stretches but the ball.
+    assert not green[int(pixels[4, 1]) + 5 : int(pixels[0, 1]) - 5].any()
+    assert (rows.min(), rows.max()) == pytest.approx((pixels[3, 1], pixels[0, 1] + 4), abs=3)
+
+
+def test_the_mesh_does_not_hide_the_path() -> None:
+    view = inside_view(np.eye(4))
+    picture = render_mesh(BALL, view)
+    draw_path(picture, view, np.array([[-5.0, 0.0, 90.0], [5.0, 0.0, 90.0]]), TRUTH_COLOUR)
+    middle = picture[view.camera.height // 2, view.camera.width // 2]
+    assert is_colour(middle[None], TRUTH_COLOUR).all()
+
+
+def test_outside_views_hold_the_path_too() -> None:
+    path = np.array([[0.0, 0.0, -200.0], [NAN] * 3, [50.0, 0.0, 0.0]])
+    for view in outside_views(BALL, np.eye(4), path).values():
+        local = (path[[0, 2]] - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
+        pixels = view.camera.project(local)
+        assert (local[:, 2] > 0).all()
+        assert pixels.min() >= 0
+        assert pixels.max() <= view.camera.width - 1
+    assert len(outside_views(trimesh.Trimesh(), None, np.full((3, 3), NAN))) == 2
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(-80, 80)] * 3), min_size=1, max_size=5), st.floats(-3, 3))
+def test_a_view_from_behind_holds_every_position(points: list[tuple[float, float, float]], turn_rad: float) -> None:
+    T_world_camera = se3(so3_exp(np.array([0.3, turn_rad, -0.2])), np.array([5.0, -3.0, 20.0]))
+    positions = np.array([*points, (NAN, NAN, NAN)])
+    view = view_from_behind(T_world_camera, positions)
+    local = (positions[:-1] - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
+    pixels = view.camera.project(local)
+    assert (local[:, 2] > 0).all()
+    assert pixels.min() >= 0
+    assert pixels.max() <= view.camera.width - 1
+
+
+def test_a_reconstruction_shows_estimate_green_and_truth_red(tmp_path: Path) -> None:
+    t = np.linspace(0, 1, 30)[:, None]
+    truth = t * [20.0, 5.0, 40.0]
+    draw_reconstruction(BALL, truth + np.array([0.0, 6.0, 0.0]), truth, tmp_path / "both.png", np.eye(4))
+    draw_reconstruction(BALL, truth, truth, tmp_path / "same.png", np.eye(4))
+    draw_reconstruction(BALL, truth, None, tmp_path / "alone.png")
+    both, same, alone = (read(tmp_path / f"{name}.png") for name in ("both", "same", "alone"))
+    assert both.shape[1] > alone.shape[1] > 800
+    for picture in (both, same):
+        assert is_colour(picture, ESTIMATE_COLOUR).sum() > 500
+        # The truth is the broader line below: it shows beside an estimate that lies on it.
+        assert is_colour(picture, TRUTH_COLOUR).sum() > 500
+    assert is_colour(both, TRUTH_COLOUR).sum() > is_colour(same, TRUTH_COLOUR).sum()
+    assert is_colour(alone, ESTIMATE_COLOUR).sum() > 500
+    assert is_colour(alone, TRUTH_COLOUR).sum() == 0
+    assert (is_colour(both, "#7878dc") | ((both[..., 2] > 60) & (both[..., 0] < 0.7 * both[..., 2]))).sum() > 3000
+
+
+def test_a_reconstruction_of_nothing_is_white(tmp_path: Path) -> None:
+    lost = np.full((4, 3), NAN)
+    draw_reconstruction(trimesh.Trimesh(), lost, lost, tmp_path / "nothing.png", np.eye(4))
+    assert (read(tmp_path / "nothing.png") > 250).mean() > 0.95
