@@ -11,12 +11,14 @@ import math
 import os
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.errors import InputError, ScopemapError
 
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
@@ -62,10 +64,26 @@ def first_bytes(file: Path, count: int) -> bytes:
         return b""
 
 
-def check_pixels(claimed: float) -> None:
+@contextmanager
+def reporting(fault: str, *, quoting: bool = True) -> Iterator[None]:
+    """Turn the exceptions of a parser into `InputError` of `fault` and, with `quoting`, the parser's own message.
+
+    Damaged bytes end in exceptions of any kind. The parser's warnings are suppressed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except ScopemapError:
+        raise
+    except Exception as error:
+        raise InputError(f"{fault} ({(quoting and str(error)) or type(error).__name__})") from None
+
+
+def check_pixels(claimed: float, doing: str = "decoding an image") -> None:
     """Raise `InputError` where an image claims more pixels than the limit."""
     if claimed > most_pixels():
-        raise InputError(f"decoding an image: its header claims {limit_in_words()}")
+        raise InputError(f"{doing}: its header claims {limit_in_words()}")
 
 
 def check_bytes(what: str, claimed: int, most: int) -> None:

@@ -143,12 +143,7 @@ class ImageFolder(SourceDefaults):
             if rgb is None:
                 self._warn(f"{file} cannot be read and was left out")
                 continue
-            height, width = rgb.shape[:2]
-            if (width, height) != (self.width, self.height):
-                raise InputError(
-                    f"reading {file}: it is {width}x{height} px, those before it {self.width}x{self.height} px; "
-                    "a sequence needs frames of one size"
-                )
+            self._check_size(rgb, f"{file}: it")
             yield SourceFrame(number, self._time_s(number), rgb, file.name)
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:

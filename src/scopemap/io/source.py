@@ -12,7 +12,7 @@ import numpy as np
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import Calibration
 from scopemap.cameras.rectification import DepthSensor
-from scopemap.errors import ScopemapError
+from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import TruthQuality
 
 
@@ -119,6 +119,8 @@ class SourceDefaults:
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
     warnings: list[str]
+    width: int
+    height: int
 
     def media(self) -> str | BinaryIO | None:
         """Nothing: no video."""
@@ -131,6 +133,15 @@ class SourceDefaults:
     def truth(self, index: int) -> SourceTruth | None:
         """No truth is known."""
         return None
+
+    def _check_size(self, rgb: np.ndarray, what: str) -> None:
+        """Raise `InputError` where an image is not of the source's size."""
+        height, width = rgb.shape[:2]
+        if (width, height) != (self.width, self.height):
+            raise InputError(
+                f"reading {what} is {width}x{height} px, those before it are {self.width}x{self.height} px; a sequence "
+                "needs frames of one size"
+            )
 
     def _warn(self, message: str) -> None:
         """Add a warning, once."""

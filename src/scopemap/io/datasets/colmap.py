@@ -11,13 +11,11 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
+from scopemap.frame import TruthQuality
 from scopemap.io.images import ImageFolder, image_files
-from scopemap.io.source import SourceTruth
 from scopemap.trajectory.formats.colmap import camera_poses
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
@@ -34,6 +32,7 @@ class ColmapFolder(ImageFolder):
     """
 
     name = "colmap"
+    quality: TruthQuality = "sfm"
 
     def __init__(self, path: Path) -> None:
         found = _model(path)
@@ -54,22 +53,13 @@ class ColmapFolder(ImageFolder):
         posed = {number: image for number, image in here.items() if image.is_posed}
         if not posed:
             raise InputError(f"reading {images_file}: every pose of the images that are here holds NaN or infinity")
-        self._poses = dict(zip(posed, camera_poses(list(posed.values())), strict=True))
+        self.poses = dict(zip(posed, camera_poses(list(posed.values())), strict=True))
         self._report_model(images_file, len(images), len(here))
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether there is a model in `path` or in one of its usual places below, and images beside it."""
         return path.is_dir() and _model(path) is not None and any(_image_folders(path))
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the pose in the model; None for an image that it does not hold."""
-        return self._poses.get(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return the pose, of arbitrary scale; None for an image that the model does not hold."""
-        T_world_camera = self.pose(index)
-        return None if T_world_camera is None else SourceTruth(T_world_camera, None, "sfm")
 
     def _use_camera(self, file: Path, uses: Counter[int]) -> None:
         cameras = read_cameras(file)
@@ -94,8 +84,8 @@ class ColmapFolder(ImageFolder):
         self.notes.append(
             "poses by structure from motion (COLMAP), world-to-camera inverted; scale unknown: units are taken as mm"
         )
-        if len(self._poses) < len(self.files):
-            self.notes.append(f"{len(self.files) - len(self._poses)} of {len(self.files)} images have no pose")
+        if len(self.poses) < len(self.files):
+            self.notes.append(f"{len(self.files) - len(self.poses)} of {len(self.files)} images have no pose")
         beside = file.absolute().parent.parent.iterdir() if file.parent.name.isdecimal() else ()
         others = sorted(o.name for o in beside if o.name.isdecimal() and o.name != file.parent.name and model_files(o))
         if others:
@@ -105,8 +95,8 @@ class ColmapFolder(ImageFolder):
             )
         if here < in_model:
             self._warn(f"{in_model - here} of {in_model} images in {file} are not beside it and were left out")
-        if len(self._poses) < here:
-            self._warn(f"{here - len(self._poses)} poses in {file} hold NaN or infinity and were left out")
+        if len(self.poses) < here:
+            self._warn(f"{here - len(self.poses)} poses in {file} hold NaN or infinity and were left out")
 
 
 def _model(path: Path) -> tuple[Path, Path] | None:

@@ -85,11 +85,7 @@ class Dicom(SourceDefaults):
             if rgb is None:
                 self._warn(f"image {number} cannot be decoded and was left out")
                 continue
-            if rgb.shape[:2] != (self.height, self.width):
-                raise InputError(
-                    f"reading {self.path}: image {number} is {rgb.shape[1]}x{rgb.shape[0]} px, those before it are "
-                    f"{self.width}x{self.height} px; a sequence needs frames of one size"
-                )
+            self._check_size(rgb, f"{self.path}: image {number}")
             yield SourceFrame(number, self._time_s(number), rgb, str(number))
 
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import io
 import struct
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from scopemap.errors import InputError, ScopemapError
-from scopemap.io.decoding import check_bytes, check_pixels
+from scopemap.errors import InputError
+from scopemap.io.decoding import check_bytes, check_pixels, reporting
 from scopemap.io.video import VideoFile
 
 _IMPLICIT, _EXPLICIT = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
@@ -72,14 +71,14 @@ class Header:
     @property
     def instance(self) -> int | None:
         """The file's number in its series."""
-        with reporting(self.path):
+        with _reporting(self.path):
             value = self.fields.get("InstanceNumber")
             return None if value is None else int(value)
 
     @property
     def pixel_aspect(self) -> float | None:
         """Width of a pixel over its height; None where the file does not state it."""
-        with reporting(self.path):
+        with _reporting(self.path):
             # PS3.3, C.7.6.3.1.7: the vertical side comes first.
             down, across = self.fields.get("PixelAspectRatio") or (1, 0)
             return across / down if 0.1 < across / (down or np.nan) < 10 else None
@@ -94,7 +93,7 @@ class Header:
         is_grey = str(fields.get("PhotometricInterpretation", "")).startswith("MONOCHROME")
         if not is_grey or str(fields.get("VOILUTFunction") or "LINEAR") != "LINEAR":
             return None
-        with reporting(self.path):
+        with _reporting(self.path):
             centre, width = (np.ravel(fields.get(f"Window{name}") or np.nan)[0] for name in ("Center", "Width"))
             slope, intercept = float(fields.get("RescaleSlope") or 1), float(fields.get("RescaleIntercept") or 0)
             low, high = ((float(centre) - 0.5 + side * (float(width) - 1) / 2 - intercept) / slope for side in (-1, 1))
@@ -102,7 +101,7 @@ class Header:
 
     def clock(self) -> tuple[np.ndarray | None, float | None, str]:
         """Return times (frames,), s from the first, or None; images per second, or None; and a note of their tag."""
-        with reporting(self.path):
+        with _reporting(self.path):
             steps_ms = np.ravel(self.fields.get("FrameTimeVector") or []).astype(float)[: self.frames]
             if len(steps_ms) == self.frames > 1 and np.isfinite(steps_ms).all() and (steps_ms[1:] > 0).all():
                 return np.cumsum([0.0, *steps_ms[1:]]) / 1000, None, "FrameTimeVector"
@@ -115,24 +114,11 @@ class Header:
         return None, None, ""
 
 
-@contextmanager
-def reporting(path: Path) -> Iterator[None]:
-    """Turn the exceptions of `pydicom` into an `InputError` that quotes nothing of the file; suppress its warnings."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except ScopemapError:
-        raise
-    except Exception as error:  # damaged bytes end in exceptions of any kind
-        raise InputError(f"reading {path}: the DICOM file is damaged or incomplete ({type(error).__name__})") from None
-
-
 def read_header(file: Path) -> Header:
     """Return what a file's header holds about its images; `InputError` where it holds none, and for unread kinds."""
     import pydicom
 
-    with reporting(file), file.open("rb") as stream:
+    with _reporting(file), file.open("rb") as stream:
         fields = pydicom.dcmread(stream, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
         syntax = str(fields.file_meta.get("TransferSyntaxUID", ""))
         syntax = syntax or (_IMPLICIT if fields.original_encoding[0] else _EXPLICIT)
@@ -164,7 +150,7 @@ def images(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | No
             return
         if number in wanted:
             try:
-                with reporting(header.path):
+                with _reporting(header.path):
                     yielded = _rgb(header, content)
             except InputError:
                 yielded = None
@@ -188,6 +174,11 @@ class EncapsulatedVideo(VideoFile):
     def media(self) -> str:
         """Return FFmpeg's name of the fragments, joined."""
         return "concat:" + "|".join(f"subfile,,start,{a},end,{b},,:{self.path}" for a, b in self._fragments)
+
+
+def _reporting(path: Path) -> AbstractContextManager[None]:
+    """Turn the exceptions of `pydicom` into an `InputError` that quotes nothing of the file."""
+    return reporting(f"reading {path}: the DICOM file is damaged or incomplete", quoting=False)
 
 
 def _is_mpeg(syntax: str) -> bool:
@@ -253,7 +244,7 @@ def _packed(header: Header) -> Iterator[bytes]:
             return
         frames = generate_frames(stream, number_of_frames=header.frames)
         while True:
-            with reporting(header.path):
+            with _reporting(header.path):
                 frame = next(frames, None)
             if frame is None:
                 return

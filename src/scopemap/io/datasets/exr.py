@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.io.decoding import check_pixels
+from scopemap.io.decoding import check_pixels, reporting
 
 
 def can_read_exr() -> bool:
@@ -23,17 +22,10 @@ def read_exr_red(file: Path) -> np.ndarray:
     """
     import OpenEXR
 
-    try:
+    with reporting(f"reading {file}: no OpenEXR image with a channel R or Y, or damaged"):
         # Header first: the file's claim is checked before its pixels are decoded.
         corners = OpenEXR.File(str(file), header_only=True).header()["dataWindow"]
         width, height = (np.subtract(*reversed(corners), dtype=np.int64) + 1).tolist()
-        check_pixels(width * height)
+        check_pixels(width * height, f"reading {file}")
         channels = OpenEXR.File(str(file), separate_channels=True).channels()
-        values = channels["R" if "R" in channels else "Y"].pixels
-    except InputError as error:
-        raise InputError(f"reading {file}: {error}") from None
-    except Exception as error:  # damaged bytes end in exceptions of any kind
-        raise InputError(f"reading {file}: no OpenEXR image with a channel R or Y, or damaged ({error})") from None
-    if values.shape != (height, width):
-        raise InputError(f"reading {file}: its channel is {values.shape} in a window of {width}x{height} px")
-    return values.astype(np.float32)
+        return np.array(channels["R" if "R" in channels else "Y"].pixels, dtype=np.float32)

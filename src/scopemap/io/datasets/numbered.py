@@ -10,20 +10,19 @@ from __future__ import annotations
 import re
 import tarfile
 import threading
-import zlib
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
 from scopemap.errors import InputError
-from scopemap.io.decoding import check_bytes
+from scopemap.io.decoding import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
 _SPACING_BYTES, _BUFFER_BYTES = 32 << 20, 1 << 20
 _BLOCK_BYTES = 512
-_DAMAGE = (tarfile.TarError, OSError, EOFError, zlib.error, ValueError, OverflowError)
 
 
 class FolderFiles:
@@ -94,43 +93,34 @@ class ArchiveFiles:
 
     def _advance(self) -> None:
         """Look at the next member."""
-        try:
+        with self._reporting():
             self._tar = self._tar or _opened(self.path)
             member = self._tar.next()
             if member is None:
-                self._check_end(self._tar)
+                _check_end(self._tar)
                 self._complete = True
                 return
-        except _DAMAGE as error:
-            raise self._damaged(str(error)) from None
         # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
         if member.size < 0 or (self._last is not None and member.offset <= self._last.offset):
-            raise self._damaged(f"{member.name} has no valid size")
+            raise InputError(
+                f"reading {self.path}: the archive is damaged or incomplete ({member.name} has no valid size)"
+            )
         self._last = member
         number = _number_of(PurePosixPath(member.name).name, self._prefix, self._suffixes)
         if number is not None and member.isreg():
             self._found.setdefault(number, member)
 
-    def _check_end(self, archive: tarfile.TarFile) -> None:
-        """Raise `ValueError` unless a block of zeros follows the last member: `tarfile` ends at any other, too."""
-        assert archive.fileobj is not None
-        archive.fileobj.seek(archive.offset)
-        if archive.fileobj.read(_BLOCK_BYTES) != bytes(_BLOCK_BYTES):
-            raise ValueError("it breaks off")
-
     def _content(self, member: tarfile.TarInfo) -> bytes:
         check_bytes(f"{self.path}, {member.name}", member.size, LARGEST_FILE_BYTES)
-        try:
+        with self._reporting():
             stream = self._tar.extractfile(member) if self._tar is not None else None
             content = b"" if stream is None else stream.read()
-        except _DAMAGE as error:
-            raise self._damaged(str(error)) from None
-        if len(content) < member.size:
-            raise self._damaged(f"{member.name} breaks off")
-        return content
+            if len(content) < member.size:
+                raise EOFError(f"{member.name} breaks off")
+            return content
 
-    def _damaged(self, how: str) -> InputError:
-        return InputError(f"reading {self.path}: the archive is damaged or incomplete ({how}); download it again")
+    def _reporting(self) -> AbstractContextManager[None]:
+        return reporting(f"reading {self.path}: the archive is damaged or incomplete; download it again")
 
 
 NumberedFiles: TypeAlias = FolderFiles | ArchiveFiles
@@ -169,3 +159,11 @@ def _opened(path: Path) -> tarfile.TarFile:
 
     stream = IndexedGzipFile(str(path), spacing=_SPACING_BYTES, buffer_size=_BUFFER_BYTES)
     return tarfile.open(fileobj=stream, mode="r:")
+
+
+def _check_end(archive: tarfile.TarFile) -> None:
+    """Raise `EOFError` unless a block of zeros follows the last member: `tarfile` ends at any other, too."""
+    assert archive.fileobj is not None
+    archive.fileobj.seek(archive.offset)
+    if archive.fileobj.read(_BLOCK_BYTES) != bytes(_BLOCK_BYTES):
+        raise EOFError("it breaks off")

@@ -13,7 +13,7 @@ import threading
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import cached_property
 from importlib.util import find_spec
 from itertools import islice
@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.rosbag_messages import (
     bit_depth,
@@ -35,7 +35,7 @@ from scopemap.io.datasets.rosbag_messages import (
     is_depth,
     is_grey,
 )
-from scopemap.io.decoding import first_bytes
+from scopemap.io.decoding import first_bytes, reporting
 from scopemap.io.images import image_files, numeric_order
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 
@@ -144,12 +144,7 @@ class RosBag(SourceDefaults):
                 except InputError as error:
                     self._warn(f"image {number} of {self._topic.name} was left out: {error}")
                     continue
-                height, width = rgb.shape[:2]
-                if (width, height) != (self.width, self.height):
-                    raise InputError(
-                        f"reading {self.path}: image {number} of {self._topic.name} is {width}x{height} px, those "
-                        f"before it are {self.width}x{self.height} px; a sequence needs frames of one size"
-                    )
+                self._check_size(rgb, f"{self.path}: image {number} of {self._topic.name}")
                 time_s = self._time_s(message)
                 if time_s <= last_s:
                     self._warn(f"the stamps of {self._topic.name} do not increase: images stay as they were recorded")
@@ -249,18 +244,9 @@ class RosBag(SourceDefaults):
         except InputError as error:
             self._warn(f"after {read} messages the bag breaks off, those were used: {error}")
 
-    @contextmanager
-    def _reporting(self) -> Iterator[None]:
-        """Turn the exceptions of `rosbags` into `InputError`."""
-        try:
-            yield
-        except ScopemapError:
-            raise
-        except Exception as error:  # damaged bytes end in exceptions of any kind
-            raise InputError(
-                f"reading {self.path}: the bag is damaged or was not closed ({error or type(error).__name__}); 'rosbag "
-                "reindex', 'ros2 bag reindex' or 'mcap recover' may mend it"
-            ) from None
+    def _reporting(self) -> AbstractContextManager[None]:
+        advice = "'rosbag reindex', 'ros2 bag reindex' or 'mcap recover' may mend it"
+        return reporting(f"reading {self.path}: the bag is damaged or was not closed; {advice}")
 
     def _picture(self, message: _Message) -> np.ndarray:
         """Return the image (h, w, 3) uint8; the first one of 16 bits decides how many bits are used of all."""
