@@ -57,7 +57,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
 def by_number(files: Iterable[Path]) -> dict[int, Path]:
     """Return files by the last number in their names, ascending; `InputError` without one, or with one twice."""
     found: dict[int, Path] = {}
-    for file in sorted(files):
+    for file in sorted(file for file in files if file.is_file()):
         number = frame_number(file)
         if number is None:
             raise InputError(f"reading {file}: its name holds no number, which would be the frame's")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TypeAlias
 
@@ -32,7 +34,6 @@ from scopemap.io.datasets.stereomis import StereoMisFolder
 from scopemap.io.datasets.tum import TumRgbdFolder
 from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.images import ImageFolder
-from scopemap.io.permissions import hindrances, is_apart, may_enter
 from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import Source, assumed_camera
@@ -66,10 +67,10 @@ _KINDS: tuple[type[Reader], ...] = (
     ImageFolder,
 )
 DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
-"""The readers by name, in the order in which they are asked whether they recognise an input."""
+"""The readers by name, in the order in which `recognises` is called."""
 
 _OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
-# Those that need nothing of what lies deeper in a folder.
+# Those that need no folder inside that of the input.
 _WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
 _IMAGES = "images"
 _MOST_NAMED = 3
@@ -77,7 +78,7 @@ _USUAL_FOV_DEG = 70.0
 _SMALLEST_SIDE_PX = 32
 _DEEPEST_NESTING = 3
 _SEARCH_DEPTH = 2
-_LEAVINGS = "__MACOSX"
+_DEEPEST_CLOSED, _MOST_FOLDERS = 4, 500
 
 
 def open_sequence(
@@ -92,16 +93,16 @@ def open_sequence(
 ) -> Sequence:
     """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
 
-    `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` names the topic, too), None: told from what lies there. The
+    `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
     camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
-    of view `fov_deg`, None: 70 deg until a run knows better. `size` is the working size (width, height), px; None: the
+    of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: the
     input's, divided by the smallest whole number that brings it to 400 px. `frames` selects positions in the input.
-    `settings` say how it is read. Raises `InputError` and `CalibrationError`.
+    `settings` are those of reading. Raises `InputError` and `CalibrationError`.
     """
     selection, settings = frames or slice(None), settings or InputSettings()
     if selection.step is not None and selection.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
-    with _saying_what_cannot_be_read(path):
+    with _errors_of_the_system(path):
         reader = _reader(Path(path), dataset)
         source = prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
@@ -133,16 +134,17 @@ def open_sequence(
 
 
 def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
-    """Return the frames of an input as they are in the file, one view and one field of each as `settings` say.
+    """Return the frames of an input as they are in the file, one view and one field of each by `settings`.
 
-    What is known of their camera is not looked at, right or wrong. Raises `InputError`.
+    Their camera is not read, so that a wrong one does not matter. Raises `InputError`.
     """
-    with _saying_what_cannot_be_read(path):
+    with _errors_of_the_system(path):
         return prepared(_reader(Path(path), dataset), settings or InputSettings())
 
 
 @contextmanager
-def _saying_what_cannot_be_read(path: Path | str) -> Iterator[None]:
+def _errors_of_the_system(path: Path | str) -> Iterator[None]:
+    """Turn errors of the operating system into an `InputError`."""
     try:
         yield
     except PermissionError as error:
@@ -158,16 +160,16 @@ def _reader(path: Path, dataset: str | None) -> Reader:
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
     within: list[str] = []
-    beside: list[str] = []
+    around: list[str] = []
     if path.is_dir():
-        beside = hindrances(path)
+        around = _closed_folders(path)
         path = _innermost(path, dataset or None)
-        within = hindrances(path)
+        within = _closed_folders(path)
     elif not path.is_file():
         raise InputError(
             f"reading {path}: it is a pipe or a device; store what comes out of it as a file, and give that"
         )
-    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "images")
+    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), ImageFolder.name)
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
     if part and kind != RosBag.name:
@@ -177,37 +179,58 @@ def _reader(path: Path, dataset: str | None) -> Reader:
     if within and DATASETS[kind] not in _WITHOUT_LAYOUT:
         raise InputError(f"reading {path}: {within[0]}")
     reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
-    for hindered in list(dict.fromkeys([*within, *beside]))[:_MOST_NAMED]:
-        reader.warnings.append(f"left out: {hindered}")
+    reader.warnings += [f"left out: {closed}" for closed in list(dict.fromkeys([*within, *around]))[:_MOST_NAMED]]
     return reader
 
 
-def _innermost(path: Path, dataset: str | None) -> Path:
-    """Return the folder that the reader `dataset` recognises in `path`, `path` where none; None: that any reader does.
+def _closed_folders(folder: Path) -> list[str]:
+    """Return, as phrases, the folders in `folder` without permission; links are not followed.
 
-    Raises `InputError` where a folder holds several sequences of a data set.
+    Whether a file in such a folder exists cannot be told, so that truth would be left out silently. Four levels are
+    looked at. Raises `InputError` where `folder` itself has no permission.
     """
-    if dataset is None:
-        return _of_any_kind(path)
-    found = _stepped_into(path, [DATASETS[dataset]])
-    return found if DATASETS[dataset].recognises(found) else path
+    if not _may_enter(folder):
+        raise InputError(f"reading {folder}: no permission to look into it")
+    closed: list[str] = []
+    for root, inner, _ in islice(os.walk(folder), _MOST_FOLDERS):
+        inner[:] = [name for name in inner if not _is_ignored(name)]
+        closed += [f"no permission to look into {path}" for name in inner if not _may_enter(path := Path(root, name))]
+        if len(Path(root).relative_to(folder).parts) + 1 >= _DEEPEST_CLOSED:
+            inner.clear()
+    return closed
 
 
-def _of_any_kind(path: Path) -> Path:
-    """Return the folder in `path` that is read; a container that lies about does not hide a data set or `images`."""
+def _may_enter(folder: Path) -> bool:
+    return os.access(folder, os.R_OK | os.X_OK)
+
+
+def _is_ignored(name: str) -> bool:
+    """Return whether a folder belongs to no data set: hidden, of the file system, or left by a zip made on a Mac."""
+    return name.startswith(".") or name in ("lost+found", "__MACOSX")
+
+
+def _innermost(path: Path, dataset: str | None) -> Path:
+    """Return the folder in `path` that the reader `dataset` recognises, `path` where none; None: that any reader does.
+
+    A bag or a DICOM file that is beside a data set or `images` does not hide them. Raises `InputError` where a folder
+    holds several sequences of a data set.
+    """
+    if dataset is not None:
+        found = _descended(path, [DATASETS[dataset]])
+        return found if DATASETS[dataset].recognises(found) else path
     containers = [kind for kind in _KINDS if kind in (RosBag, Dicom)]
     others = [kind for kind in _KINDS if kind not in containers]
-    found = _stepped_into(path, others)
-    pictures = ImageFolder.recognises(found)
+    found = _descended(path, others)
+    has_images = ImageFolder.recognises(found)
     layouts = [kind for kind in others if kind not in _WITHOUT_LAYOUT]
-    if (pictures and (found == path or found.name == _IMAGES)) or any(kind.recognises(found) for kind in layouts):
+    if (has_images and (found == path or found.name == _IMAGES)) or any(kind.recognises(found) for kind in layouts):
         return found
-    # Without its package a container cannot be read, the pictures beside it can.
-    able = [kind for kind in containers if not pictures or kind.is_installed()]
-    return _stepped_into(path, [*able, *others])
+    # Without its package a container cannot be read, the images beside it can.
+    readable = [kind for kind in containers if not has_images or kind.is_installed()]
+    return _descended(path, [*readable, *others])
 
 
-def _stepped_into(path: Path, kinds: list[type[Reader]]) -> Path:
+def _descended(path: Path, kinds: list[type[Reader]]) -> Path:
     """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only."""
     for _ in range(_DEEPEST_NESTING):
         if any(kind.recognises(path) for kind in kinds):
@@ -225,7 +248,7 @@ def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
     kinds = [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
     level = _folders_in(path)
     for _ in range(_SEARCH_DEPTH):
-        level = [folder for folder in level if may_enter(folder)]
+        level = [folder for folder in level if _may_enter(folder)]
         found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
         if len(found) > 1:
             names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
@@ -237,8 +260,7 @@ def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
 
 
 def _folders_in(path: Path) -> list[Path]:
-    folders = (folder for folder in path.iterdir() if folder.is_dir())
-    return sorted(folder for folder in folders if not is_apart(folder.name) and folder.name != _LEAVINGS)
+    return sorted(folder for folder in path.iterdir() if folder.is_dir() and not _is_ignored(folder.name))
 
 
 def _calibration_of(

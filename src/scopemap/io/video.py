@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -17,9 +17,8 @@ from av.video.stream import VideoStream
 
 from scopemap.errors import InputError
 from scopemap.io.decoding import limit_in_words, most_pixels
-from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
+from scopemap.io.source import SourceDefaults, SourceFrame
 from scopemap.io.time_stamps import TimeStamps
-from scopemap.io.video_format.orientation import turns_sideways, upright
 
 DEFAULT_RATE_HZ = 30.0
 # Some headers give the unit of their clock for the rate.
@@ -55,7 +54,7 @@ class VideoFile(SourceDefaults):
             raise InputError(f"reading the video {path}: it {found}")
         self._coded_size = (first[0].width, first[0].height)
         matrix = _display_matrix(first[0])
-        sideways = matrix is not None and turns_sideways(matrix)
+        sideways = matrix is not None and _swaps_sides(matrix)
         self.width, self.height = self._coded_size[::-1] if sideways else self._coded_size
         with self._opened() as container:
             stream = container.streams.video[0]
@@ -109,14 +108,6 @@ class VideoFile(SourceDefaults):
     def media(self) -> str | BinaryIO:
         """Return what FFmpeg opens: the file's name, or its bytes where these are part of another file."""
         return str(self.path)
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """A video knows no pose."""
-        return None
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """A video knows no truth."""
-        return None
 
     def _opened(self) -> InputContainer:
         # FFmpeg takes the memory for a picture of whatever size a header claims, to look at it already.
@@ -188,9 +179,25 @@ class VideoFile(SourceDefaults):
 
 
 def _shown(frame: VideoFrame) -> np.ndarray:
-    """Return the picture (h, w, 3) uint8, sRGB, turned as it is to be shown."""
+    """Return the picture (h, w, 3) uint8, sRGB, in the orientation in which it is to be shown."""
     rgb, matrix = frame.to_ndarray(format="rgb24"), _display_matrix(frame)
     return rgb if matrix is None else upright(rgb, matrix)
+
+
+def upright(rgb: np.ndarray, matrix: Sequence[int]) -> np.ndarray:
+    """Return a picture (h, w, 3) rotated and mirrored by a display matrix, to the nearest quarter turn.
+
+    `matrix` is that of ISO/IEC 14496-12, 9 numbers a b u c d v x y w: a pixel at (x, y) is shown at
+    (a x + c y, b x + d y), up to a shift.
+    """
+    across, down = matrix[0], matrix[4]
+    if _swaps_sides(matrix):
+        rgb, across, down = rgb.transpose(1, 0, 2), matrix[3], matrix[1]
+    return np.ascontiguousarray(rgb[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
+
+
+def _swaps_sides(matrix: Sequence[int]) -> bool:
+    return abs(matrix[1]) > abs(matrix[0])
 
 
 def _display_matrix(frame: VideoFrame) -> tuple[int, ...] | None:

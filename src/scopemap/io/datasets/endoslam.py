@@ -154,7 +154,8 @@ def _find_poses(folder: Path) -> Path | None:
     """Return the file of poses in `folder`, which need not exist, or None; several are an `InputError`."""
     for pattern in _POSE_FILES:
         # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
-        found = sorted(file for file in folder.glob(pattern) if not file.name.startswith((".", "~")))
+        files = (file for file in folder.glob(pattern) if not file.name.startswith((".", "~")))
+        found = sorted(file for file in files if file.is_file())
         if len(found) > 1:
             names = ", ".join(file.name for file in found[:5])
             raise InputError(f"reading {folder}: it holds {len(found)} files of poses ({names}); leave one there")

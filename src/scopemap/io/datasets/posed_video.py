@@ -90,7 +90,8 @@ class PosedVideo(SourceDefaults):
 def videos_in(path: Path, suffix: str) -> list[Path]:
     """Return the videos with this suffix in a folder, none where it is no folder; no hidden files."""
     files = path.iterdir() if path.is_dir() else ()
-    return sorted(file for file in files if file.suffix.lower() == suffix and not file.name.startswith("."))
+    found = (file for file in files if file.suffix.lower() == suffix and not file.name.startswith("."))
+    return sorted(file for file in found if file.is_file())
 
 
 def only_video(path: Path, videos: list[Path], what: str) -> Path:
