@@ -58,7 +58,7 @@ class ArchiveFiles:
         self.path, self._prefix, self._suffixes = path, prefix, suffixes
         self._found: dict[int, tarfile.TarInfo] = {}
         self._tar: tarfile.TarFile | None = None
-        self._last: tarfile.TarInfo | None = None
+        self._last_offset = -1
         self._complete = False
         # Frames are read ahead in a thread of their own, truth in another; the stream is one.
         self._lock = threading.Lock()
@@ -100,12 +100,10 @@ class ArchiveFiles:
                 _check_end(self._tar)
                 self._complete = True
                 return
-        # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
-        if member.size < 0 or (self._last is not None and member.offset <= self._last.offset):
-            raise InputError(
-                f"reading {self.path}: the archive is damaged or incomplete ({member.name} has no valid size)"
-            )
-        self._last = member
+            # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
+            if member.size < 0 or member.offset <= self._last_offset:
+                raise EOFError(f"{member.name} has no valid size")
+        self._last_offset = member.offset
         number = _number_of(PurePosixPath(member.name).name, self._prefix, self._suffixes)
         if number is not None and member.isreg():
             self._found.setdefault(number, member)
