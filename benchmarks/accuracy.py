@@ -22,7 +22,8 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.io.datasets.reference import read_reference
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 
 HEADER = (
     "| run | frames tracked | alignment | ATE | rotation mean / max | 10: mm / deg | TLR | mesh to truth | ms |\n"

@@ -22,7 +22,8 @@ from scopemap.calibration.focal_length import focal_from_motion, with_focal_from
 from scopemap.config import Config
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 
 # Scene, horizontal field of view in degrees, seed, whether tissue breathes.
 PHANTOMS = (

@@ -24,7 +24,8 @@ from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.phantom import PhantomSpec, parse_events, write_phantom
+from scopemap.phantom.spec import PhantomSpec, parse_events
+from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 

@@ -25,7 +25,8 @@ from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.fusion import TsdfVolume
 from scopemap.io.opening import open_sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=337, height=270, seed=0)

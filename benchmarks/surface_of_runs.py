@@ -33,7 +33,8 @@ from scopemap.evaluation.surface import compare_surfaces
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.io.datasets.reference import read_reference
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
 
 HEADER = "| run | ATE | depth, one scale | depth, medians | mesh to truth | truth to mesh |\n|---|---|---|---|---|---|"

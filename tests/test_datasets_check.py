@@ -24,7 +24,8 @@ from scopemap.io.datasets.survey import FrameFigures, Survey, survey
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import SourceFrame, SourceTruth
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.text import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -25,7 +25,8 @@ from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.geometry.uncertainty import blended_share, by_variance, depth_trust, faded_share, sigma_share
-from scopemap.phantom import PhantomSpec, prepare, render_frame
+from scopemap.phantom.render import prepare, render_frame
+from scopemap.phantom.spec import PhantomSpec
 from scopemap.pipeline import Estimators, Step
 from scopemap.tracking import Tracker
 from scopemap.tracking.pyramid import build_pyramid

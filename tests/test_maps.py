@@ -25,7 +25,8 @@ from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, Correction, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
 from scopemap.tracking import Track
 from scopemap.trajectory.formats.opening import read_trajectory

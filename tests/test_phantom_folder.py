@@ -15,7 +15,9 @@ from typer.testing import CliRunner
 
 from scopemap.cli.phantom import phantom as phantom_command
 from scopemap.errors import InputError, SettingsError
-from scopemap.phantom import Event, PhantomSpec, encode_depth, parse_events, prepare, render_frame, write_phantom
+from scopemap.phantom.render import prepare, render_frame
+from scopemap.phantom.spec import Event, PhantomSpec, parse_events
+from scopemap.phantom.writer import encode_depth, write_phantom
 
 SPEC = PhantomSpec(frames=3, width=64, height=48, deform=True, breath_frames=4.0, seed=2)
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.phantom import PhantomSpec, prepare
 from scopemap.phantom.camera_path import c3vd_line, lumen_path, sweep_path
+from scopemap.phantom.render import prepare
+from scopemap.phantom.spec import PhantomSpec
 from scopemap.trajectory.formats.text import read_poses
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scopemap.phantom import PhantomSpec, parse_events, prepare, render_frame
 from scopemap.phantom.deformation import REST
 from scopemap.phantom.march import march
 from scopemap.phantom.noise import noise_at
-from scopemap.phantom.render import light
-from scopemap.phantom.shading import Look, develop, shade
+from scopemap.phantom.render import light, prepare, render_frame
+from scopemap.phantom.shading import AppearanceBuffers, develop, shade
+from scopemap.phantom.spec import PhantomSpec, parse_events
 from scopemap.phantom.volume import Volume
 
 SMALL = {"width": 96, "height": 80, "frames": 6}
@@ -30,7 +30,7 @@ def at_depth(wall: Volume, z: float) -> tuple[np.ndarray, np.ndarray]:
     T = np.eye(4)
     T[2, 3] = 60.0 - z
     surface = march(wall, camera, T, REST)
-    flat = Look(
+    flat = AppearanceBuffers(
         np.full((41, 41, 3), 0.5, np.float32), np.zeros((41, 41, 3), np.float32), np.zeros((41, 41), np.float32)
     )
     return shade(surface, flat, camera)[..., 0], surface.depth_mm
@@ -51,7 +51,7 @@ def test_highlights_sit_where_the_surface_faces_the_lamp(wall: Volume) -> None:
     T[2, 3] = 30.0
     surface = march(wall, camera, T, REST)
     zero = np.zeros((41, 41, 3), np.float32)
-    shiny = shade(surface, Look(zero, zero, np.ones((41, 41), np.float32)), camera)[..., 0]
+    shiny = shade(surface, AppearanceBuffers(zero, zero, np.ones((41, 41), np.float32)), camera)[..., 0]
     assert np.unravel_index(shiny.argmax(), shiny.shape) == (20, 20)
     assert shiny[20, 30] < 0.01 * shiny[20, 20]
 

@@ -15,7 +15,8 @@ from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Estimators, Pipeline
 from scopemap.runner import reconstruct
 

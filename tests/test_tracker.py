@@ -11,7 +11,8 @@ import pytest
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.phantom import PhantomSpec, prepare, render_frame
+from scopemap.phantom.render import prepare, render_frame
+from scopemap.phantom.spec import PhantomSpec
 from scopemap.tracking import Tracker
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.rtdl import align

@@ -32,8 +32,8 @@ def test_light_falls_with_the_cosine_of_incidence():
     tilted = wall.normal.copy()
     # Turn the right half's normals by 60 degrees about the vertical.
     c, s = np.cos(np.pi / 3), np.sin(np.pi / 3)
-    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    tilted[24, 40] = wall.normal[24, 40] @ turn.T
+    rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    tilted[24, 40] = wall.normal[24, 40] @ rotation.T
     light = shade(replace(wall, normal=tilted.astype(np.float32)), _plain_light(), bounce=0.0)
     expected = max(-float(tilted[24, 40] @ wall.rays[24, 40]), 0)
     assert light[24, 40] == pytest.approx(expected * light[24, 41], rel=1e-3)

@@ -11,8 +11,9 @@ from scipy.ndimage import minimum_filter
 from scopemap.errors import InputError
 from training.buffers import Buffers, camera_rays, create_store, decode, encode, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
+from training.random_scene import kind_of, random_scene
 from training.render import render_buffers, render_store, unlit_share
-from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene, kind_of, random_scene
+from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene
 from training.scene_tubes import wall_point
 from training.shapes import ELLIPSOID, bend_back, bump, shape_row, tube
 

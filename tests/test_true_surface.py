@@ -20,7 +20,8 @@ from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, 
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.datasets.c3vd import CAMERA
 from scopemap.io.opening import open_sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.text import read_poses
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)

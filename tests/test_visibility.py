@@ -15,7 +15,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.visibility import pixels_near, seen_samples, visible_from
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.io.datasets.c3vd import CAMERA, C3vdFolder
-from scopemap.phantom import PhantomSpec, prepare, render_frame, surface_mesh
+from scopemap.phantom.render import prepare, render_frame
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.truth_mesh import surface_mesh
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)
 HERE = np.eye(4)

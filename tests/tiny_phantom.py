@@ -9,7 +9,8 @@ import numpy as np
 
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse
-from scopemap.phantom import PhantomSpec, parse_events, write_phantom
+from scopemap.phantom.spec import PhantomSpec, parse_events
+from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FRAMES = 9

@@ -41,7 +41,7 @@ class Calibration:
 def fit_calibration(network: ScopeNet, stores: list[Store]) -> Calibration:
     """Return the calibration of a network on fresh pictures of the scenes in `stores`, as many of each."""
     rng = np.random.default_rng(_SEED)
-    told, true, log_spread, levels = [], [], [], []
+    given, true, log_spread, levels = [], [], [], []
     for n in range(_PICTURES):
         store = stores[n % len(stores)]
         sample = make_sample(store[int(rng.integers(len(store)))], np.random.default_rng((_SEED, n)))
@@ -52,11 +52,11 @@ def fit_calibration(network: ScopeNet, stores: list[Store]) -> Calibration:
         with torch.inference_mode():
             answer = network(torch.from_numpy(sample.planes)[None])[0].numpy().reshape(2, -1)[:, known]
         truth = sample.log_distance.ravel()[known]
-        told.append(answer[0] - np.median(answer[0]))
+        given.append(answer[0] - np.median(answer[0]))
         true.append(truth - np.median(truth))
         levels.append(np.median(answer[0]))
         log_spread.append(answer[1])
-    x, y, spreads = np.concatenate(told), np.concatenate(true), np.exp(np.concatenate(log_spread))
+    x, y, spreads = np.concatenate(given), np.concatenate(true), np.exp(np.concatenate(log_spread))
     fit = minimize_scalar(lambda e: float(np.abs(y - e * x).mean()), bounds=_RANGE, method="bounded")
     exponent = float(fit.x)
     # The median of |error| / b of a Laplace distribution is ln 2: outliers have no say in it.

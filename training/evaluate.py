@@ -24,7 +24,7 @@ class PictureScore:
     Attributes
     ----------
     kind : of its scene. abs_rel, delta : after median scaling. tissue : abs_rel where no instrument is seen. unscaled :
-    abs_rel of the millimetres as told. rank : Spearman's correlation of error and spread. errors, spreads : (n,), of
+    abs_rel of the millimetres as given. rank : Spearman's correlation of error and spread. errors, spreads : (n,), of
     pixels drawn at random.
     """
 

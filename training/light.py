@@ -90,7 +90,7 @@ def draw_light(rng: np.random.Generator) -> Light:
 def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
     """Return linear light (H, W, 3) float32 before exposure, the median of what is lit being about 1; 0 = nothing hit.
 
-    bounce : share of the light that comes by way of other walls, 0..0.6.
+    bounce : share of the light that comes from other walls, 0..0.6.
     """
     distance_mm = np.exp(buffers.log_distance)
     out = np.zeros((*distance_mm.shape, 3), np.float32)
@@ -176,7 +176,7 @@ def _paint(noise, part, light, rgb):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _mirrored(normal, noise, tilt, view, towards):  # type: ignore[no-untyped-def]
-    """Cosine between the wavy film's normal and the direction half way between the eye and the lamp."""
+    """Cosine between the wavy film's normal and the direction halfway between the eye and the lamp."""
     total, square, length = 0.0, 0.0, 0.0
     for c in range(3):
         wavy = normal[c] + tilt * (noise[2 + c] + noise[(3 + 2 * c) % 5])
@@ -206,12 +206,12 @@ def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, out, al
                 for c in range(3):
                     towards[c] = lamps_mm[n, c] - reach * view[c]
                     square += towards[c] * towards[c]
-                way = np.sqrt(square)
+                to_lamp = np.sqrt(square)
                 for c in range(3):
-                    towards[c] /= way
+                    towards[c] /= to_lamp
                     cosine += towards[c] * normal[c]
                 axis = max(-towards[2], 0.05)
-                power = seen * np.exp(light.fall[2] * np.log(axis) - light.fall[0] * np.log(way))
+                power = seen * np.exp(light.fall[2] * np.log(axis) - light.fall[0] * np.log(to_lamp))
                 diffuse = power * max(cosine, light.fall[3]) ** light.fall[1]
                 mirror = 0.0
                 if wet > 0:

@@ -203,10 +203,10 @@ def _trace_cone(scene, eye, d, spread, start, step, far):
     """Distance along d up to which the whole cone of half-angle `spread` (rad) is free."""
     t = start
     for _ in range(100):
-        room = 0.9 * step * _at(scene, eye, d, t) - spread * t
-        if room < _STUCK * spread * t or t > far:
+        free = 0.9 * step * _at(scene, eye, d, t) - spread * t
+        if free < _STUCK * spread * t or t > far:
             break
-        t += room / (1.0 + spread)
+        t += free / (1.0 + spread)
     return t
 
 
@@ -349,12 +349,12 @@ def _maybe_shadowed(camera, distances, hit, lamp, nearest):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _light_share(scene, start, lamp, step, soft):
     """Share (0..1) of a lamp's light that reaches a point, both in scene axes: a march with a soft edge."""
-    way = lamp - start
-    length = np.sqrt((way * way).sum())
-    way /= length
+    towards = lamp - start
+    length = np.sqrt((towards * towards).sum())
+    towards /= length
     t, share = 0.0, 1.0
     for _ in range(80):
-        f = _at(scene, start, way, t)
+        f = _at(scene, start, towards, t)
         if f <= 0.0:
             return 0.0
         if t > 0.03 * length:
@@ -372,9 +372,9 @@ def shade_shadows(scene, view, buffers, lamp, step, soft, out):
     view: eye (3,), rotation scene <- camera (3, 3), camera (7,). buffers: rays in camera axes (H, W, 3), distances
     (H, W), normals in camera axes. Only what the image says may be shadowed is marched.
     """
-    eye, turn, camera = view
+    eye, rotation, camera = view
     rays, distances, normals = buffers
-    world_lamp = eye + turn @ lamp
+    world_lamp = eye + rotation @ lamp
     nearest = np.nanmin(distances)
     for row in range(rays.shape[0]):
         for column in range(rays.shape[1]):
@@ -387,5 +387,5 @@ def shade_shadows(scene, view, buffers, lamp, step, soft, out):
                 continue
             out[row, column] = 1.0
             if _maybe_shadowed(camera, distances, (hx, hy, hz), lamp, nearest):
-                start = eye + turn @ (t * ray + 4e-3 * t * normal)
+                start = eye + rotation @ (t * ray + 4e-3 * t * normal)
                 out[row, column] = _light_share(scene, start, world_lamp, step, soft)

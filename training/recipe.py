@@ -20,9 +20,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Use:
-    """How a part is used: every `stride`-th pixel of it, `batch` pictures a step, in a stretch of the training.
+    """How a part is used: every `stride`-th pixel of it, `batch` pictures a step, in an interval of the training.
 
-    begin, end : shares of all steps. share : of the steps in that stretch, against the other uses there.
+    begin, end : shares of all steps. share : of the steps in that interval, against the other uses there.
     """
 
     part: str
@@ -67,8 +67,8 @@ class Recipe:
 
     def uses_at(self, step: int) -> list[Use]:
         """Return the uses that take part in a step."""
-        way = step / self.steps
-        return [use for use in self.uses if use.begin <= way < use.end]
+        progress = step / self.steps
+        return [use for use in self.uses if use.begin <= progress < use.end]
 
     def toml(self) -> str:
         """Return all settings as TOML that `read` reads back."""

@@ -20,9 +20,10 @@ import numpy as np
 from scopemap.errors import InputError
 from training.buffers import NOISE_PERIODS, Buffers, camera_rays, create_store, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
-from training.scene import AIRWAY, BAG, COLON, LAPAROSCOPY, SINUS, WALL, Scene, kind_of, log_uniform, random_scene
+from training.random_scene import kind_of, random_scene
+from training.scene import AIRWAY, BAG, COLON, LAPAROSCOPY, SINUS, WALL, Scene, log_uniform
 from training.shapes import noise_channels
-from training.viewpoint import FAR, View, found_well, random_tools, random_view, turned
+from training.viewpoint import FAR, SceneView, found_well, random_tools, random_view, rotated
 
 _NEAREST_MM, _FARTHEST_MM = 2.0, 400.0
 # Median distances in mm that a kind of scene is scaled to.
@@ -49,12 +50,12 @@ def render_buffers(seed: int, index: int, width: int, height: int, *, kind: int 
     raise InputError(f"rendering frame {index} of set {seed}: no scene of kind {wanted} gave a view; widen the scenes.")
 
 
-def _rendered(scene: Scene, view: View, rng: np.random.Generator) -> Buffers | None:
+def _rendered(scene: Scene, view: SceneView, rng: np.random.Generator) -> Buffers | None:
     """All buffers of a view, or None where the view turns out to be bad."""
     scene = scene.with_tools(random_tools(scene, view, rng))
     arrays = scene.arrays()
     rays = camera_rays(view.camera)
-    ahead = turned(rays, view.turn)
+    ahead = rotated(rays, view.rotation)
     distances = march_rays(arrays, view.eye, ahead, view.step, FAR)
     scale = _scale_mm(scene.kind, distances, rng)
     if scale is None:
@@ -67,7 +68,7 @@ def _rendered(scene: Scene, view: View, rng: np.random.Generator) -> Buffers | N
     noise = np.zeros((*distances.shape, len(NOISE_PERIODS)))
     periods = np.array([(period, 0 < n < 7) for n, period in enumerate(NOISE_PERIODS)])
     noise_channels(view.eye, ahead, distances, scene.seed, periods, pixel, noise)
-    normal = turned(normal, view.turn.T)
+    normal = rotated(normal, view.rotation.T)
     lamps_mm = _random_lamps(rng, scale * float(np.nanmedian(distances)))
     lit = _lit(arrays, view, (rays, distances, normal), lamps_mm / scale, rng)
     if unlit_share(scale * distances[..., None] * rays, normal, lit, lamps_mm) > _MOST_UNLIT:
@@ -113,14 +114,14 @@ def _random_lamps(rng: np.random.Generator, median_mm: float) -> np.ndarray:
 
 def _lit(
     arrays: tuple[np.ndarray, ...],
-    view: View,
+    view: SceneView,
     seen: tuple[np.ndarray, np.ndarray, np.ndarray],
     lamps: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Share (H, W, 2) float32 of each lamp's light that arrives; lamps (2, 3) in scene units."""
     soft = log_uniform(rng, 15.0, 300.0)
-    place = (view.eye, np.ascontiguousarray(view.turn), view.camera.astype(np.float64))
+    place = (view.eye, np.ascontiguousarray(view.rotation), view.camera.astype(np.float64))
     lit = np.zeros((*seen[1].shape, 2))
     for n in range(2):
         if np.isfinite(lamps[n]).all():

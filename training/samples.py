@@ -28,7 +28,7 @@ class Sample:
     Attributes
     ----------
     rgb : (H, W, 3) uint8. valid : (H, W) bool, as the masker or the field of view says.
-    rays : (H, W, 3) float32 true unit rays. told_rays : what the network is told of them, None = nothing.
+    rays : (H, W, 3) float32 true unit rays. given_rays : what the network is given of them, None = nothing.
     log_distance : (H, W) float32, ln of mm along the ray, NaN = unknown or outside the field of view.
     tissue : (H, W) bool, False where an instrument is seen.
     """
@@ -36,14 +36,14 @@ class Sample:
     rgb: np.ndarray
     valid: np.ndarray
     rays: np.ndarray
-    told_rays: np.ndarray | None
+    given_rays: np.ndarray | None
     log_distance: np.ndarray
     tissue: np.ndarray
 
     @property
     def planes(self) -> np.ndarray:
         """The network's input (8, H, W) float32."""
-        return input_planes(self.rgb, self.told_rays, self.valid)
+        return input_planes(self.rgb, self.given_rays, self.valid)
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def _told(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     """The rays as a user's calibration gives them: a little off, or not at all."""
     if rng.random() < _RAYS_UNKNOWN_SHARE:
         return None
-    told = rays * np.array([1, 1, np.exp(rng.normal(0, _FIELD_OF_VIEW_ERROR))], np.float32)
-    return told / np.linalg.norm(told, axis=-1, keepdims=True)
+    given = rays * np.array([1, 1, np.exp(rng.normal(0, _FIELD_OF_VIEW_ERROR))], np.float32)
+    return given / np.linalg.norm(given, axis=-1, keepdims=True)
 
 
 def make_batch(

@@ -14,7 +14,6 @@ from training.shapes import COLUMNS
 
 COLON, BAG, AIRWAY, SINUS, LAPAROSCOPY, WALL = 1, 2, 3, 4, 5, 6
 KINDS = {COLON: "colon", BAG: "bag", AIRWAY: "airway", SINUS: "sinus", LAPAROSCOPY: "laparoscopy", WALL: "wall"}
-_SHARES = ((COLON, 0.35), (LAPAROSCOPY, 0.25), (WALL, 0.12), (BAG, 0.10), (AIRWAY, 0.08), (SINUS, 0.10))
 _BASE = 31
 _BOUND = 30
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -70,14 +69,14 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def random_turn(rng: np.random.Generator) -> np.ndarray:
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """Return a uniformly random rotation (3, 3)."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
 
 
-def turn_to(axis: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
+def rotation_to(axis: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
     """Return a rotation (3, 3) whose first row is along `axis` (3,); rolled at random with `rng`."""
     x = axis / np.linalg.norm(axis)
     other = np.array([0.0, 0.0, 1.0]) if abs(x[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
@@ -109,25 +108,3 @@ def random_relief(rng: np.random.Generator, size: float, strength: float = 1.0) 
         rows.append([height * (0.6 if mode else 1.0), period, float(rng.integers(1 << 20)), mode])
         period *= rng.uniform(0.3, 0.6)
     return np.array(rows)
-
-
-def kind_of(index: int, seed: int) -> int:
-    """Return the kind of scene `index` of a set: the shares are fixed, the order is shuffled in blocks of 100."""
-    counts = [round(100 * share) for _, share in _SHARES]
-    deck = np.repeat([kind for kind, _ in _SHARES], counts)
-    return int(np.random.default_rng((seed, index // 100, 77)).permutation(deck)[index % 100])
-
-
-def random_scene(kind: int, rng: np.random.Generator) -> Scene:
-    """Return a random scene of that kind."""
-    from training import scene_abdomen, scene_cavities, scene_tubes
-
-    makers = {
-        COLON: scene_tubes.colon,
-        AIRWAY: scene_tubes.airway,
-        BAG: scene_cavities.bag,
-        SINUS: scene_cavities.sinus,
-        LAPAROSCOPY: scene_abdomen.laparoscopy,
-        WALL: scene_abdomen.wall,
-    }
-    return makers[kind](rng)

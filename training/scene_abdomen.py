@@ -9,7 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from training.scene import LAPAROSCOPY, WALL, Scene, log_uniform, random_relief, random_turn, random_warps, turn_to
+from training.scene import (
+    LAPAROSCOPY,
+    WALL,
+    Scene,
+    log_uniform,
+    random_relief,
+    random_rotation,
+    random_warps,
+    rotation_to,
+)
 from training.shapes import BOX, CONE, ELLIPSOID, RELIEF, SHEET, TORUS, joined, shape_row, waved
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -69,17 +78,19 @@ def laparoscopy(rng: np.random.Generator) -> Scene:
 
 def _organ(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]:
     axes = log_uniform(rng, 8, 32) * np.exp(rng.normal(0, 0.35, 3))
-    turn = turn_to(_flat_axis(rng), rng)
-    return [shape_row(ELLIPSOID, _on_floor(rng, 100, rng.uniform(-4, 12)), turn, tuple(axes), part=part, blend=blend)]
+    rotation = rotation_to(_flat_axis(rng), rng)
+    return [
+        shape_row(ELLIPSOID, _on_floor(rng, 100, rng.uniform(-4, 12)), rotation, tuple(axes), part=part, blend=blend)
+    ]
 
 
 def _lobe(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]:
     """A lobe of the liver: broad, with a thin edge that hangs over what is below."""
     long, thick = rng.uniform(25, 60), log_uniform(rng, 2.5, 10)
     axis = np.array([*rng.normal(0, 0.35, 2), 1.0])
-    turn = np.roll(turn_to(axis, rng), -1, axis=0)
+    rotation = np.roll(rotation_to(axis, rng), -1, axis=0)
     place = _on_floor(rng, 110, rng.uniform(3, 26))
-    row = shape_row(ELLIPSOID, place, turn, (long, long * rng.uniform(0.4, 0.9), thick), part=part, blend=blend)
+    row = shape_row(ELLIPSOID, place, rotation, (long, long * rng.uniform(0.4, 0.9), thick), part=part, blend=blend)
     row[RELIEF] = rng.uniform(0.2, 0.7)
     return [row]
 
@@ -88,17 +99,17 @@ def _chain(points: np.ndarray, radii: np.ndarray, part: int) -> list[np.ndarray]
     rows = []
     for start, end, r0, r1 in zip(points[:-1], points[1:], radii[:-1], radii[1:], strict=True):
         length = max(float(np.linalg.norm(end - start)), 1e-3)
-        rows.append(shape_row(CONE, start, turn_to(end - start), (length, r0, r1), part=part))
+        rows.append(shape_row(CONE, start, rotation_to(end - start), (length, r0, r1), part=part))
     return rows
 
 
 def _loop(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]:
     """A loop of bowel: a chain of swollen pieces winding over the floor."""
     radius, heading = log_uniform(rng, 4, 13), rng.uniform(0, 2 * np.pi)
-    point, points, turn = _on_floor(rng, 90, radius * rng.uniform(0, 1.2)), [], rng.normal(0, 0.4)
+    point, points, curving = _on_floor(rng, 90, radius * rng.uniform(0, 1.2)), [], rng.normal(0, 0.4)
     for _ in range(int(rng.integers(4, 8))):
         points.append(point.copy())
-        heading += turn + rng.normal(0, 0.35)
+        heading += curving + rng.normal(0, 0.35)
         point += radius * 1.8 * np.array([np.cos(heading), np.sin(heading), rng.normal(0, 0.12)])
     radii = radius * rng.uniform(0.8, 1.15, len(points))
     rows = joined(_chain(np.array(points), radii, part), 0.25 * radius)
@@ -108,8 +119,11 @@ def _loop(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]
 
 def _ring(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]:
     big = rng.uniform(10, 28)
-    small, turn = big * rng.uniform(0.25, 0.6), np.roll(turn_to(np.array([*rng.normal(0, 0.6, 2), 1.0])), -1, axis=0)
-    return [shape_row(TORUS, _on_floor(rng, 90, rng.uniform(-3, 9)), turn, (big, small), part=part, blend=blend)]
+    small, rotation = (
+        big * rng.uniform(0.25, 0.6),
+        np.roll(rotation_to(np.array([*rng.normal(0, 0.6, 2), 1.0])), -1, axis=0),
+    )
+    return [shape_row(TORUS, _on_floor(rng, 90, rng.uniform(-3, 9)), rotation, (big, small), part=part, blend=blend)]
 
 
 def _tent(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]:
@@ -117,7 +131,7 @@ def _tent(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]
     width, height = rng.uniform(5, 14), rng.uniform(15, 45)
     axis = np.array([*rng.normal(0, 0.3, 2), 1.0])
     row = shape_row(
-        CONE, _on_floor(rng, 70, -5.0), turn_to(axis), (height, width, log_uniform(rng, 0.5, 2.0)), part=part
+        CONE, _on_floor(rng, 70, -5.0), rotation_to(axis), (height, width, log_uniform(rng, 0.5, 2.0)), part=part
     )
     row[3], row[RELIEF] = max(blend, rng.uniform(3, 14)), 0.5
     return [row]
@@ -131,9 +145,9 @@ def _flap(rng: np.random.Generator, part: int, blend: float) -> list[np.ndarray]
     up = _UP + rng.normal(0, 0.45, 3)
     up -= along * (up @ along)
     up /= np.linalg.norm(up)
-    turn = np.stack([along, up, np.cross(along, up)])
+    rotation = np.stack([along, up, np.cross(along, up)])
     size = (long, high, log_uniform(rng, 0.5, 2.0), rng.uniform(0, 6.3))
-    row = shape_row(SHEET, _on_floor(rng, 70, rng.uniform(-4, 8)), turn, size, part=part, blend=blend)
+    row = shape_row(SHEET, _on_floor(rng, 70, rng.uniform(-4, 8)), rotation, size, part=part, blend=blend)
     row[RELIEF] = 0.12
     return [waved(row, rng.uniform(0, 5), rng.uniform(7, 16))]
 
@@ -179,9 +193,9 @@ def _fold(rng: np.random.Generator) -> list[np.ndarray]:
     up = _UP + rng.normal(0, 0.4, 3)
     up -= along * (up @ along)
     up /= np.linalg.norm(up)
-    turn = np.stack([along, up, np.cross(along, up)])
+    rotation = np.stack([along, up, np.cross(along, up)])
     size = (rng.uniform(15, 60), log_uniform(rng, 2, 11), log_uniform(rng, 0.5, 2.5), rng.uniform(0, 6.3))
-    row = shape_row(SHEET, _on_floor(rng, 50, 0.0), turn, size, blend=log_uniform(rng, 1.0, 9.0))
+    row = shape_row(SHEET, _on_floor(rng, 50, 0.0), rotation, size, blend=log_uniform(rng, 1.0, 9.0))
     row[RELIEF] = 0.3
     return [waved(row, rng.uniform(0, 4), rng.uniform(5, 15))]
 
@@ -191,4 +205,4 @@ def _bump(rng: np.random.Generator) -> list[np.ndarray]:
     axes = tuple(radius * np.exp(rng.normal(0, 0.3, 3)))
     kind, sizes = (BOX, (*axes, 0.9 * min(axes))) if rng.random() < 0.15 else (ELLIPSOID, axes)
     place = _on_floor(rng, 50, rng.uniform(-0.5, 0.6) * radius)
-    return [shape_row(kind, place, random_turn(rng), sizes, part=part, blend=log_uniform(rng, 0.3, 4.0))]
+    return [shape_row(kind, place, random_rotation(rng), sizes, part=part, blend=log_uniform(rng, 0.3, 4.0))]

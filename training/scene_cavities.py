@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from training.scene import BAG, SINUS, Scene, log_uniform, random_relief, random_turn, random_warps, turn_to
+from training.scene import BAG, SINUS, Scene, log_uniform, random_relief, random_rotation, random_warps, rotation_to
 from training.shapes import BOX, CONE, ELLIPSOID, RELIEF, SHEET, joined, shape_row, waved
 
 
@@ -21,11 +21,11 @@ def bag(rng: np.random.Generator) -> Scene:
     """Return an ellipsoidal cavity about 30 in half axis, perhaps with rugae, pouches and protruding lumps."""
     half = 30.0 * np.exp(rng.normal(0, 0.25, 3))
     half *= 30.0 / np.cbrt(half.prod())
-    rows = [shape_row(ELLIPSOID, np.zeros(3), random_turn(rng), tuple(half), solid=False)]
+    rows = [shape_row(ELLIPSOID, np.zeros(3), random_rotation(rng), tuple(half), solid=False)]
     for _ in range(int(rng.integers(0, 4))):
         size = tuple(rng.uniform(8, 22) * np.exp(rng.normal(0, 0.25, 3)))
         place = _unit(rng) * half.min() * rng.uniform(0.5, 1.1)
-        rows.append(shape_row(ELLIPSOID, place, random_turn(rng), size, solid=False))
+        rows.append(shape_row(ELLIPSOID, place, random_rotation(rng), size, solid=False))
     joined(rows, log_uniform(rng, 2.0, 15.0))
     for _ in range(rng.poisson(1.6)):
         rows.append(_lump(rng, half))
@@ -49,7 +49,7 @@ def _lump(rng: np.random.Generator, half: np.ndarray) -> np.ndarray:
     outward, size = _unit(rng), log_uniform(rng, 2.0, 12.0)
     place = outward * half.min() * rng.uniform(0.85, 1.2)
     axes = tuple(size * np.exp(rng.normal(0, 0.3, 3)))
-    row = shape_row(ELLIPSOID, place, turn_to(-outward, rng), axes, part=int(rng.integers(0, 5)))
+    row = shape_row(ELLIPSOID, place, rotation_to(-outward, rng), axes, part=int(rng.integers(0, 5)))
     row[3] = log_uniform(rng, 0.3, 6.0)
     row[RELIEF] = rng.uniform(0.2, 1.0)
     return row
@@ -65,7 +65,7 @@ def sinus(rng: np.random.Generator) -> Scene:
         size = rng.uniform(9, 18) * np.exp(rng.normal(0, 0.25, 3))
         kind = BOX if rng.random() < 0.35 else ELLIPSOID
         rounding = (0.7 * size.min(),) if kind == BOX else ()
-        rows.append(shape_row(kind, centres[n], random_turn(rng), (*size, *rounding), solid=False))
+        rows.append(shape_row(kind, centres[n], random_rotation(rng), (*size, *rounding), solid=False))
     joined(rows, log_uniform(rng, 0.8, 8.0))
     for _ in range(rng.poisson(1.3)):
         rows.append(_septum(rng, centres))
@@ -86,7 +86,7 @@ def _septum(rng: np.random.Generator, centres: np.ndarray) -> np.ndarray:
     place = centres[rng.integers(len(centres))] + _unit(rng) * rng.uniform(2, 12)
     size = (rng.uniform(8, 25), rng.uniform(5, 14), log_uniform(rng, 0.4, 1.6), rng.uniform(0, 6.3))
     row = shape_row(
-        SHEET, place, random_turn(rng), size, blend=log_uniform(rng, 0.5, 4.0), part=int(rng.integers(0, 3))
+        SHEET, place, random_rotation(rng), size, blend=log_uniform(rng, 0.5, 4.0), part=int(rng.integers(0, 3))
     )
     row[RELIEF] = 0.15
     return waved(row, rng.uniform(0, 1.5), rng.uniform(4, 9))
@@ -96,6 +96,8 @@ def _turbinate(rng: np.random.Generator, centres: np.ndarray) -> np.ndarray:
     place = centres[rng.integers(len(centres))] + _unit(rng) * rng.uniform(7, 16)
     radius = log_uniform(rng, 1.2, 5.0)
     size = (rng.uniform(5, 22), radius, radius * rng.uniform(0.3, 1.0))
-    row = shape_row(CONE, place, random_turn(rng), size, blend=log_uniform(rng, 0.4, 4.0), part=int(rng.integers(0, 5)))
+    row = shape_row(
+        CONE, place, random_rotation(rng), size, blend=log_uniform(rng, 0.4, 4.0), part=int(rng.integers(0, 5))
+    )
     row[RELIEF] = rng.uniform(0.2, 0.8)
     return row

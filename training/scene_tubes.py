@@ -2,7 +2,7 @@
 
 The numbers of a tube, `base`: 0 = 0; 1 radius; 2-4 and 5-7 share, wave number, phase of its variation; 8 depth of the
 triangle that the taeniae make; 9-11 and 12-14 amplitude, wave number, phase of the winding; 15-16 angle of the first
-taenia and its turn per length; 17-18 stations of the blind ends; 19 mean fold distance; 20 rounding of the ends;
+taenia and its rotation per length; 17-18 stations of the blind ends; 19 mean fold distance; 20 rounding of the ends;
 21-24 height, period, tilt and obliquity of the wrinkles; 25 fillet of the folds; 26 reach of the folds from the wall,
 27 the margin in it. `bends` rows: start, radius, angle, cosine and sine of the plane, of the
 angle and of half the angle. `folds` rows: station, height,
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from training.scene import AIRWAY, COLON, Scene, log_uniform, random_relief, random_warps, turn_to
+from training.scene import AIRWAY, COLON, Scene, log_uniform, random_relief, random_warps, rotation_to
 from training.shapes import CONE, ELLIPSOID, RELIEF, bend_back, joined, shape_row, waved
 
 _RADIUS = 20.0
@@ -102,15 +102,15 @@ def _polyp(rng: np.random.Generator, base: np.ndarray, bends: np.ndarray) -> lis
     u, angle = rng.uniform(base[17] + 20, base[18]), rng.uniform(0, 2 * np.pi)
     inward = wall_point(base, bends, (u, angle, 0.5)) - wall_point(base, bends, (u, angle, 1.0))
     root = wall_point(base, bends, (u, angle, rng.uniform(0.92, 1.08)))
-    turn, radius, part = turn_to(inward, rng), log_uniform(rng, 1.0, 6.0), int(rng.integers(0, 4))
-    inward = turn[0]
+    rotation, radius, part = rotation_to(inward, rng), log_uniform(rng, 1.0, 6.0), int(rng.integers(0, 4))
+    inward = rotation[0]
     if rng.random() < 0.3:
         length = radius * rng.uniform(1.0, 2.5)
-        stalk = shape_row(CONE, root, turn, (length, 0.6 * radius, 0.35 * radius), blend=2.0, part=part)
+        stalk = shape_row(CONE, root, rotation, (length, 0.6 * radius, 0.35 * radius), blend=2.0, part=part)
         head = (radius, *(radius * rng.uniform(0.8, 1.2, 2)))
-        return joined([stalk, shape_row(ELLIPSOID, root + inward * length, turn, head, part=part)], 0.8)
+        return joined([stalk, shape_row(ELLIPSOID, root + inward * length, rotation, head, part=part)], 0.8)
     head = (radius * rng.uniform(0.4, 1.3), *(radius * rng.uniform(0.7, 1.3, 2)))
-    lump = shape_row(ELLIPSOID, root, turn, head, blend=log_uniform(rng, 0.4, 4.0), part=part)
+    lump = shape_row(ELLIPSOID, root, rotation, head, blend=log_uniform(rng, 0.4, 4.0), part=part)
     return [lump]
 
 
@@ -121,8 +121,8 @@ def _end_lump(rng: np.random.Generator, base: np.ndarray, bends: np.ndarray) -> 
         place = wall_point(base, bends, (base[18] - rng.uniform(-2, 14), rng.uniform(0, 6.3), rng.uniform(0, 0.9)))
         radius = log_uniform(rng, 2.0, 8.0)
         length, thin = radius * rng.uniform(0.8, 2.2), radius * rng.uniform(0.3, 0.9)
-        turn = turn_to(rng.normal(size=3), rng)
-        rows.append(shape_row(ELLIPSOID, place, turn, (length, radius, thin), blend=log_uniform(rng, 1.0, 8.0)))
+        rotation = rotation_to(rng.normal(size=3), rng)
+        rows.append(shape_row(ELLIPSOID, place, rotation, (length, radius, thin), blend=log_uniform(rng, 1.0, 8.0)))
     return rows
 
 
@@ -137,7 +137,7 @@ def airway(rng: np.random.Generator) -> Scene:
         length = radius * (rng.uniform(5, 9) if depth == 0 else rng.uniform(2.5, 5.5))
         ahead = 1.1 * radius * (depth < 3)
         thin = radius * rng.uniform(0.8, 1.05)
-        row = shape_row(CONE, start, turn_to(axis, rng), (length, radius, thin), solid=False, part=depth % 2)
+        row = shape_row(CONE, start, rotation_to(axis, rng), (length, radius, thin), solid=False, part=depth % 2)
         rows.append(waved(row, ring * radius / trunk, period * radius / trunk) if ring else row)
         for s in (0.15, 0.4, 0.65, 0.9):
             spots.append(np.array([*(start + s * length * axis), 0.6 * radius]))
@@ -177,7 +177,7 @@ def _airway_lump(rng: np.random.Generator, spots: list[np.ndarray]) -> np.ndarra
     row = shape_row(
         ELLIPSOID,
         spot[:3] + away * 1.6 * spot[3],
-        turn_to(away, rng),
+        rotation_to(away, rng),
         tuple(spot[3] * rng.uniform(0.2, 0.8, 3)),
         part=3,
     )

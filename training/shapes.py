@@ -16,7 +16,7 @@ ELLIPSOID, CONE, BOX, TORUS, SHEET = 0, 1, 2, 3, 4
 CARVE, SOLID = 0, 1
 # Columns of a row of shapes.
 TYPE, OP, JOINS, BLEND, PART, RELIEF = 0, 1, 2, 3, 4, 5
-CENTRE, TURN, SIZE, RING, REACH = 6, 9, 18, 22, 24
+CENTRE, ROTATION, SIZE, RING, REACH = 6, 9, 18, 22, 24
 COLUMNS = 25
 # Without nnan and ninf: a NaN stays one.
 _FAST: dict[str, Any] = {
@@ -136,9 +136,9 @@ def _box(x, y, z, a, b, c, r):
 def shape_distance(rows, n, x, y, z):
     """Distance (mm) of a point to the surface of shape n, negative inside; rows as the columns above say."""
     px, py, pz = x - rows[n, CENTRE], y - rows[n, CENTRE + 1], z - rows[n, CENTRE + 2]
-    lx = rows[n, TURN] * px + rows[n, TURN + 1] * py + rows[n, TURN + 2] * pz
-    ly = rows[n, TURN + 3] * px + rows[n, TURN + 4] * py + rows[n, TURN + 5] * pz
-    lz = rows[n, TURN + 6] * px + rows[n, TURN + 7] * py + rows[n, TURN + 8] * pz
+    lx = rows[n, ROTATION] * px + rows[n, ROTATION + 1] * py + rows[n, ROTATION + 2] * pz
+    ly = rows[n, ROTATION + 3] * px + rows[n, ROTATION + 4] * py + rows[n, ROTATION + 5] * pz
+    lz = rows[n, ROTATION + 6] * px + rows[n, ROTATION + 7] * py + rows[n, ROTATION + 8] * pz
     a, b, c, d = rows[n, SIZE], rows[n, SIZE + 1], rows[n, SIZE + 2], rows[n, SIZE + 3]
     kind = rows[n, TYPE]
     if kind == 0:
@@ -219,8 +219,8 @@ def tube(base, bends, folds, x, y, z):
     v, w = v - dv, w - dw
     r = np.sqrt(v * v + w * w) + 1e-9
     cv, cw = v / r, w / r
-    turn = base[15] + base[16] * u
-    c1 = cv * sine(turn + 1.5707963) + cw * sine(turn)
+    angle = base[15] + base[16] * u
+    c1 = cv * sine(angle + 1.5707963) + cw * sine(angle)
     wall = tube_radius(base, u, c1 * (4.0 * c1 * c1 - 3.0))
     free = wall - r
     if base[21] > 0.0 and free < 6.0 * base[21] + 2.0:
@@ -274,7 +274,7 @@ def floor(base, x, y, z):
 def shape_row(
     kind: int,
     centre: np.ndarray,
-    turn: np.ndarray,
+    rotation: np.ndarray,
     size: tuple[float, ...],
     *,
     solid: bool = True,
@@ -283,13 +283,13 @@ def shape_row(
 ) -> np.ndarray:
     """Return the row (COLUMNS,) of one shape.
 
-    `turn` (3, 3) takes scene axes to the shape's own. `size`: half axes (ellipsoid); length, radius at the start and
+    `rotation` (3, 3), shape <- scene axes. `size`: half axes (ellipsoid); length, radius at the start and
     at the end (cone, from `centre` along x); half sides, rounding (box); radii of ring and bulge (torus); half sides,
     phase (sheet). `blend` > 0 is the length over which it merges with what is there already.
     """
     row = np.zeros(COLUMNS)
     row[TYPE], row[OP], row[BLEND], row[PART], row[RELIEF] = kind, float(solid), max(blend, 1e-3), part, 1.0
-    row[CENTRE : CENTRE + 3], row[TURN : TURN + 9] = centre, np.ravel(turn)
+    row[CENTRE : CENTRE + 3], row[ROTATION : ROTATION + 9] = centre, np.ravel(rotation)
     row[SIZE : SIZE + len(size)] = size
     row[RING + 1] = 1.0
     extent = {

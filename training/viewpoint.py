@@ -8,7 +8,7 @@ import numpy as np
 
 from training.buffers import camera_rays
 from training.marching import INSTRUMENT, march_rays, steepness, value_and_part
-from training.scene import AIRWAY, COLON, LAPAROSCOPY, WALL, Arrays, Scene, log_uniform, turn_to
+from training.scene import AIRWAY, COLON, LAPAROSCOPY, WALL, Arrays, Scene, log_uniform, rotation_to
 from training.scene_tubes import wall_point
 from training.shapes import CONE, ELLIPSOID, shape_row
 
@@ -21,21 +21,21 @@ _MOST_MISSED = 0.02
 
 
 @dataclass(frozen=True)
-class View:
+class SceneView:
     """A camera in a scene.
 
     Attributes
     ----------
     camera : (7,) as in `Buffers.camera`.
     eye : (3,) in scene units.
-    turn : (3, 3) rotation, scene <- camera.
+    rotation : (3, 3) rotation, scene <- camera.
     step : share of the free distance that a ray may safely go.
     median : median distance that the probe found, scene units.
     """
 
     camera: np.ndarray
     eye: np.ndarray
-    turn: np.ndarray
+    rotation: np.ndarray
     step: float
     median: float
 
@@ -52,7 +52,7 @@ def random_camera(rng: np.random.Generator, width: int, height: int) -> np.ndarr
     return np.array([fisheye, focal, focal * rng.uniform(0.98, 1.02), *centre, width, height], np.float32)
 
 
-def random_view(scene: Scene, rng: np.random.Generator, width: int, height: int) -> View | None:
+def random_view(scene: Scene, rng: np.random.Generator, width: int, height: int) -> SceneView | None:
     """Return a random view of a scene, or None where the draw is no good: draw again."""
     camera = random_camera(rng, width, height)
     arrays = scene.arrays()
@@ -65,21 +65,23 @@ def random_view(scene: Scene, rng: np.random.Generator, width: int, height: int)
         eye, ahead = _in_cavity(scene, arrays, rng)
     if ahead is None or value_and_part(arrays, *eye, False)[0] < 0.4:
         return None
-    turn = np.roll(turn_to(ahead, rng), -1, axis=0).T
+    rotation = np.roll(rotation_to(ahead, rng), -1, axis=0).T
     least = _PLAIN if rng.random() < _TURNED_DOWN else _LEAST_SPREAD
-    return _probed(arrays, camera, np.ascontiguousarray(eye), np.ascontiguousarray(turn), least)
+    return _probed(arrays, camera, np.ascontiguousarray(eye), np.ascontiguousarray(rotation), least)
 
 
-def _probed(arrays: Arrays, camera: np.ndarray, eye: np.ndarray, turn: np.ndarray, least: float) -> View | None:
+def _probed(
+    arrays: Arrays, camera: np.ndarray, eye: np.ndarray, rotation: np.ndarray, least: float
+) -> SceneView | None:
     """March few rays: whether the view is closed, deep and wide enough, and how far a ray may step."""
-    rays = turned(probe_rays(camera), turn)
+    rays = rotated(probe_rays(camera), rotation)
     found = march_rays(arrays, eye, rays, 0.5, FAR)
     if np.isnan(found).mean() > _MOST_MISSED or not found_well(found, least):
         return None
     steep = np.empty(found.size)
     steepness(arrays, eye, rays.reshape(-1, 3), found.ravel(), steep)
     slope = max(1.0, float(np.nanpercentile(steep, 95)))
-    return View(camera, eye, turn, max(0.9 / slope, 0.25), float(np.nanmedian(found)))
+    return SceneView(camera, eye, rotation, max(0.9 / slope, 0.25), float(np.nanmedian(found)))
 
 
 def probe_rays(camera: np.ndarray) -> np.ndarray:
@@ -93,9 +95,9 @@ def probe_rays(camera: np.ndarray) -> np.ndarray:
     return camera_rays(small)
 
 
-def turned(rays: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def rotated(rays: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) turned by a rotation (3, 3); not by BLAS, whose threads would fight the other worker."""
-    return np.ascontiguousarray(np.einsum("...j,ij->...i", rays, turn))
+    return np.ascontiguousarray(np.einsum("...j,ij->...i", rays, rotation))
 
 
 def found_well(distances: np.ndarray, least: float = _LEAST_SPREAD) -> bool:
@@ -106,8 +108,8 @@ def found_well(distances: np.ndarray, least: float = _LEAST_SPREAD) -> bool:
 
 def _tilted(rng: np.random.Generator, axis: np.ndarray, angle: float) -> np.ndarray:
     """`axis` (3,) turned by `angle` towards a random side."""
-    turn = turn_to(axis, rng)
-    return np.cos(angle) * turn[0] + np.sin(angle) * turn[1]
+    rotation = rotation_to(axis, rng)
+    return np.cos(angle) * rotation[0] + np.sin(angle) * rotation[1]
 
 
 def _in_colon(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +153,7 @@ def _in_cavity(scene: Scene, arrays: Arrays, rng: np.random.Generator) -> tuple[
     return eye, ways[int(depths.argmax())]
 
 
-def random_tools(scene: Scene, view: View, rng: np.random.Generator) -> np.ndarray:
+def random_tools(scene: Scene, view: SceneView, rng: np.random.Generator) -> np.ndarray:
     """Return 0 to 2 instruments as shapes (n, COLUMNS): shafts from the border towards the tissue, with two jaws."""
     wanted = rng.random() < (0.5 if scene.kind == LAPAROSCOPY else 0.15)
     count = int(rng.integers(1, 3)) if wanted else 0
@@ -159,7 +161,7 @@ def random_tools(scene: Scene, view: View, rng: np.random.Generator) -> np.ndarr
     return np.array(rows).reshape(-1, 25)
 
 
-def _tool(view: View, rng: np.random.Generator) -> list[np.ndarray]:
+def _tool(view: SceneView, rng: np.random.Generator) -> list[np.ndarray]:
     rays = probe_rays(view.camera)
     rows, columns = rays.shape[:2]
     tip_ray = rays[rng.integers(rows // 5, rows - rows // 5), rng.integers(columns // 5, columns - columns // 5)]
@@ -180,18 +182,18 @@ def _tool(view: View, rng: np.random.Generator) -> list[np.ndarray]:
         return []
     made = [_piece(view, start, axis, (length, radius, radius))]
     jaw, spread = radius * rng.uniform(2.5, 6.0), np.deg2rad(rng.uniform(0, 30))
-    turn = turn_to(axis, rng)
+    rotation = rotation_to(axis, rng)
     made.append(_piece(view, tip, axis, (0.8 * radius, 1.0 * radius, 0.7 * radius)))
     for sign in (-1.0, 1.0):
-        way = np.cos(spread) * turn[0] + sign * np.sin(spread) * turn[1]
-        root = tip + sign * 0.35 * radius * turn[1]
-        made.append(_piece(view, root, way, (jaw, 0.45 * radius, 0.2 * radius)))
+        heading = np.cos(spread) * rotation[0] + sign * np.sin(spread) * rotation[1]
+        root = tip + sign * 0.35 * radius * rotation[1]
+        made.append(_piece(view, root, heading, (jaw, 0.45 * radius, 0.2 * radius)))
     if rng.random() < 0.3:
-        ball = shape_row(ELLIPSOID, view.eye + view.turn @ tip, np.eye(3), (1.15 * radius,) * 3, part=INSTRUMENT)
+        ball = shape_row(ELLIPSOID, view.eye + view.rotation @ tip, np.eye(3), (1.15 * radius,) * 3, part=INSTRUMENT)
         made.append(ball)
     return made
 
 
-def _piece(view: View, start: np.ndarray, axis: np.ndarray, size: tuple[float, float, float]) -> np.ndarray:
+def _piece(view: SceneView, start: np.ndarray, axis: np.ndarray, size: tuple[float, float, float]) -> np.ndarray:
     """A cone of an instrument from camera to scene coordinates."""
-    return shape_row(CONE, view.eye + view.turn @ start, turn_to(view.turn @ axis), size, part=INSTRUMENT)
+    return shape_row(CONE, view.eye + view.rotation @ start, rotation_to(view.rotation @ axis), size, part=INSTRUMENT)

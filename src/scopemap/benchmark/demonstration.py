@@ -24,7 +24,8 @@ from scopemap.evaluation.poses import MatchedTrajectories, match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Step
 from scopemap.reconstruction import Reconstruction, prepare_folder
 from scopemap.report.depth_figures import draw_depths

@@ -17,7 +17,8 @@ from scopemap.config import Config
 from scopemap.errors import SettingsError
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.phantom import PhantomSpec, write_phantom
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
 
 FILE_NAME = "entry.json"
 

@@ -19,7 +19,7 @@ from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.flow.create import FLOWS
 from scopemap.geometry.align import AlignMode
 from scopemap.io.opening import DATASETS
-from scopemap.phantom import PhantomSpec, parse_events
+from scopemap.phantom.spec import PhantomSpec, parse_events
 
 _PLANS, _METHOD_SETS = "plans", "method_sets"
 

@@ -32,7 +32,8 @@ def phantom(
 ) -> None:
     """Render synthetic endoscopy with true poses, depth and mesh, in the C3VD layout."""
     # Imported here, so that --help does not wait for the kernels.
-    from scopemap.phantom import PhantomSpec, parse_events, write_phantom
+    from scopemap.phantom.spec import PhantomSpec, parse_events
+    from scopemap.phantom.writer import write_phantom
 
     width, height = parse_size(size)
     spec = PhantomSpec(

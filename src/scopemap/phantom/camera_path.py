@@ -1,4 +1,4 @@
-"""Camera paths, made up as a hand would move. Poses are camera to world, mm, OpenCV axes."""
+"""Generated camera paths that move like a hand. Poses are camera to world, mm, OpenCV axes."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def c3vd_line(T_world_camera: np.ndarray) -> str:
 def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
     """Return a hand-like path along a winding or straight tube, (frames, 4, 4): forward, or forward and back."""
     rng = np.random.default_rng((seed, 1))
-    turn = _turn(frames, loop)
+    phase = _phase(frames, loop)
     length = _SPEED_MM * max(frames - 1, 1) * (0.5 if loop else 1.0)
-    progress = 0.5 * (1 - np.cos(turn)) if loop else np.linspace(0, 1, frames)
+    progress = 0.5 * (1 - np.cos(phase)) if loop else np.linspace(0, 1, frames)
     stations = np.linspace(0, length, max(int(length * 2), 2))
     yaw, pitch = (np.radians(0 if straight else 28) * _wander(stations, rng, (120.0, 220.0)) for _ in range(2))
     heading = np.stack([np.sin(yaw), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], -1)
@@ -37,14 +37,14 @@ def sweep_path(frames: int, loop: bool, seed: int) -> np.ndarray:
     """Return a hand-like path that sweeps sideways over a scene ahead of it, (frames, 4, 4)."""
     rng = np.random.default_rng((seed, 1))
     reach_mm = min(18.0, _SPEED_MM * max(frames - 1, 1) / (2 * np.pi))
-    positions = _sway(frames, loop, rng, (reach_mm, reach_mm, 0.4 * reach_mm), frames_per_turn=(220.0, 320.0))
+    positions = _sway(frames, loop, rng, (reach_mm, reach_mm, 0.4 * reach_mm), frames_per_cycle=(220.0, 320.0))
     positions += _sway(frames, loop, rng, (1.0, 1.0, 1.0))
     look = np.stack([positions[:, 1] / 90.0, -positions[:, 0] / 90.0, np.zeros(frames)], -1)
     return _poses(positions, look + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
 
 
-def _turn(frames: int, loop: bool) -> np.ndarray:
-    """Angle 0 to 2 pi over a loop, whose last frame is its first; else the share of the way."""
+def _phase(frames: int, loop: bool) -> np.ndarray:
+    """Angle 0 to 2 pi over a loop, whose last frame is its first; else the share of the path, 0 to 1."""
     return np.linspace(0, 2 * np.pi if loop else 1.0, frames)
 
 
@@ -60,19 +60,19 @@ def _sway(
     loop: bool,
     rng: np.random.Generator,
     amplitudes: tuple[float, float, float],
-    frames_per_turn: tuple[float, float] = _SWAY_FRAMES,
+    frames_per_cycle: tuple[float, float] = _SWAY_FRAMES,
 ) -> np.ndarray:
-    """Low-frequency wandering (frames, 3); in a loop with whole numbers of turns, so that it ends where it starts."""
+    """Low-frequency wandering (frames, 3); in a loop with whole numbers of cycles, so that it ends where it starts."""
     columns = []
     for amplitude in amplitudes:
         if loop:
-            amplitude *= min(1.0, frames / frames_per_turn[0])
-            turns = np.maximum(np.round(frames / rng.uniform(*frames_per_turn, 3) * [1.0, 1.6, 2.6]), 1)
+            amplitude *= min(1.0, frames / frames_per_cycle[0])
+            turns = np.maximum(np.round(frames / rng.uniform(*frames_per_cycle, 3) * [1.0, 1.6, 2.6]), 1)
             phase = rng.uniform(0, 2 * np.pi, 3)
-            wave = np.sin(_turn(frames, loop)[:, None] * turns + phase) @ [0.55, 0.3, 0.15]
+            wave = np.sin(_phase(frames, loop)[:, None] * turns + phase) @ [0.55, 0.3, 0.15]
             columns.append(amplitude * (wave - wave[0]))
         else:
-            columns.append(amplitude * _wander(np.arange(frames), rng, frames_per_turn))
+            columns.append(amplitude * _wander(np.arange(frames), rng, frames_per_cycle))
     return np.stack(columns, -1)
 
 

@@ -101,7 +101,7 @@ def _distances(p: np.ndarray, half: float, depth: float, behind: float, seed: in
 
 
 def _relief(p: np.ndarray, organs: int, seed: int) -> np.ndarray:
-    """Unevenness (K, N) of floor, wall and organs, mm, at points (N, 3); less than `_RELIEF_MM` everywhere."""
+    """Relief (K, N) of floor, wall and organs, mm, at points (N, 3); less than `_RELIEF_MM` everywhere."""
     lumps = 4.0 * noise_at(p, 22.0, seed + 21) + 1.6 * noise_at(p, 9.0, seed + 22) + 0.5 * noise_at(p, 4.5, seed + 26)
     floor = 9.0 * noise_at(p * [1, 1, 0], 70.0, seed + 23) + lumps
     wall = 4.0 * noise_at(p, 34.0, seed + 24) + 0.8 * lumps

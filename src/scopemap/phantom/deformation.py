@@ -1,7 +1,7 @@
-"""Deformation: tissue that breathes, as a smooth periodic displacement with bounded gradient.
+"""Deformation: breathing tissue, as a smooth periodic displacement with bounded gradient.
 
-The tissue found at the point p of space is that of the rest point p - u(p), with u a sum of plane waves. Truth stays
-exact: rays are marched through the warped shape, and points of the rest surface are moved by solving p = q + u(p).
+The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves. The truth is exact:
+rays are marched through the warped shape, and points of the rest surface are moved by solving p = q + u(p).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lumens built around a camera path: the colon with folds and haustra, and the straight featureless tube.
 
-A lumen is a smooth union of balls strung along the path and beyond it, so wherever the camera goes there is room, and
-the wall that it looks at is a closed, winding tube.
+A lumen is a smooth union of balls strung along the path and beyond it, so the camera is always in
+free space, and the wall around it is a closed, winding tube.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TUBE_AHEAD_MM = 130.0
 
 
 def colon_volume(poses: np.ndarray, seed: int) -> Volume:
-    """Return a colon-like lumen around camera poses (N, 4, 4): at least 6 mm of room at each, a blind end ahead."""
+    """Return a colon-like lumen around camera poses (N, 4, 4): at least 6 mm of free space, a blind end ahead."""
     rng = np.random.default_rng((seed, 2))
     centres = backbone(poses, rng)
     along = _distances_along(centres)
@@ -105,7 +105,7 @@ def _mean_view(poses: np.ndarray) -> np.ndarray:
 
 
 def _box(points: np.ndarray, margin_mm: float) -> tuple[np.ndarray, tuple[int, int, int], float]:
-    """Origin, shape and spacing of a grid around points; 1 mm, coarser only where the memory would not do."""
+    """Origin, shape and spacing of a grid around points; 1 mm, coarser only above 20 million voxels."""
     low, high = points.min(0) - margin_mm, points.max(0) + margin_mm
     voxel = max(1.0, float(np.prod(high - low) / _VOXEL_BUDGET) ** (1 / 3))
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / voxel) + 1)

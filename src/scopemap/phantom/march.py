@@ -1,7 +1,7 @@
-"""March rays from a camera to the surface of a volume, exactly, also while the tissue moves.
+"""Ray marching from a camera to the surface of a volume, exact, also for tissue that moves.
 
-Sphere tracing (J. C. Hart, The Visual Computer 12, 1996) with three gaits: through empty cells by the distance that
-their map guarantees, near the surface by value over steepest slope, and at the surface by guarded Newton steps.
+Sphere tracing (J. C. Hart, The Visual Computer 12, 1996) with three kinds of step: through empty cells by their
+guaranteed distance, near the surface by value over steepest slope, and at the surface by bracketed Newton steps.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Grids = tuple[np.ndarray, np.ndarray, np.ndarray, float, float]
 
 
 @dataclass(frozen=True)
-class Surface:
-    """What a camera sees of the tissue, before any light: the buffers that every shading starts from.
+class SurfaceBuffers:
+    """The visible surface in each pixel, before any shading.
 
     Attributes
     ----------
-    depth_mm : (H, W) float32 along the optical axis, NaN where the ray meets nothing.
+    depth_mm : (H, W) float32 along the optical axis, NaN where the ray hits nothing.
     distance_mm : (H, W) float32 along the ray, NaN likewise.
     normal : (H, W, 3) float32 unit vectors in camera axes, towards the camera, NaN likewise.
-    rest_mm : (H, W, 3) float32, world position of the point before deformation, NaN likewise: textures stick to it.
+    rest_mm : (H, W, 3) float32, world position of the point before deformation, the texture coordinate, NaN likewise.
     """
 
     depth_mm: np.ndarray
@@ -143,8 +143,10 @@ def _march_image(
                 out[row, column, n] = here[n] if np.isfinite(distance) else np.nan
 
 
-def march(volume: Volume, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement) -> Surface:
-    """Return what `camera` sees of `volume` from `T_world_camera` (4, 4) while the tissue is displaced.
+def march(
+    volume: Volume, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement
+) -> SurfaceBuffers:
+    """Return the surface of `volume` seen by `camera` from `T_world_camera` (4, 4) while the tissue is displaced.
 
     Depth is exact to 1e-4 mm before rounding to float32. A camera inside tissue sees nothing (NaN).
     """
@@ -158,7 +160,7 @@ def march(volume: Volume, camera: PinholeCamera, T_world_camera: np.ndarray, dis
     distance = out[..., 0] * volume.voxel_mm
     normal = out[..., 4:] @ T_world_camera[:3, :3]
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return Surface(
+    return SurfaceBuffers(
         depth_mm=(distance / np.linalg.norm(rays, axis=-1)).astype(np.float32),
         distance_mm=distance.astype(np.float32),
         normal=normal.astype(np.float32),

@@ -12,8 +12,8 @@ from scopemap.phantom.camera_path import lumen_path, sweep_path
 from scopemap.phantom.cavity import laparoscopy_volume
 from scopemap.phantom.deformation import REST, Breathing, Displacement, breathing
 from scopemap.phantom.lumen import colon_volume, tube_volume
-from scopemap.phantom.march import Surface, march
-from scopemap.phantom.shading import Look, develop, disturb, exposure_for, shade, vignette
+from scopemap.phantom.march import SurfaceBuffers, march
+from scopemap.phantom.shading import AppearanceBuffers, develop, disturb, exposure_for, shade, vignette
 from scopemap.phantom.spec import DEFAULT_FRAMES, PhantomSpec
 from scopemap.phantom.texture import Appearance
 from scopemap.phantom.volume import Volume
@@ -24,8 +24,8 @@ _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Shape and look of the tissue at rest."""
+class PhantomScene:
+    """Shape and appearance of the tissue at rest."""
 
     volume: Volume
     appearance: Appearance
@@ -41,18 +41,18 @@ class Phantom:
     scene : tissue at rest.
     poses : (N, 4, 4) float64, camera to world, mm.
     breath : how the tissue moves.
-    exposure : gain of every frame; None: each frame is exposed for itself.
+    exposure : gain of every frame; None: each frame has its own.
     """
 
     spec: PhantomSpec
-    scene: Scene
+    scene: PhantomScene
     poses: np.ndarray
     breath: Breathing
     exposure: float | None
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
-    """Return the phantom of `spec`: path read or made up, scene built around it, exposure set by the first frame.
+    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame.
 
     Raises `InputError` where the path file cannot be used or holds fewer poses than the frames wanted.
     """
@@ -64,7 +64,7 @@ def prepare(spec: PhantomSpec) -> Phantom:
 
 
 def camera_path(spec: PhantomSpec) -> np.ndarray:
-    """Return the poses (N, 4, 4) of `spec`, camera to world, mm: from its file, or made up to suit its scene."""
+    """Return the poses (N, 4, 4) of `spec`, camera to world, mm: from its file, or generated for its scene."""
     if spec.path_file is None:
         frames = spec.frames or DEFAULT_FRAMES
         if spec.scene == "laparoscopy":
@@ -78,25 +78,27 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
     return poses[: spec.frames]
 
 
-def build_scene(spec: PhantomSpec, poses: np.ndarray) -> Scene:
+def build_scene(spec: PhantomSpec, poses: np.ndarray) -> PhantomScene:
     """Return the scene of `spec` built around the poses (N, 4, 4)."""
     if spec.scene == "colon":
-        return Scene(colon_volume(poses, spec.seed), Appearance(_COLON_RGB, spec.texture, spec.gloss, spec.seed))
+        return PhantomScene(colon_volume(poses, spec.seed), Appearance(_COLON_RGB, spec.texture, spec.gloss, spec.seed))
     if spec.scene == "laparoscopy":
         volume, tint = laparoscopy_volume(poses, spec.seed)
-        return Scene(volume, Appearance(tint, spec.texture, spec.gloss, spec.seed))
-    return Scene(tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed))
+        return PhantomScene(volume, Appearance(tint, spec.texture, spec.gloss, spec.seed))
+    return PhantomScene(tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed))
 
 
 def light(
-    scene: Scene, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement = REST
-) -> tuple[np.ndarray, Surface]:
+    scene: PhantomScene, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement = REST
+) -> tuple[np.ndarray, SurfaceBuffers]:
     """Return linear light (H, W, 3) float32 behind the lens, before exposure, and the surface that it came from."""
     surface = march(scene.volume, camera, T_world_camera, displacement)
     footprint = surface.distance_mm / np.float32(camera.fx)
     appearance = scene.appearance
     rest = surface.rest_mm
-    look = Look(appearance.albedo(rest, footprint), appearance.ripple(rest, footprint), appearance.film(rest))
+    look = AppearanceBuffers(
+        appearance.albedo(rest, footprint), appearance.ripple(rest, footprint), appearance.film(rest)
+    )
     return shade(surface, look, camera) * vignette(camera), surface
 
 
@@ -106,7 +108,7 @@ def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, np.ndarray]:
     return rgb, surface.depth_mm
 
 
-def render_surface(phantom: Phantom, index: int) -> tuple[np.ndarray, Surface]:
+def render_surface(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
     """Return frame `index` as sRGB (H, W, 3) uint8 and the surface that it shows."""
     spec = phantom.spec
     linear, surface = light(phantom.scene, spec.camera, phantom.poses[index], phantom.breath.at(index))

@@ -1,6 +1,6 @@
-"""From a bare surface to linear light, and from light to the camera's 8-bit picture.
+"""Shading of a surface to linear light, and the camera's 8-bit image of it.
 
-The lamp sits at the camera: irradiance falls as cosine over squared distance, and a facing wet spot mirrors it.
+The light is at the camera: irradiance falls as cosine over squared distance, and a wet spot that faces it reflects it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.phantom.march import Surface
+from scopemap.phantom.march import SurfaceBuffers
 from scopemap.phantom.spec import EventName
 
 _FILM_TILT = 0.3
@@ -28,14 +28,14 @@ _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
 
 
 @dataclass(frozen=True)
-class Look:
-    """Buffers of the tissue's look, cached beside its `Surface` and shaded as often as wanted.
+class AppearanceBuffers:
+    """Buffers of the tissue's appearance in each pixel.
 
     Attributes
     ----------
     albedo : (H, W, 3) float32 linear RGB, 0..1.
     ripple : (H, W, 3) float32, tilt of the fluid film, about -1..1.
-    film : (H, W) float32, strength of mirroring, 0 up.
+    film : (H, W) float32, strength of specular reflection, >= 0.
     """
 
     albedo: np.ndarray
@@ -43,7 +43,7 @@ class Look:
     film: np.ndarray
 
 
-def shade(surface: Surface, look: Look, camera: PinholeCamera) -> np.ndarray:
+def shade(surface: SurfaceBuffers, look: AppearanceBuffers, camera: PinholeCamera) -> np.ndarray:
     """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen."""
     towards = -camera.rays / np.linalg.norm(camera.rays, axis=-1, keepdims=True)
     light = 1.0 / surface.distance_mm[..., None] ** 2
@@ -64,14 +64,14 @@ def vignette(camera: PinholeCamera) -> np.ndarray:
 
 
 def exposure_for(radiance: np.ndarray) -> float:
-    """Return the gain that exposes `radiance` (H, W, 3) well: most of it bright, the nearest wall near saturation."""
+    """Return the gain that exposes `radiance` (H, W, 3) well: its 80th percentile at level 0.48."""
     lit = radiance.max(-1)
     lit = lit[lit > 0]
     return _EXPOSED_LEVEL / float(np.percentile(lit, _EXPOSED_SHARE)) if lit.size else 1.0
 
 
 def disturb(linear: np.ndarray, kinds: set[EventName], rng: np.random.Generator) -> np.ndarray:
-    """Return exposed light (H, W, 3) as it is behind smoke, through motion and defocus, or without any lamp."""
+    """Return exposed light (H, W, 3) with smoke, with motion and defocus blur, or all black."""
     if "smoke" in kinds:
         linear = _smoke(linear, rng)
     if "blur" in kinds:

@@ -1,10 +1,10 @@
-"""PhantomSpec: everything that decides what a phantom looks like; equal specs give equal files."""
+"""PhantomSpec: every parameter of a phantom; equal specs give equal files."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -22,20 +22,20 @@ C3VD_DEPTH_SCALE_MM = 100.0 / 65535
 
 @dataclass(frozen=True)
 class Event:
-    """A stretch of frames, `first` to `last` inclusive, that shows little or nothing."""
+    """A disturbance of the frames `first` to `last`, inclusive."""
 
     kind: EventName
     first: int
     last: int
 
     def covers(self, index: int) -> bool:
-        """Tell whether frame `index` belongs to the stretch."""
+        """Return whether frame `index` is disturbed."""
         return self.first <= index <= self.last
 
 
 @dataclass(frozen=True)
 class PhantomSpec:
-    """What to render.
+    """Parameters of a phantom.
 
     Attributes
     ----------
@@ -44,14 +44,14 @@ class PhantomSpec:
     width, height : image size, px.
     fov_deg : horizontal field of view, degrees.
     seed : of everything random.
-    path_file : camera path to follow (`read_poses`), None: a hand-like path is made up.
+    path_file : camera path to follow (`read_poses`), None: a hand-like path is generated.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
-    loop : whether the made-up path ends in exactly its first pose.
-    events : stretches of black, blurred or smoky frames.
+    loop : whether the generated path ends in exactly its first pose.
+    events : ranges of black, blurred or smoky frames.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo.
     gloss : strength of the wet highlights, 1 = as in the clinic, 0 = none.
-    auto_exposure : whether every frame is exposed for itself; False: all as the first.
+    auto_exposure : whether every frame has its own exposure; False: all that of the first.
     depth_scale_mm : mm per unit of the depth files; the default is C3VD's, 100 mm at most.
     fps : frames per second as written to `camera.yaml`.
     """
@@ -86,17 +86,12 @@ class PhantomSpec:
             "breath_frames and fps must be positive": min(self.breath_frames, self.fps) > 0,
             "noise, texture and gloss must not be negative": min(self.noise, self.texture, self.gloss) >= 0,
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
-            "loop needs a made-up path of at least 3 frames, not a path file": not self.loop
+            "loop needs a generated path of at least 3 frames, not a path file": not self.loop
             or (self.path_file is None and (self.frames is None or self.frames >= 3)),
         }
         for message, fine in checks.items():
             if not fine:
-                raise SettingsError(f"impossible phantom: {message} (got {self._named_in(message)})")
-
-    def _named_in(self, message: str) -> str:
-        return ", ".join(
-            f"{f.name}={getattr(self, f.name)}" for f in fields(self) if re.search(rf"\b{f.name}\b", message)
-        )
+                raise SettingsError(f"impossible phantom: {message}")
 
     @property
     def camera(self) -> PinholeCamera:
@@ -106,7 +101,7 @@ class PhantomSpec:
 
     @property
     def max_depth_mm(self) -> float:
-        """Depth from which the 16-bit depth files say "clipped"."""
+        """Depth from which the 16-bit depth files hold the value for "clipped"."""
         return 65535 * self.depth_scale_mm
 
     def with_settings(self, settings: dict[str, Any]) -> PhantomSpec:

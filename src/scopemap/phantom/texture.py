@@ -1,7 +1,7 @@
-"""The look of tissue: mottled albedo, vessels, and the fluid film that breaks up highlights.
+"""Appearance of tissue: mottled albedo, vessels, and the fluid film that breaks up highlights.
 
-Everything is a function of the rest point, so it sticks to tissue that moves, and fades where a pixel is too coarse
-to show it, so it does not flicker.
+All are functions of the rest point, so that they move with the tissue, and fade where a pixel is too coarse for them,
+so that they do not flicker.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PUDDLE_MM = 14.0
 
 @dataclass(frozen=True)
 class Appearance:
-    """What a scene's tissue looks like.
+    """Appearance of a scene's tissue.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Appearance:
         return np.stack(axes, -1).reshape(rest_mm.shape) * fade
 
     def film(self, rest_mm: np.ndarray) -> np.ndarray:
-        """Return the strength (H, W) float32, 0 up, of mirroring: wet in places, never quite dry."""
+        """Return the strength (H, W) float32, >= 0, of specular reflection: larger in wet places, never 0."""
         wetness = 0.5 + 1.6 * noise_at(rest_mm.reshape(-1, 3), _PUDDLE_MM, self.seed + 45)
         return (self.gloss * np.clip(wetness, 0.05, 1.0)).reshape(rest_mm.shape[:2]).astype(np.float32)
 
@@ -71,7 +71,7 @@ class Appearance:
         return np.exp(self.texture * (brightness[:, None] + redness[:, None] * tone)).astype(np.float32)
 
     def _vessels(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Where smooth noise crosses zero runs a winding line: a vessel, if a second noise wants one there."""
+        """Vessels run along the zero crossings of smooth noise; a second noise selects where."""
         stain = np.zeros(len(points), np.float32)
         for n, (period, width, depth) in enumerate(_VESSELS):
             bent = points + 0.9 * noise_at(points, period / 3, self.seed + 51 + n)[:, None]
@@ -83,5 +83,5 @@ class Appearance:
 
 
 def _visible(period_mm: float, footprint_mm: np.ndarray) -> np.ndarray:
-    """Share (0..1) of a pattern that pixels of this width can still show."""
+    """Share (0..1) of a pattern's contrast that pixels of this width resolve."""
     return np.clip(period_mm / (2.0 * footprint_mm) - 0.5, 0.0, 1.0).astype(np.float32)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import trimesh
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from scopemap.errors import InputError
-from scopemap.phantom.deformation import Displacement
 from scopemap.phantom.volume import Volume
 
 _NEWTON_STEPS = 4
@@ -17,21 +17,9 @@ _SEEN_MARGIN_VOXELS = 2
 _RIM_VOXELS = 4
 
 
-@dataclass(frozen=True)
-class TriangleMesh:
-    """Triangles: vertices (V, 3) float64 in world mm, faces (F, 3) int64, counter-clockwise seen from the camera."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-
-    def moved(self, displacement: Displacement) -> TriangleMesh:
-        """Return the mesh of the rest shape where the displacement takes it."""
-        return TriangleMesh(displacement.move(self.vertices), self.faces)
-
-
 @dataclass
 class SeenVoxels:
-    """Which part of the volume the cameras have seen, gathered frame by frame."""
+    """The voxels of the volume's surface that the cameras have seen, frame by frame."""
 
     volume: Volume
     voxels: np.ndarray = field(init=False)
@@ -40,18 +28,20 @@ class SeenVoxels:
         self.voxels = np.zeros(self.volume.coefficients.shape, bool)
 
     def add(self, rest_mm: np.ndarray) -> None:
-        """Mark the voxels of rest points (H, W, 3); NaN points are passed over."""
+        """Mark the voxels of rest points (H, W, 3); NaN points are ignored."""
         points = rest_mm.reshape(-1, 3)
         cells = ((points[np.isfinite(points[:, 0])] - self.volume.origin_mm) / self.volume.voxel_mm).astype(int)
         self.voxels[tuple(cells.T)] = True
 
-    def mesh(self) -> TriangleMesh:
+    def mesh(self) -> trimesh.Trimesh:
         """Return the true surface at rest where it was seen, with a rim of 2 voxels."""
         return surface_mesh(self.volume, ndimage.binary_dilation(self.voxels, iterations=_SEEN_MARGIN_VOXELS))
 
 
-def surface_mesh(volume: Volume, where: np.ndarray) -> TriangleMesh:
-    """Return the surface inside the voxels `where` (X, Y, Z) bool; vertices lie on it to 1e-4 mm.
+def surface_mesh(volume: Volume, where: np.ndarray) -> trimesh.Trimesh:
+    """Return the surface inside the voxels `where` (X, Y, Z) bool, world mm, vertices on it to 1e-4 mm.
+
+    Faces are counter-clockwise seen from the camera.
 
     Raises `InputError` where there is no surface in these voxels.
     """
@@ -67,7 +57,7 @@ def surface_mesh(volume: Volume, where: np.ndarray) -> TriangleMesh:
         value, gradient = volume.values_at(points)
         shift = -(value / (gradient**2).sum(1))[:, None] * gradient
         points = points + np.clip(np.nan_to_num(shift), -0.5 * volume.voxel_mm, 0.5 * volume.voxel_mm)
-    return TriangleMesh(points, faces.astype(np.int64))
+    return trimesh.Trimesh(points, faces.astype(np.int64), process=False)
 
 
 def _defined(shape: tuple[int, ...]) -> np.ndarray:

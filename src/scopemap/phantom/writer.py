@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import c3vd_line
 from scopemap.phantom.render import Phantom, prepare, render_surface
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.truth_mesh import SeenVoxels, TriangleMesh
+from scopemap.phantom.truth_mesh import SeenVoxels
 
 CLIPPED = 65535
 _OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
@@ -79,7 +78,7 @@ def _write_image(file: Path, image: np.ndarray) -> None:
 
 
 def _write_camera(spec: PhantomSpec, file: Path) -> None:
-    camera: PinholeCamera = spec.camera
+    camera = spec.camera
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     if not storage.isOpened():
         raise OSError(f"{file.name} could not be opened")
@@ -94,16 +93,13 @@ def _write_camera(spec: PhantomSpec, file: Path) -> None:
 
 def _write_meshes(phantom: Phantom, seen: SeenVoxels, folder: Path) -> None:
     mesh = seen.mesh()
-    _write_mesh(mesh, folder / "mesh_truth.ply")
+    mesh.export(folder / "mesh_truth.ply")
     if not phantom.spec.deform:
         return
     (folder / "mesh_truth").mkdir(exist_ok=True)
     for index in range(len(phantom.poses)):
-        _write_mesh(mesh.moved(phantom.breath.at(index)), folder / "mesh_truth" / f"{index:04d}.ply")
-
-
-def _write_mesh(mesh: TriangleMesh, file: Path) -> None:
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
+        moved = phantom.breath.at(index).move(np.asarray(mesh.vertices))
+        trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
 
 
 def _write_description(phantom: Phantom, file: Path) -> None:
