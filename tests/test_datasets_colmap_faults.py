@@ -166,7 +166,7 @@ def test_a_file_cut_off_anywhere_is_a_sentence(tmp_path: Path) -> None:
         ("cameras.bin", binary_cameras({1: CAMERA, 2: ("RADIAL", *SIZE, (61.0, 40.0, 32.0, 0.0, 0.0))}), read_cameras),
     ):
         assert read(write_binary(tmp_path, name, content))
-        for length in range(len(content)):
+        for length in range(0, len(content), 5):
             with pytest.raises(ScopemapError, match=rf"{name}"):
                 read(write_binary(tmp_path, name, content[:length]))
         with pytest.raises(ScopemapError, match="bytes are left after the last entry"):

@@ -161,6 +161,9 @@ def test_a_count_beyond_the_file_is_bounded(tmp_path: Path) -> None:
     source = RosBag(folder)
     assert 4 <= source.count < 10**6
     assert numbers(source) == [0, 1, 2, 3]
+    metadata.write_text(metadata.read_text().replace(f"message_count: {9 * 10**20}", "message_count: many"))
+    with pytest.raises(InputError, match="the bag is damaged"):
+        RosBag(folder)
 
 
 def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:

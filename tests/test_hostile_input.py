@@ -142,7 +142,9 @@ def test_a_pipe_is_one_sentence(name: str, tmp_path: Path, at_once: None) -> Non
 
 
 @needs_pipes
-@pytest.mark.parametrize("name", sorted(WRITERS))
+@pytest.mark.parametrize(
+    "name", ["7-scenes", "colmap:bin", "dicom:frames", "endoslam:real", "rosbag:ros2", "scared", "tum"]
+)
 def test_pipes_in_the_place_of_files_end_reading_at_once(name: str, tmp_path: Path, at_once: None) -> None:
     entry = WRITERS[name](tmp_path / "input")
     files = {(f.parent, f.suffix): f for f in sorted((tmp_path / "input").rglob("*")) if f.is_file()}

@@ -275,8 +275,9 @@ class RosBag(SourceDefaults):
     def _topics_in(self, reader: Any) -> dict[str, _Topic]:
         """Return the topics of images and cameras that hold messages; a warning names those that cannot be read."""
         counts: Counter[tuple[str, str]] = Counter()
-        for connection in _readable(reader):
-            counts[connection.topic, connection.msgtype] += connection.msgcount
+        with self._reporting():  # counts are read from metadata as they are written
+            for connection in _readable(reader):
+                counts[connection.topic, connection.msgtype] += int(connection.msgcount)
         topics: dict[str, _Topic] = {}
         for (name, kind), count in counts.items():
             try:
