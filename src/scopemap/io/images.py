@@ -139,7 +139,7 @@ class ImageFolder(SourceDefaults):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; an unreadable file is left out with a warning, another size is an `InputError`."""
         for number, file in list(zip(self.numbers, self.files, strict=True))[selection]:
-            rgb = read_image(file)
+            rgb = self._image(file)
             if rgb is None:
                 self._warn(f"{file} cannot be read and was left out")
                 continue
@@ -159,6 +159,10 @@ class ImageFolder(SourceDefaults):
         pose, depth_mm = self.pose(index), self._depth_mm(index)
         return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
+    def _image(self, file: Path) -> np.ndarray | None:
+        """Return an image as (h, w, 3) uint8 RGB, None where it cannot be read."""
+        return read_image(file)
+
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self.depth_files.get(index)
         if file is None:
@@ -174,7 +178,7 @@ class ImageFolder(SourceDefaults):
 
     def _size(self) -> tuple[int, int]:
         for file in self.files:
-            image = read_image(file)
+            image = self._image(file)
             if image is not None:
                 return image.shape[0], image.shape[1]
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"

@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from math import gcd
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
 from scopemap.io.decoding import decoded
-from scopemap.io.images import FOLDER_RATE_HZ, OWN_CALIBRATION, ImageFolder, decoded_image, image_files
+from scopemap.io.images import OWN_CALIBRATION, ImageFolder, decoded_image, frame_number, image_files
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
 from scopemap.trajectory.formats.scared import parse_frame_data, times_of
@@ -52,22 +51,6 @@ _MOST_OFF_CENTRE = 0.25
 _COLMAP_CENTRE_PX = 0.5
 
 
-class _Pictures(Protocol):
-    """The pictures of a keyframe: a video, a folder or an archive.
-
-    numbers : of the frames; a range for a video, as its header claims, None where it claims nothing.
-    """
-
-    width: int
-    height: int
-    numbers: range | list[int] | None
-    rate_hz: float
-    warnings: list[str]
-
-    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the frames with these numbers; None: all. Only those of `selection`, which counts positions."""
-
-
 class ScaredKeyframe(SourceDefaults):
     """The left view of one keyframe's video, with its true poses and depth where they are beside it.
 
@@ -76,21 +59,22 @@ class ScaredKeyframe(SourceDefaults):
 
     name = "scared"
     quality: TruthQuality = "kinematic"
+    _counts_from_one = False
 
     def __init__(self, path: Path) -> None:
         self.path = _keyframe(path)
         self._pictures = self._find_pictures()
+        self._rate_hz = self._pictures.rate_hz
         stacked = self._pictures.height > _STACKED_ASPECT * self._pictures.width
         self.width, self.height = self._pictures.width, self._pictures.height // (2 if stacked else 1)
         self.notes: list[str] = []
         self.warnings = self._pictures.warnings
         self._read_frame_data()
         self._numbers = self._common_numbers()
-        numbers = self._pictures.numbers if self._numbers is None else self._numbers
-        self.count: int | None = None if numbers is None else len(numbers)
+        self.count: int | None = self._pictures.count if self._numbers is None else len(self._numbers)
         self._points = find_numbered(self.path, _SCENE_POINTS, "scene_points", (".tiff", ".tif"))
         self._calibrate()
-        times = "those of frame_data" if self.stamped else f"frame number / {self._pictures.rate_hz:g} s"
+        times = "those of frame_data" if self.stamped else f"frame number / {self._rate_hz:g} s"
         self.notes += [f"time stamps: {times}", *self._assumptions(stacked)]
 
     @staticmethod
@@ -103,7 +87,7 @@ class ScaredKeyframe(SourceDefaults):
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected left views, decoded in order."""
-        for frame in self._pictures.frames(self._numbers, selection):
+        for frame in self._selected(selection):
             time_s = frame.time_s if self._numbers is None else self._time_s(frame.index)
             yield replace(frame, time_s=time_s, rgb=np.ascontiguousarray(frame.rgb[: self.height]))
 
@@ -120,13 +104,17 @@ class ScaredKeyframe(SourceDefaults):
         pose, depth_mm = self.pose(index), self._depth_mm(index)
         return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
-    def _find_pictures(self) -> _Pictures:
+    def _find_pictures(self) -> VideoFile | ImageFolder:
         for place in _VIDEOS:
             if (self.path / place).is_file():
-                return _VideoPictures(self.path / place)
+                return VideoFile(self.path / place)
         for place in _IMAGES:
             if image_files(self.path / place):
-                return _FolderPictures(self.path / place)
+                folder = ImageFolder(self.path / place)
+                if folder.numbers[0] != 0:
+                    folder.numbers = [number - 1 for number in folder.numbers]
+                    self._counts_from_one = True
+                return folder
         if (self.path / _RECTIFIED).is_dir():
             raise InputError(
                 f"reading {self.path}: {_RECTIFIED} holds rectified images, to which neither the calibration nor the "
@@ -160,14 +148,16 @@ class ScaredKeyframe(SourceDefaults):
             self.warnings.append(f"{files.path}: its time stamps do not increase or only count frames; none is used")
 
     def _common_numbers(self) -> list[int] | None:
-        """Return the numbers of frames that have a picture and, where there is frame_data, a JSON of it."""
-        available = self._pictures.numbers
-        if not self._posed:
-            return available if isinstance(available, list) else None
-        if available is None:
-            return self._posed
-        known = set(available) if isinstance(available, list) else available
-        common = [number for number in self._posed if number in known]
+        """Return the numbers of frames that have a picture and, where there is frame_data, a JSON of it.
+
+        None for a video without frame_data.
+        """
+        pictures = self._pictures
+        is_video = isinstance(pictures, VideoFile)
+        if not self._posed or (is_video and pictures.count is None):
+            return pictures.numbers if isinstance(pictures, ImageFolder) else self._posed or None
+        available = set(pictures.numbers) if isinstance(pictures, ImageFolder) else range(pictures.count or 0)
+        common = [number for number in self._posed if number in available]
         if not common:
             raise InputError(f"reading {self.path}: no picture has the number of a frame_data file")
         if len(common) < max(len(available), len(self._posed)):
@@ -175,7 +165,19 @@ class ScaredKeyframe(SourceDefaults):
                 f"{self.path}: {len(available)} pictures, but {len(self._posed)} frame_data files; the {len(common)} "
                 "frames that have both are used"
             )
+        if isinstance(pictures, ImageFolder):
+            pictures.files, pictures.numbers = [pictures.file_of[number] for number in common], common
         return common
+
+    def _selected(self, selection: slice) -> Iterator[SourceFrame]:
+        if self._numbers is None or isinstance(self._pictures, ImageFolder):
+            yield from self._pictures.frames(selection)
+            return
+        numbers = self._numbers[selection]
+        if numbers:
+            step = gcd(*(number - numbers[0] for number in numbers)) or 1
+            frames = self._pictures.frames(slice(numbers[0], numbers[-1] + 1, step))
+            yield from (frame for frame in frames if frame.index in set(numbers))
 
     def _calibrate(self) -> None:
         size = (self.width, self.height)
@@ -206,14 +208,14 @@ class ScaredKeyframe(SourceDefaults):
                 f"SCARED dataset {numbers[-1]}: its calibration is known to be inaccurate, and so is what is measured"
             )
         notes = ["the view used: " + ("left, the upper half" if stacked else "the whole image")]
-        if isinstance(self._pictures, _FolderPictures) and self._pictures.shift:
+        if self._counts_from_one:
             notes.append("image number n is taken as frame n - 1: images that a video was unpacked to count from 1")
         if not self._poses:
             return [*notes, "no pose is known: frame_data is not there"]
         return [*notes, "truth: scan of the keyframe moved by robot kinematics; its error grows away from the keyframe"]
 
     def _time_s(self, index: int) -> float:
-        return self._times_s.get(index, index / self._pictures.rate_hz)
+        return self._times_s.get(index, index / self._rate_hz)
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         """Return the left view's depth (h, w) float32, NaN = unknown; None where the frame has no scene points."""
@@ -250,12 +252,12 @@ class ScaredCKeyframe(ScaredKeyframe):
         """Return whether `path` holds COLMAP's intrinsics and the frames."""
         return (path / _INTRINSICS).is_file() and _find_frames(path) is not None
 
-    def _find_pictures(self) -> _Pictures:
+    def _find_pictures(self) -> VideoFile | ImageFolder:
         files = _find_frames(self.path)
         if files is None:
             raise InputError(f"reading {self.path}: no SCARED-C keyframe, data/rgb_frames.tar.gz is not there")
         log = self.path / _LOG
-        return _ArchivePictures(files, _read_log(log) if log.is_file() else files.numbers())
+        return _ArchivedImages(files, _read_log(log) if log.is_file() else files.numbers())
 
     def _calibrate(self) -> None:
         size = (self.width, self.height)
@@ -274,75 +276,15 @@ class ScaredCKeyframe(ScaredKeyframe):
         return ["truth: COLMAP's poses, scaled to the scan of the keyframe"]
 
 
-class _VideoPictures:
-    numbers: range | list[int] | None
+class _ArchivedImages(ImageFolder):
+    """Images in an archive, `frame<number>.png`; one that is missing or damaged is left out with a warning."""
 
-    def __init__(self, file: Path) -> None:
-        self._video = VideoFile(file)
-        self.width, self.height, self.rate_hz = self._video.width, self._video.height, self._video.rate_hz
-        self.numbers = None if self._video.count is None else range(self._video.count)
-        self.warnings = self._video.warnings
+    def __init__(self, archive: NumberedFiles, numbers: list[int]) -> None:
+        self._archive = archive
+        super().__init__(archive.path, [archive.path.parent / f"frame{number:06d}.png" for number in numbers])
 
-    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the frames; a video passes over those in between."""
-        chosen = None if numbers is None else numbers[selection]
-        if chosen is None:
-            yield from self._video.frames(selection)
-        elif chosen:
-            step = gcd(*(number - chosen[0] for number in chosen)) or 1
-            frames = self._video.frames(slice(chosen[0], chosen[-1] + 1, step))
-            yield from (frame for frame in frames if frame.index in set(chosen))
-
-
-class _FolderPictures:
-    """Images of a folder; those that a video was unpacked to count from 1, so that `shift` is 1."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = ImageFolder(folder)
-        self.shift = 0 if self._folder.numbers[0] == 0 else 1
-        self.width, self.height, self.rate_hz = self._folder.width, self._folder.height, FOLDER_RATE_HZ
-        self.numbers: range | list[int] | None = [number - self.shift for number in self._folder.numbers]
-        self.warnings = self._folder.warnings
-
-    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the frames."""
-        for number in (numbers or [])[selection]:
-            position = self._folder.numbers.index(number + self.shift)
-            for frame in self._folder.frames(slice(position, position + 1)):
-                yield replace(frame, index=number)
-
-
-class _ArchivePictures:
-    """Images in an archive; one that is missing or damaged is left out with a warning."""
-
-    rate_hz = FOLDER_RATE_HZ
-
-    def __init__(self, files: NumberedFiles, numbers: list[int]) -> None:
-        self._files = files
-        self.numbers: range | list[int] | None = numbers
-        self.warnings: list[str] = []
-        first = next((image for number in numbers if (image := self._image(number)) is not None), None)
-        if first is None:
-            raise InputError(f"reading {files.path}: none of its {len(numbers)} frames can be read")
-        self.height, self.width = first.shape[:2]
-
-    def frames(self, numbers: list[int] | None, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the frames."""
-        for number in (numbers or [])[selection]:
-            rgb = self._image(number)
-            warning = f"{self._files.path}: frame {number} is missing or cannot be read, and was left out"
-            if rgb is None:
-                self.warnings += [warning] if warning not in self.warnings else []
-            elif rgb.shape[:2] != (self.height, self.width):
-                raise InputError(
-                    f"reading {self._files.path}: frame {number} is {rgb.shape[1]}x{rgb.shape[0]} px, those before it "
-                    f"are {self.width}x{self.height} px"
-                )
-            else:
-                yield SourceFrame(number, number / self.rate_hz, rgb, f"frame{number:06d}.png")
-
-    def _image(self, number: int) -> np.ndarray | None:
-        content = self._files.read(number)
+    def _image(self, file: Path) -> np.ndarray | None:
+        content = self._archive.read(frame_number(file) or 0)
         return None if content is None else decoded_image(content)
 
 
