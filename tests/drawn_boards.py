@@ -34,7 +34,7 @@ def texture(board: Checkerboard | CharucoBoard) -> np.ndarray:
 class Studio:
     """Takes pictures of a board with a camera; `samples` rays a side make a pixel."""
 
-    def __init__(self, camera: CameraModel, board: Checkerboard | CharucoBoard, samples: int = 3) -> None:
+    def __init__(self, camera: CameraModel, board: Checkerboard | CharucoBoard, samples: int = 2) -> None:
         self.camera, self.board, self.print, self.samples = camera, board, texture(board), samples
         steps = (np.arange(samples) + 0.5) / samples - 0.5
         u = (np.arange(camera.width)[:, None] + steps).ravel()

@@ -9,6 +9,7 @@ import pytest
 from drawn_calibrations import CAMERAS, PINHOLE, SIZE
 from drawn_datasets import write_pictures
 from drawn_inputs import write_c3vd
+from front_door import refused
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import Calibration, fitted, fitted_to
@@ -131,6 +132,16 @@ def test_a_file_that_is_given_wins_over_one_beside_the_frames_that_does_not_fit(
     write_calibration(LARGE, folder / "camera.yaml")
     (tmp_path / "mine.txt").write_text("70 71 65 52")
     assert open_sequence(folder, camera=tmp_path / "mine.txt").rectifier.source.central.fx == 70.0
+
+
+def test_numbers_are_a_camera_for_every_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_pictures(tmp_path / "frames")
+    sequence = open_sequence(folder, camera="70, 71, 65, 52")
+    assert sequence.rectifier.source == PinholeCamera(70.0, 71.0, 65.0, 52.0, 135, 108)
+    assert sequence.camera_source == "camera of the numbers given (--camera)"
+    for command in (("run", folder, "--out", tmp_path / "out"), ("inspect", folder)):
+        message = refused(capfd, *command, "--camera", "70 71 65")
+        assert "'70 71 65': it holds 3 numbers: expected fx fy cx cy [k1 k2 p1 p2 [k3" in message
 
 
 def test_a_crop_of_nothing_is_refused(tmp_path: Path) -> None:

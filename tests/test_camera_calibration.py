@@ -114,7 +114,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
     true = np.array(
         [getattr(PINHOLE.central, name) for name in ("fx", "fy", "cx", "cy")] + list(PINHOLE.distortion[:4])
     )
-    for seed in range(16):
+    for seed in range(8):
         rng, views = np.random.default_rng(seed), []
         for i, pose in enumerate(studio.poses(12, seed=seed)):
             # By so much the plate bends from view to view: errors of the corners of one view are alike.
@@ -124,7 +124,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
         fit = with_deviations(fit_camera(views, SIZE, form, near=PINHOLE), views)
         off = np.array(list(fit.parameters.values())) - true
         shares.append(off / np.array(list(fit.deviations.values())))
-    # 128 errors over their deviations; those that the noise of single corners gives were 2.3 times too small.
+    # 64 errors over their deviations; those that the noise of single corners gives were 2.3 times too small.
     assert 0.7 < np.sqrt(np.mean(np.square(shares))) < 1.3
     assert np.mean(np.abs(shares) < 2) > 0.9
 
@@ -318,7 +318,7 @@ def test_corners_of_large_pictures_are_where_they_truly_are(blur_px: float, larg
 @pytest.fixture(scope="module")
 def large() -> Studio:
     camera = OpenCvCamera(PinholeCamera(700.0, 700.0, 640.0, 480.0, 1280, 960), (-0.28, 0.08, 0.0, 0.0))
-    return Studio(camera, CHECKERBOARD, samples=2)
+    return Studio(camera, CHECKERBOARD, samples=1)
 
 
 # ---- what is left open

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from scopemap.calibration.intrinsics import (
 )
 from scopemap.calibration.targets import Target, other_target_seen
 from scopemap.calibration.views import LeftOut, Search, View, select_views, views_per_pixel
-from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
 
@@ -120,38 +121,32 @@ def calibrate(
         differ = f"but {len(selected.views)} of these views are sharp and differ"
         raise _too_few(f"{seen}, {differ}", "move the board through the picture and tilt it")
     forms = [form for form in FORMS if model in ("auto", form.model)]
-    views, out = without_outliers(selected.views, size, _most_flexible(selected.views, size, forms))
+    flexible = _flexible_fits(selected.views, size, forms)
+    best = min(flexible.values(), key=lambda fit: float(np.median(fit.view_rms_px)))
+    views, out = without_outliers(selected.views, size, best.form)
     views.sort(key=lambda view: view.index)
     if len(views) < FEWEST_VIEWS:
         agree = f"{seen}, but only {len(views)} of {len(selected.views)} views agree"
         worst = f"frame {out[0].view.index}: {out[0].reason}; " if out else ""
         raise _too_few(agree, f"{worst}is the board flat and the zoom untouched?")
-    errors = {form: held_out_error_px(views, size, form) for form in forms}
-    fit = with_deviations(fit_camera(views, size, choose_form(errors)), views)
+    near = {model: fit.camera for model, fit in flexible.items()}
+    errors = {form: held_out_error_px(views, size, form, near[form.model]) for form in forms if form.model in near}
+    form = choose_form(errors)
+    fit = with_deviations(fit_camera(views, size, form, near[form.model]), views)
     covered = float((views_per_pixel(views, size) > 0).mean())
     warnings = warnings_about(fit, covered, pixel_aspect)
     return CameraCalibration(fit, views, errors, out, selected.blurred, selected.alike, covered, warnings)
 
 
 def save_calibration(calibration: CameraCalibration, file: Path) -> None:
-    """Write the camera to `file`, OpenCV YAML, in place of an earlier one.
-
-    Raises `CalibrationError`, and writes none, where the camera could not be read again or not be written.
-    """
-    camera = calibration.fit.camera
-    partial = file.with_name(f".{file.stem}.partial{file.suffix}")
+    """Write the camera to `file`, OpenCV YAML; `CalibrationError`, and no file, where no command would take it."""
     try:
-        write_calibration(camera, partial)
-        read_calibration(partial, (camera.width, camera.height))
-        partial.replace(file)
+        check_plausible(calibration.fit.camera, "the fitted camera")
     except CalibrationError as error:
         raise CalibrationError(
             f"the views lead to a camera that cannot be used, so none was written: {error}"
         ) from None
-    except OSError as error:
-        raise CalibrationError(f"cannot write the calibration to {file}: {error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    write_calibration(calibration.fit.camera, file)
 
 
 def tilts_deg(fit: Fit) -> np.ndarray:
@@ -206,16 +201,14 @@ def _too_few(found: str, advice: str) -> InputError:
     return InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")
 
 
-def _most_flexible(views: list[View], size: tuple[int, int], forms: list[LensForm]) -> LensForm:
-    """Return the form with most coefficients, of the model that fits most views best: for finding outliers."""
-    fits = []
-    for form in {form.model: form for form in forms}.values():
-        try:
-            fits.append(fit_camera(views, size, form))
-        except CalibrationError:
-            continue
+def _flexible_fits(views: list[View], size: tuple[int, int], forms: list[LensForm]) -> dict[str, Fit]:
+    """Return the fit with most coefficients by model; `CalibrationError` where neither model fits."""
+    fits: dict[str, Fit] = {}
+    for model, form in {form.model: form for form in forms}.items():
+        with suppress(CalibrationError):
+            fits[model] = fit_camera(views, size, form)
     if not fits:
         raise CalibrationError(
             f"calibrating: no camera explains the {len(views)} views; is the board flat and the one named?"
         )
-    return min(fits, key=lambda fit: float(np.median(fit.view_rms_px))).form
+    return fits

@@ -148,13 +148,13 @@ def choose_form(errors_px: dict[LensForm, float]) -> LensForm:
     return best
 
 
-def held_out_error_px(views: list[View], size: tuple[int, int], form: LensForm) -> float:
+def held_out_error_px(views: list[View], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
     """Return the RMS reprojection error, px, in views that the form was not fitted to (5 folds); inf: a fit failed.
 
-    In these only the pose of the target is fitted.
+    In these only the pose of the target is fitted. `near` is a camera of the same model to start from.
     """
     try:
-        fit = fit_camera(views, size, form)
+        fit = fit_camera(views, size, form, near)
         residuals = []
         for fold in range(_FOLDS if np.isfinite(fit.rms_px) else 0):
             kept = [view for place, view in enumerate(views) if place % _FOLDS != fold]

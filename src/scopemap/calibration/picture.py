@@ -62,22 +62,13 @@ def _draw_residuals(axes: Axes, calibration: CameraCalibration, colours: np.ndar
     count = views_per_pixel(calibration.views, (width, height))
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     shown = axes.imshow(count, cmap="Greys", vmin=0, vmax=max(2 * int(count.max()), 1), extent=extent)
-    most = int(count.max())
-    bar = axes.figure.colorbar(shown, ax=axes, shrink=0.7, label="views", boundaries=np.arange(most + 2) - 0.5)
-    bar.set_ticks(list(range(0, most + 1, max(1, most // 6))))
+    axes.figure.colorbar(shown, ax=axes, shrink=0.7, label="views")
     lengths = np.linalg.norm(np.concatenate(calibration.fit.residuals_px), axis=1)
     longer = max(float(np.percentile(lengths, _LONGER_PERCENT)), 1e-9)
     magnified = _DRAWN_SHARE * width / longer
     for view, residual, colour in zip(calibration.views, calibration.fit.residuals_px, colours, strict=True):
-        axes.quiver(
-            *view.corners.pixels.T,
-            *residual.T * magnified,
-            color=colour,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.0025,
-        )
+        arrows = (*view.corners.pixels.T, *residual.T * magnified)
+        axes.quiver(*arrows, color=colour, angles="xy", scale_units="xy", scale=1, width=0.0025)
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     axes.set_title(

@@ -128,9 +128,7 @@ class CharucoBoard:
     def __post_init__(self) -> None:
         _check(self.columns, self.rows, self.square_mm)
         if not 0 < self.marker_mm < self.square_mm:
-            raise SettingsError(
-                f"a marker of {self.marker_mm:g} mm does not fit into a square of {self.square_mm:g} mm"
-            )
+            raise SettingsError(f"a marker of {self.marker_mm:g} mm does not fit a square of {self.square_mm:g} mm")
         if self.dictionary not in DICTIONARIES:
             raise SettingsError(f"unknown markers '{self.dictionary}': choose one of {', '.join(DICTIONARIES)}")
         known, wanted = len(_markers(self.dictionary).bytesList), self.columns * self.rows // 2
