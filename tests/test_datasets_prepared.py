@@ -82,7 +82,7 @@ def test_ordinary_videos_and_data_sets_are_left_alone(tmp_path: Path) -> None:
     assert (ordinary.source.width, ordinary.source.height) == (WIDTH, HEIGHT)
     assert [note for note in ordinary.notes if "stereo" in note] == ordinary.warnings == []
     folder = write_c3vd(tmp_path / "c3vd")
-    with pytest.raises(InputError, match=r"'c3vd' knows which view is meant; leave input\.stereo=left-right"):
+    with pytest.raises(InputError, match=r"'c3vd' defines the view; leave input\.stereo=left-right"):
         open_sequence(folder, settings=InputSettings(stereo="left-right"))
     assert open_sequence(folder, settings=InputSettings(stereo="none")).source.name == "c3vd"
 

@@ -1,4 +1,4 @@
-"""Frames that are left out unasked or by rate, and why; they keep their numbers."""
+"""Frames that are skipped because they repeat another or exceed the rate; the others keep their numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal
 from scopemap.io.source import SourceFrame
 from scopemap.io.video_format.redundant_frames import is_repeat
 
-# Stamps that are written in milliseconds must not make a frame miss its turn; nor may this be a good part of one.
+# Rounding of stamps to milliseconds must not skip a frame; the tolerance is at most a share of a frame.
 _SLACK_S, _SLACK_SHARE = 1e-3, 0.25
 
 
@@ -42,16 +42,16 @@ class FrameChoice:
 
     def __call__(self, frames: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
         """Yield the frames that are used; the first always is."""
-        start_s, turn, last = math.nan, -math.inf, None
+        start_s, taken, last = math.nan, -math.inf, None
         for frame in frames:
             start_s = frame.time_s if last is None else start_s
             due = math.inf if self.fps is None else _slot(frame.time_s - start_s, self.fps)
-            if due <= turn and self.fps is not None:
+            if due <= taken and self.fps is not None:
                 self._skip(frame, "thinned", f"beyond {self.fps:g} frames/s")
             elif last is not None and self.skip_repeated and is_repeat(last.rgb, frame.rgb):
                 self._skip(frame, "repeated", f"repeats frame {last.index}")
             else:
-                turn, last = due, frame
+                taken, last = due, frame
                 yield frame
 
     def _skip(self, frame: SourceFrame, kind: Literal["repeated", "thinned"], reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Pictures that hold two views or two fields, brought to one: what the settings of the input say, or what is found."""
+"""One view and one field per picture: stereo packing and interlacing undone, as the settings ask or as detected."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
 
 UNKNOWN_MAKE = ("video", "images", "dicom")
-"""Readers of pictures that nothing more is known of; those of data sets know what a picture holds, and have truth."""
+"""Readers without a data set: stereo packing and interlacing are detected, repeated frames are skipped."""
 
 OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag")
-"""Readers that do not know whether their pictures hold two views: `input.stereo` may say it."""
+"""Readers for which `input.stereo` may name the stereo packing; other data sets define their view."""
 
 _SAMPLES, _SAMPLED_EVERY = 8, 10
 _FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
@@ -31,14 +31,14 @@ _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
 def prepared(source: Source, settings: InputSettings) -> Source:
-    """Return the source with one view and one field per picture, as the settings ask; the source itself where it is so.
+    """Return the source with one view and one field per picture; the source itself where it is so already.
 
-    With `stereo` = auto, videos and folders of images that belong to no data set are looked at, and interlaced ones
-    told of. Raises `InputError` where `stereo` names the views of a data set, whose reader knows them.
+    With `stereo` = auto, the packing is detected in videos and folders of images of no data set; a warning names
+    interlaced ones. Raises `InputError` where `stereo` names the views of a data set, whose reader defines them.
     """
     if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
         raise InputError(
-            f"reading {source.path}: the reader of the data set '{source.name}' knows which view is meant; leave "
+            f"reading {source.path}: the reader of the data set '{source.name}' defines the view; leave "
             f"input.stereo={settings.stereo} (--stereo) out"
         )
     samples = _samples(source) if source.name in UNKNOWN_MAKE else []
@@ -58,7 +58,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
 class PreparedSource(SourceDefaults):
     """A source of which one view and one field of each picture is used; all else is the source's own.
 
-    packed : how two views lie in a picture, of which the left eye's is used; None: the picture is one view.
+    packed : the packing of two views, of which the left eye's is used; None: the picture is one view.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class PreparedSource(SourceDefaults):
 
 
 def of_one_view(source: Source) -> str:
-    """Return what to add to an error about a camera that does not fit the source, "" where pictures are one view."""
+    """Return what an error about a camera of another size adds where pictures hold two views, else ""."""
     if not isinstance(source, PreparedSource) or not source.two_views:
         return ""
     return (
@@ -132,28 +132,28 @@ def _samples(source: Source) -> list[np.ndarray]:
     picture_bytes = max(1, 3 * source.width * source.height)
     count = max(_FEWEST_SAMPLES, min(_SAMPLES, _SAMPLES_BYTES // picture_bytes))
     found: list[np.ndarray] = []
-    told = len(source.warnings)
-    # Where reading stops or finds faults, the run says so: it may not reach them.
+    warnings = len(source.warnings)
+    # Errors and warnings here may concern frames that the run does not read; it reports those that it meets.
     with suppress(InputError):
         if isinstance(source, VideoFile):
             found.extend(source.samples(count))
         else:
             step = max(1, (source.count or 0) // count) if isinstance(source, ImageFolder) else _SAMPLED_EVERY
             found.extend(frame.rgb for frame in islice(source.frames(slice(0, None, step)), count))
-    del source.warnings[told:]
+    del source.warnings[warnings:]
     return found
 
 
 def _packing(source: Source, settings: InputSettings, samples: list[np.ndarray]) -> tuple[Packing | None, str]:
-    """Return how two views lie in a picture, and what is to be said of it."""
+    """Return the stereo packing, None for one view, and a note about it or ""."""
     width, height, aspect = source.width, source.height, source.pixel_aspect
     if settings.stereo in ("left-right", "top-bottom"):
         asked = Packing(settings.stereo, squeezed_views(width, height, settings.stereo, aspect), float("nan"))
-        return asked, _described(asked, "as asked")
+        return asked, _packing_note(asked, "as asked")
     packed = packing(samples, aspect) if settings.stereo == "auto" else None
     if packed is not None:
         alike = f"the halves correlate by {packed.correlation:.2f}; --stereo none (input.stereo) uses the whole picture"
-        return packed, _described(packed, alike)
+        return packed, _packing_note(packed, alike)
     layout = suspected(width, height, aspect) if settings.stereo == "auto" and samples else None
     if layout is None:
         return None, ""
@@ -163,7 +163,7 @@ def _packing(source: Source, settings: InputSettings, samples: list[np.ndarray])
     )
 
 
-def _described(packed: Packing, why: str) -> str:
+def _packing_note(packed: Packing, why: str) -> str:
     squeezed = ", of pixels that are " + ("twice as wide" if packed.layout == "left-right" else "half as wide")
     return (
         f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is used"

@@ -1,4 +1,4 @@
-"""Time stamps of a video's frames as they are used: those of the stream where these can be meant."""
+"""Repair of a video's time stamps: those of the stream where they are plausible."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TimeStamps:
         """Return when the frame with number `index` was taken, s, by its stamp, s or None."""
         number, known_s = self._known
         time_s = known_s + (index - number) / self._rate_hz
-        if stamp_s is not None and self._is_meant(stamp_s + self._shift_s):
+        if stamp_s is not None and self._is_plausible(stamp_s + self._shift_s):
             time_s = stamp_s + self._shift_s
         else:
             if stamp_s is not None and not self._is_disordered(stamp_s + self._shift_s):
@@ -48,7 +48,7 @@ class TimeStamps:
         self._last_s = time_s
         return time_s
 
-    def _is_meant(self, time_s: float) -> bool:
+    def _is_plausible(self, time_s: float) -> bool:
         longest_s = max(_LONGEST_GAP_S, _LONGEST_GAP_FRAMES / self._rate_hz)
         return self._last_s is None or 0 < time_s - self._last_s <= longest_s
 

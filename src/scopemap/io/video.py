@@ -35,9 +35,9 @@ _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 class VideoFile(SourceDefaults):
     """A video; frame number = order of decoding, time stamps from the stream, pictures turned as they are to be shown.
 
-    Colours come as 8-bit sRGB by what the stream says of its matrix and range; where it is silent, BT.601, limited. A
-    video that breaks off, holds damaged pictures or wrong time stamps is used as far as it goes; `warnings` says so
-    once it was read. Raises `InputError` where it cannot be opened or holds fewer than two readable frames.
+    Colours are converted to 8-bit sRGB by the matrix and range of the stream; where it states none, BT.601, limited. A
+    video that breaks off, holds damaged pictures or wrong time stamps is used as far as it goes; `warnings` names
+    it once it was read. Raises `InputError` where it cannot be opened or holds fewer than two readable frames.
     """
 
     name = "video"
@@ -134,7 +134,7 @@ class VideoFile(SourceDefaults):
                     raise InputError(f"reading the video {self.path}: it has no picture")
                 stream = container.streams.video[0]
                 if stream.codec_context is None:
-                    raise InputError(f"reading the video {self.path}: FFmpeg knows no decoder for it")
+                    raise InputError(f"reading the video {self.path}: FFmpeg has no decoder for it")
                 if stream.codec_context.name in _TEXT_CODECS:
                     raise InputError(f"reading the video {self.path}: it is a text file, not a video")
                 stream.thread_type = "AUTO"

@@ -1,8 +1,8 @@
-"""Weights on this machine: where they lie, whether they are what they should be, and how to fetch them.
+"""Weights on this machine: their folder, their verification by hash, their download.
 
-All weights lie in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. Nothing is downloaded
-but by `pull`, on the user's word. What `checkpoints.py` pins by hash is held to it; what was pulled is hashed into the
-folder's `weights.lock.json`, with the revision it came at, and held to that ever after.
+All weights are in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. `pull` downloads.
+Files must have the hashes of `checkpoints.toml`, and those recorded in the folder's `weights.lock.json` when they were
+pulled, with their revision.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def is_present(*names: str) -> bool:
 def locate(*names: str) -> Path:
     """Return the checked file or folder of the first of `names` that is there; never downloads.
 
-    Files unchanged since they were recorded are not hashed again (`verify` does that). Raises `WeightsError` that says
-    what to fetch and where it must lie, or which file is damaged.
+    Files unchanged since they were recorded are not hashed again (`verify` does that). Raises `WeightsError` that names
+    what to fetch and where to put it, or the damaged file.
     """
     checkpoints = [find(name) for name in names]
     for checkpoint in checkpoints:
@@ -71,11 +71,10 @@ def verify(name: str) -> Path:
 def overview() -> list[Row]:
     """Return the state of every registered checkpoint and of every other one that was pulled."""
     names = [*REGISTRY, *(name for name in _read_lock() if name not in REGISTRY)]
-    rows = []
-    for checkpoint in map(find, names):
-        shown = (checkpoint.name, checkpoint.purpose, checkpoint.licence, checkpoint.size_mb)
-        rows.append(Row(*shown, _state(checkpoint), weights_folder() / checkpoint.place))
-    return rows
+    return [
+        Row(one.name, one.purpose, one.licence, one.size_mb, _state(one), weights_folder() / one.place)
+        for one in map(find, names)
+    ]
 
 
 def pull(name: str, *, progress: bool = False) -> Path:

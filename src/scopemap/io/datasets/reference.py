@@ -16,9 +16,9 @@ from scopemap.trajectory.trajectory import Trajectory, Unit
 
 
 def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory | None:
-    """Return the true poses of a data set's sequence, or of a trajectory file or folder; None where it knows none.
+    """Return the true poses of a data set's sequence, or of a trajectory file or folder; None where there are none.
 
-    A folder is asked as a data set first: its reader knows which camera the poses are of. `unit` and `kind` are those
+    A folder is read as a data set first: its reader defines the camera of the poses. `unit` and `kind` are those
     of `read_trajectory` and call for a trajectory; `kind` may be the name of a data set's reader, too. Raises
     `InputError` where `path` is neither, `SettingsError` for an unknown `kind`.
     """

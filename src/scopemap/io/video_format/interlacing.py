@@ -1,10 +1,9 @@
 """Interlaced pictures: even and odd rows taken at two times (PAL 576i, NTSC 480i, 1080i), and how to undo it.
 
 Where the scene moves, the odd rows of an interlaced picture show it elsewhere than the even rows do: edges look like
-combs. Looking for rows that differ from their neighbours would take fine horizontal texture and noise for them, too.
-Here the two fields are held against each other: what the odd rows differ from the mean of the even rows around them is
-either explained by a motion of the one field against the other (as in Lucas and Kanade's optical flow), and more than
-rows of one field differ from each other, or it is texture or noise.
+combs. The difference between the odd rows and the mean of the even rows around them counts as combing where a motion
+between the two fields explains it (as in Lucas and Kanade's optical flow) and it exceeds the difference between rows of
+one field; else it is texture or noise.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ def _share_moved(even: np.ndarray, odd: np.ndarray, scale_px: float) -> float:
     energy = over_block(apart * apart)
     if energy.mean() < (_LEAST_DIFFERENCE / (1 + scale_px)) ** 2:
         return 0.0
-    # Rows of one field lie farther apart, so that texture and noise make them differ more: what it is without motion.
+    # The difference without motion is estimated by rows of one field, which are farther apart.
     within = np.pad(even[1:-1] - (even[:-2] + even[2:]) / 2, ((1, 0), (0, 0)), mode="edge")
     usual = over_block(calm(np.abs(within)) ** 2)
     along, down = (cv2.Sobel(mean, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))

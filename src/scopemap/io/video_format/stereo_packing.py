@@ -1,10 +1,9 @@
-"""Two views packed into one picture: beside or above each other, whole or squeezed to half their width or height.
+"""Two views packed into one picture: side by side or above each other, whole or squeezed to half their width or height.
 
-A shape that is unusual for one view raises the suspicion; only pictures confirm it: the halves of a stereo picture show
-the same tissue, moved sideways by a few percent and not at all up or down. What is compared is fine detail: the light
-of an ordinary picture, brightest in its middle and dark around, is alike in its halves, too. So are the reflections of
-two lamps and what is written over both halves: saturated pixels and those that never change are left out, bright ones
-count no more than others, and the halves must agree in several parts.
+The halves of a stereo picture show the same tissue, shifted sideways by a few percent and not vertically. The fine
+detail of both halves is compared, since illumination is similar in the halves of any endoscopic picture. Reflections of
+two lamps and text over both halves are similar, too: saturated pixels and those that never change are left out, bright
+ones count no more than others, and the halves must agree in several tiles.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ _STILL_LEVELS, _LEAST_STILL_PICTURES, _MOST_STILL_SHARE = 3, 3, 0.5
 
 @dataclass(frozen=True)
 class Packing:
-    """How two views lie in one picture.
+    """The packing of two views into one picture.
 
     Attributes
     ----------
-    layout : beside each other, the left eye's on the left; or above each other, the left eye's on top.
+    layout : side by side, the left eye's on the left; or above each other, the left eye's on top.
     squeezed : whether each has only half its width (left-right) or height (top-bottom).
-    correlation : of the detail of both views, median over the pictures; NaN where nobody looked.
+    correlation : of the detail of both views, median over the pictures; NaN where it was not measured.
     """
 
     layout: Layout
@@ -86,7 +85,7 @@ def halves(picture: np.ndarray, layout: Layout) -> tuple[np.ndarray, np.ndarray]
 
 
 def suspected(width: int, height: int, pixel_aspect: float = 1.0) -> Layout | None:
-    """Return how two whole views would lie in pictures whose shape is unusual for one view; None for usual shapes."""
+    """Return the layout that the shape of pictures suggests, None for shapes that are usual for one view."""
     aspect = pixel_aspect * width / height
     if aspect > _LEAST_ASPECT_BESIDE:
         return "left-right"
@@ -143,7 +142,7 @@ def _comparable(views: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     if len(views) >= _LEAST_STILL_PICTURES:
         still = np.ptp(greys, axis=0) < _STILL_LEVELS
         lit = used.any(axis=0)
-        # A video that stands still as a whole has nothing written over it that could be told from it.
+        # In a video at rest, text over the picture cannot be distinguished from the scene.
         if lit.any() and still[lit].mean() < _MOST_STILL_SHARE:
             used *= _eroded((~still | ~lit).astype(np.float32))
     return list(zip(greys, used, strict=True))
