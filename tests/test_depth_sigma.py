@@ -19,7 +19,8 @@ from scopemap.config import DepthSettings, FusionSettings, MapisSettings, Tracki
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
+from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.mapis import Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
 from scopemap.fusion import TsdfVolume

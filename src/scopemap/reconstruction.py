@@ -11,7 +11,6 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,15 +23,16 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
+from scopemap.frame import Frame
 from scopemap.fusion.mesh import save_mesh
 from scopemap.io.frame_choice import SkippedFrame
-from scopemap.mapping import Correction
+from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step
 from scopemap.tracking import Track
 from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
-"""The finest step of depth/*.png, which reaches 655 mm."""
+"""The finest unit of depth/*.png; the largest depth is then 655 mm."""
 
 _LARGEST_UNIT = 65534
 _COLUMNS = [
@@ -89,38 +89,33 @@ def _skipped_row(frame: SkippedFrame) -> list[str]:
     return known + [""] * (len(_COLUMNS) - len(known))
 
 
-def corrected(records: list[FrameRecord], correction: Correction) -> list[FrameRecord]:
-    """Return the records with the poses and scales of the back end; a lost frame repeats the last pose known."""
-    out: list[FrameRecord] = []
-    for record in records:
-        if record.track.status == "lost":
-            pose = out[-1].T_world_camera if out else record.T_world_camera
-            out.append(replace(record, T_world_camera=pose))
-            continue
-        pose, factor = correction.pose(record.index, record.T_world_camera), correction.depth_factor(record.index)
-        out.append(replace(record, T_world_camera=pose, depth_scale=record.depth_scale * factor))
-    return out
+def records_of(submap: Submap, records: list[FrameRecord]) -> list[FrameRecord]:
+    """Return the records with corrected poses and scales; frames of other submaps are lost in this one.
 
-
-def only_maps(records: list[FrameRecord], kept: Collection[int]) -> list[FrameRecord]:
-    """Return the records of these maps' frames as of one map, and with those of all other maps lost."""
-    if len({record.track.map for record in records if record.track.status != "lost"}) < 2:
-        return records
-    out: list[FrameRecord] = []
-    begun = False
-    first = next((r.T_world_camera for r in records if r.track.status != "lost" and r.track.map in kept), np.eye(4))
+    A lost frame repeats the last pose that is known, before the first one the first.
+    """
+    first = next(record for record in records if record.index in submap.frames)
+    last, out, started = _corrected(submap, first).T_world_camera, list[FrameRecord](), False
     for record in records:
         track = record.track
-        if track.status == "lost" or track.map not in kept:
-            reason = track.reason if track.status == "lost" else f"tracked in another map, number {track.map}"
-            pose = out[-1].T_world_camera if out else first
-            track = replace(track, status="lost", reason=reason, T_world_camera=pose)
-            record = replace(record, track=track, T_world_camera=pose)
-        elif track.status == "initial" and begun:
-            record = replace(record, track=replace(track, status="ok", reason="began a map that was joined"))
-        begun = begun or record.track.status != "lost"
+        if record.index not in submap.frames:
+            reason = track.reason if track.status == "lost" else f"tracked in another submap, map {track.map}"
+            record = replace(record, track=replace(track, status="lost", reason=reason), T_world_camera=last)
+        else:
+            if track.status == "initial" and started:
+                record = replace(record, track=replace(track, status="ok", reason="first frame of a merged map"))
+            record, started = _corrected(submap, record), True
+            last = record.T_world_camera
         out.append(record)
     return out
+
+
+def _corrected(submap: Submap, record: FrameRecord) -> FrameRecord:
+    if submap.correction is None:
+        return record
+    pose = submap.correction.pose(record.index, record.T_world_camera)
+    scale = record.depth_scale * submap.correction.depth_factor(record.index)
+    return replace(record, T_world_camera=pose, depth_scale=scale)
 
 
 @dataclass(frozen=True)
@@ -195,15 +190,15 @@ class Reconstruction:
 
 
 class DepthWriter:
-    """Writes the refined depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
+    """Writes the depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
 
-    reach_mm : depth that must fit in; it makes the step coarser than `DEPTH_SCALE_MM` where it has to.
+    largest_mm : depth that must be representable; it makes the unit coarser than `DEPTH_SCALE_MM` where necessary.
     Raises `InputError` where nothing can be written.
     """
 
-    def __init__(self, folder: Path, reach_mm: float = 0.0) -> None:
+    def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
         self._folder = Path(folder) / "depth"
-        self._scale_mm = _step_for(reach_mm)
+        self._scale_mm = _unit_for(largest_mm)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             description = json.dumps({"scale_mm": self._scale_mm, "unknown": 0}) + "\n"
@@ -211,32 +206,17 @@ class DepthWriter:
         except OSError as error:
             raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
 
-    def __call__(self, step: Step) -> None:
-        """Write one frame's depth."""
-        self._write(step.frame.index, step.refined.depth_mm / self._scale_mm)
-
-    def correct(self, records: list[FrameRecord], correction: Correction) -> None:
-        """Write the depth of all tracked frames once more, as the back end corrected it."""
-        for record in records if not correction.refused else []:
-            if record.track.status != "lost":
-                image = cv2.imread(str(self._file(record.index)), cv2.IMREAD_UNCHANGED)
-                if image is None:
-                    raise InputError(f"cannot read back {self._file(record.index)}: was it removed during the run?")
-                units = np.where(np.asarray(image) > 0, image, np.nan).astype(np.float32)
-                self._write(record.index, units * correction.depth_factors(record.index, units * self._scale_mm))
-
-    def _file(self, index: int) -> Path:
-        return self._folder / f"{index:06d}.png"
-
-    def _write(self, index: int, units: np.ndarray) -> None:
-        units = np.nan_to_num(units, nan=0.0)
+    def __call__(self, frame: Frame) -> None:
+        """Write the depth of a frame."""
+        units = np.nan_to_num(np.asarray(frame.depth_mm) / self._scale_mm, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
+        file = self._folder / f"{frame.index:06d}.png"
         try:
-            written = cv2.imwrite(str(self._file(index)), image)
+            written = cv2.imwrite(str(file), image)
         except cv2.error:
             written = False
         if not written:
-            raise InputError(f"cannot write {self._file(index)}: the disk is full or the folder may not be written")
+            raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
 
 
 class DepthReader:
@@ -264,9 +244,9 @@ class DepthReader:
         return np.where(image > 0, image * np.float32(self._scale_mm), np.float32(np.nan))
 
 
-def _step_for(reach_mm: float) -> float:
-    """Return the smallest of ..., 0.01, 0.02, 0.05, 0.1, ... mm, `DEPTH_SCALE_MM` at least, that reaches so far."""
-    least = max(reach_mm / _LARGEST_UNIT, DEPTH_SCALE_MM) * (1 - 1e-6)
+def _unit_for(largest_mm: float) -> float:
+    """Return the smallest of 0.01, 0.02, 0.05, 0.1, ... mm with which the largest depth is representable."""
+    least = max(largest_mm / _LARGEST_UNIT, DEPTH_SCALE_MM) * (1 - 1e-6)
     power = 10.0 ** math.floor(math.log10(least))
     return next(round(digit * power, 12) for digit in (1, 2, 5, 10) if digit * power >= least)
 

@@ -1,17 +1,17 @@
-"""Runs the story over a sequence: looks ahead, keeps the clock, tells observers, collects what is needed to trust it.
+"""The runner: passes a sequence through the pipeline and collects the result.
 
 While frame i is tracked and fused in this thread, frame i+1 is read and goes through the networks in another.
 """
 
 from __future__ import annotations
 
-import math
 import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,16 @@ from scopemap.config import Config, FusionSettings
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
+from scopemap.estimators import create_estimators, estimators_provenance, largest_depth_mm
+from scopemap.frame import Frame
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
 from scopemap.io.video_format.redundant_frames import is_constant
-from scopemap.mapping import LARGEST_LOG_FACTOR, Submap
-from scopemap.pipeline import Estimators, Fused, Percept, Pipeline, Step
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, corrected, only_maps, prepare_folder
-from scopemap.tracking import FrameTracker
+from scopemap.mapping.submaps import Submap
+from scopemap.pipeline import Estimators, Percept, Pipeline, Step
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of
+from scopemap.tracking.track import FrameTracker
 
 Observer = Callable[[Step], None]
 _VERSIONS = (
@@ -53,42 +57,100 @@ def reconstruct(
     config : settings, by default the preset `default`.
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
-    observers : called with each `Step` as it is done, its pose and depth as tracked: a back end has not spoken yet.
-    tracker : odometry that takes the place of ours; None: as `config.tracking` says. Its keyframes are adjusted, too,
-        unless `config.mapping.method` is "none".
+    observers : called with each `Step`, whose pose and depth are as tracked, before the back end.
+    tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
+        "none".
 
-    The settings in the result are the resolved ones: a `depth.exponent` that was to be fitted is a number there, and so
-    is the size of the voxels.
-    Where maps could not be joined, what has most frames is the result, and `others` are beside it.
-    Raises `InputError` where no frame could be used, and whatever the chosen estimators raise for missing weights.
+    The settings in the result are the resolved ones: a fitted `depth.exponent` and the TSDF parameters are numbers.
+    Of several submaps the one with most frames is the result, and `others` holds the others.
+    Raises `InputError` where no frame could be tracked, and what the estimators raise for missing weights.
     """
     config, clock = config or Config(), _Clock()
-    estimators = Estimators.create(config, sequence)
-    writer = None
-    if out is not None:
-        _refuse_own_input(Path(out), sequence, config)
-        prepare_folder(Path(out), overwrite=overwrite)
-        writer = DepthWriter(Path(out), _most_depth_mm(config, estimators))
-        observers = (writer, *observers)
-    sequence, camera_note = _with_best_camera(sequence, config, estimators, clock)
-    config, exponent_note = _with_exponent(sequence, config, estimators, clock)
-    if exponent_note:
+    folder = None if out is None else Path(out)
+    estimators = create_estimators(config, sequence)
+    write = None
+    if folder is not None:
+        _refuse_own_input(folder, sequence, config)
+        prepare_folder(folder, overwrite=overwrite)
+        write = DepthWriter(folder, largest_depth_mm(config, estimators))
+    sequence, camera_notes = _with_best_camera(sequence, config, estimators, clock)
+    config, exponent_notes = _with_exponent(sequence, config, estimators, clock)
+    if exponent_notes:
         # Some estimators remember the first frame that they saw, and the anchor holds the settings.
-        estimators = Estimators.create(config, sequence)
-    distances = _Distances()
-    observers = (distances, *observers)
-    pipeline = Pipeline(config, estimators, tracker)
-    records = [_observed(step, observers) for step in _steps(sequence, pipeline, clock)]
-    if all(record.track.status == "lost" for record in records):
-        raise InputError(f"no frame of {sequence.path} could be used: {records[0].track.reason} (black or constant?)")
-    submaps, warnings = clock.timed("back end", pipeline.submaps)
-    tracked = _Tracked(sequence, config, pipeline, clock, records, camera_note + exponent_note, distances, writer)
-    results = [tracked.result(submap) for submap in submaps]
-    results[0].provenance["warnings"] += warnings
-    result = replace(results[0], others=results[1:])
-    if out is not None:
-        result.save(Path(out))
+        estimators = create_estimators(config, sequence)
+    with closing(FrameStore(folder)) as store:
+        run = _Run(sequence, config, Pipeline(config, estimators, store, tracker), clock, write)
+        run.track(observers)
+        result = run.result(camera_notes + exponent_notes)
+    if folder is not None:
+        result.save(folder)
     return result
+
+
+@dataclass
+class _Run:
+    """One run: the pipeline, and what is collected on the way."""
+
+    sequence: Sequence
+    config: Config
+    pipeline: Pipeline
+    clock: _Clock
+    write: DepthWriter | None
+    records: list[FrameRecord] = field(default_factory=list)
+    median_depths_mm: list[float] = field(default_factory=list)
+
+    def track(self, observers: tuple[Observer, ...]) -> None:
+        """Pass all frames through the pipeline. Raises `InputError` where no frame is tracked."""
+        for step in _steps(self.sequence, self.pipeline, self.clock):
+            some_mm = step.refined.depth_mm[::4, ::4]
+            if np.isfinite(some_mm).any():
+                self.median_depths_mm.append(float(np.nanmedian(some_mm)))
+            if self.write is not None and not self.pipeline.fusion.at_end:
+                self.write(step.frame)
+            for observer in observers:
+                observer(step)
+            self.records.append(FrameRecord.of(step))
+        if all(record.track.status == "lost" for record in self.records):
+            reason = self.records[0].track.reason
+            raise InputError(f"no frame of {self.sequence.path} could be used: {reason} (black or constant?)")
+
+    def result(self, notes: list[str]) -> Reconstruction:
+        """Return the reconstruction of the largest submap with those of the others."""
+        submaps, warnings = self.clock.timed("back end", self.pipeline.submaps)
+        results = [self._fused(submap, notes) for submap in submaps]
+        for frame in self._frames_of_none(submaps):
+            self._written(frame)
+        results[0].provenance["warnings"] += warnings
+        return replace(results[0], others=results[1:])
+
+    def _fused(self, submap: Submap, notes: list[str]) -> Reconstruction:
+        """Correct, write and fuse the frames of a submap."""
+        sequence, pipeline = self.sequence, self.pipeline
+        frames = map(self._written, pipeline.corrected(submap))
+        fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
+        records = records_of(submap, self.records)
+        provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
+        correction = [] if submap.correction is None else [submap.correction.description]
+        provenance["notes"] += notes + correction + fused.notes
+        masks = pipeline.estimators.masks
+        provenance["warnings"] += [] if masks is None else masks.warnings
+        provenance["warnings"] += _depth_warnings(self.median_depths_mm, fused.settings)
+        config = self.config.model_copy(update={"fusion": fused.settings})
+        source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
+        return Reconstruction(
+            sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
+        )
+
+    def _frames_of_none(self, submaps: list[Submap]) -> Iterator[Frame]:
+        """Yield the stored frames that are in no submap, as tracked."""
+        submapped = {index for submap in submaps for index in submap.frames}
+        return self.pipeline.fusion.store.frames([r.index for r in self.records if r.index not in submapped])
+
+    def _written(self, frame: Frame) -> Frame:
+        """Write the final depth of a frame."""
+        if self.write is not None:
+            self.write(frame)
+        return frame
 
 
 class _Clock:
@@ -111,65 +173,6 @@ class _Clock:
             self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - started
 
 
-class _Distances:
-    """Observer that keeps how far the scene lies: what is too far to be fused must not go missing unsaid."""
-
-    def __init__(self) -> None:
-        self._medians_mm: list[float] = []
-
-    def __call__(self, step: Step) -> None:
-        """Note the median depth of a frame."""
-        some_mm = step.refined.depth_mm[::4, ::4]
-        if np.isfinite(some_mm).any():
-            self._medians_mm.append(float(np.nanmedian(some_mm)))
-
-    def warnings(self, settings: FusionSettings) -> list[str]:
-        """Return what there is to say of all frames so far."""
-        if not settings.enabled or not self._medians_mm or settings.max_depth_mm is None:
-            return []
-        median_mm = float(np.median(self._medians_mm))
-        if median_mm <= settings.max_depth_mm:
-            return []
-        return [
-            f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
-            f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
-        ]
-
-
-@dataclass(frozen=True)
-class _Tracked:
-    """All that there is of a run once the last frame is tracked."""
-
-    sequence: Sequence
-    config: Config
-    pipeline: Pipeline
-    clock: _Clock
-    records: list[FrameRecord]
-    notes: list[str]
-    distances: _Distances
-    writer: DepthWriter | None
-
-    def result(self, submap: Submap) -> Reconstruction:
-        """Correct and fuse one submap; its depth is written anew."""
-        sequence, clock, correction = self.sequence, self.clock, submap.correction
-        records = only_maps(self.records, submap.maps)
-        if correction is not None:
-            records = corrected(records, correction)
-            if self.writer is not None:
-                clock.timed("depth corrected", self.writer.correct, records, correction)
-        fused: Fused = clock.timed("fuse", self.pipeline.fuse, submap)
-        config = self.config.model_copy(update={"fusion": fused.settings})
-        estimators = self.pipeline.estimators
-        provenance = _provenance(sequence, estimators, clock, records)
-        provenance["notes"] += self.notes + ([] if correction is None else [correction.description]) + fused.note
-        provenance["warnings"] += [] if estimators.masks is None else estimators.masks.warnings
-        provenance["warnings"] += self.distances.warnings(config.fusion)
-        source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
-        return Reconstruction(
-            sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
-        )
-
-
 def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[Step]:
     frames = sequence.frames()
 
@@ -184,25 +187,12 @@ def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[St
             yield clock.timed("track and fuse", pipeline.step, percept)
 
 
-def _observed(step: Step, observers: tuple[Observer, ...]) -> FrameRecord:
-    for observer in observers:
-        observer(step)
-    return FrameRecord.of(step)
-
-
 def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
     """Raise `InputError` where the result would replace what the run reads."""
     kind, _, folder = config.depth.backend.partition(":")
     for source in [sequence.path, *([Path(folder)] if kind == "files" else [])]:
         if source.resolve().is_relative_to(out.resolve()):
             raise InputError(f"cannot write a run to {out}: its input {source} lies there; name another folder")
-
-
-def _most_depth_mm(config: Config, estimators: Estimators) -> float:
-    """How far depth may reach, mm, with room for what a back end may make of it (three deviations of the scale)."""
-    bent = LARGEST_LOG_FACTOR if config.mapping.depth_step_sigma > 0 else 0.0
-    room = 1.0 if config.mapping.method == "none" else math.exp(3 * config.mapping.scale_sigma + bent)
-    return estimators.reach_mm(config.depth, room)
 
 
 def _with_best_camera(
@@ -238,6 +228,19 @@ def _with_exponent(
     return fit.applied(config), [fit.describe(config.depth.advanced.exponent_frames)]
 
 
+def _depth_warnings(medians_mm: list[float], settings: FusionSettings) -> list[str]:
+    """Return a warning where most of the scene is beyond the largest depth that is fused."""
+    if not settings.enabled or not medians_mm or settings.max_depth_mm is None:
+        return []
+    median_mm = float(np.median(medians_mm))
+    if median_mm <= settings.max_depth_mm:
+        return []
+    return [
+        f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
+        f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
+    ]
+
+
 def _provenance(
     sequence: Sequence, estimators: Estimators, clock: _Clock, records: list[FrameRecord]
 ) -> dict[str, Any]:
@@ -260,7 +263,7 @@ def _provenance(
             "focal_sigma_px": sequence.focal_sigma_px,
             "size": sequence.size_source,
         },
-        "estimators": estimators.provenance(),
+        "estimators": estimators_provenance(estimators),
         "notes": sequence.notes,
         "warnings": sequence.warnings,
         "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},

@@ -17,29 +17,13 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MapisSettings
+from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.depth.estimate import DepthKind
 from scopemap.errors import check_shape
 from scopemap.geometry.uncertainty import blended_share, by_variance, faded_share, sigma_share
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 
 _MIN_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
-
-
-@dataclass(frozen=True)
-class DenseCorrespondence:
-    """Dense correspondence of a frame with the previous one.
-
-    Attributes
-    ----------
-    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, flow check passed.
-    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant for a single score.
-    usable_share : share of the current image that shows tissue.
-    """
-
-    to_previous: np.ndarray
-    consistent: np.ndarray
-    distance: np.ndarray
-    usable_share: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
-"""Frames that wait to be fused, kept in a temporary file (4 bytes a pixel): long videos must not fill the memory."""
+"""The frame store: tracked frames on disk (about 5 bytes a pixel) until the last one, so that memory stays bounded."""
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Collection, Iterator
 from functools import cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import IO, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,106 +16,120 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 
-# ln of millimetres in 16 bits: 0.0001 mm (uncertainties are small) to 34 m in steps of 0.03 %; 0 = unknown.
-_LOG_STEP, _LEAST_MM = 3e-4, 1e-4
-_MOST_CODE = 65535
-# Colours only paint the mesh: JPEG takes a fifth of the time and half of the room of what loses nothing.
+# ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
+_LOG_STEP, _MIN_MM = 3e-4, 1e-4
+_MAX_CODE = 65535
+# Colours only paint the mesh: JPEG takes a fifth of the time and half of the space of a lossless format.
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
 class _Entry(NamedTuple):
-    """What of a frame is small, and how many bytes each of its images takes in the file."""
+    """What is small of a frame, where its images begin in the file, and how many bytes each takes."""
 
-    number: int
+    index: int
     time_s: float
     camera: PinholeCamera
     T_world_camera: np.ndarray | None
+    offset: int
     sizes: list[int]
-    median_mm: float
+    median_depth_mm: float
 
 
-class FrameSpool:
-    """Keeps frames with depth and pose in order; what fusion does not need of them is not kept."""
+class FrameStore:
+    """Stores frames with depth in one unnamed file, which is made with the first frame and gone with the store.
 
-    def __init__(self) -> None:
-        # It lives as long as the spool: closed, and so gone, with it.
-        self._file = tempfile.TemporaryFile(prefix="scopemap")  # noqa: SIM115
+    folder : where that file is; None: the system's temporary folder.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder = Path(tempfile.gettempdir() if folder is None else folder)
+        self._file: IO[bytes] | None = None
         self._entries: list[_Entry] = []
 
     def __len__(self) -> int:
-        """Return how many frames wait."""
+        """Return the number of frames."""
         return len(self._entries)
 
-    def typical_mm(self, among: Collection[int] | None = None) -> float | None:
-        """Return the median of the frames' median depths, mm; None where no depth is known.
-
-        among : numbers of the frames that count; None: all.
-        """
-        some = [entry.median_mm for entry in self._entries if among is None or entry.number in among]
-        medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
-        return float(np.median(medians_mm)) if medians_mm else None
-
     def put(self, frame: Frame) -> None:
-        """Keep a frame. Raises `InputError` where the temporary folder is full."""
+        """Store a frame. Raises `InputError` where the folder is full or read-only."""
         assert frame.depth_mm is not None
         parts = [
             cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _COLOUR_QUALITY)[1].tobytes(),
             np.packbits(frame.valid).tobytes(),
-            *(_packed(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
+            *(_encoded(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
         ]
         try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=self._folder, prefix="scopemap")  # noqa: SIM115
+            self._file.seek(0, os.SEEK_END)
             self._file.write(b"".join(parts))
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"cannot keep frames to be fused in {tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR "
-                "to a folder with room, or mapping.method=none and fusion.voxel_mm: then nothing waits"
+                f"cannot store frames in {self._folder}: {error.strerror or error}; free space there, or set "
+                "mapping.method=none and fusion.voxel_mm: then no frame is stored"
             ) from None
         sizes = [len(part) for part in parts]
-        self._entries.append(
-            _Entry(frame.index, frame.time_s, frame.camera, frame.T_world_camera, sizes, _median_mm(frame))
+        offset = self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
+        entry = (frame.index, frame.time_s, frame.camera, frame.T_world_camera, offset, sizes, _median_depth_mm(frame))
+        self._entries.append(_Entry(*entry))
+
+    def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
+        """Yield the frames, or those with the given numbers, in order; depth to 0.015 %, colours to a few levels."""
+        for entry in self._entries:
+            if among is None or entry.index in among:
+                yield self._read(entry)
+
+    def median_depth_mm(self, among: Collection[int] | None = None) -> float | None:
+        """Return the median of the frames' median depths, mm, None where no depth is known; `among` as in `frames`."""
+        some = [entry.median_depth_mm for entry in self._entries if among is None or entry.index in among]
+        medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
+        return float(np.median(medians_mm)) if medians_mm else None
+
+    def close(self) -> None:
+        """Delete the file."""
+        if self._file is not None:
+            self._file.close()
+
+    def _read(self, entry: _Entry) -> Frame:
+        assert self._file is not None
+        self._file.seek(entry.offset)
+        shape = (entry.camera.height, entry.camera.width)
+        colours, valid, depth, *sigma = (np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes)
+        return Frame(
+            entry.index,
+            entry.time_s,
+            cv2.cvtColor(np.asarray(cv2.imdecode(colours, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB),
+            entry.camera,
+            np.unpackbits(valid, count=shape[0] * shape[1]).reshape(shape).astype(bool),
+            _decoded(depth, shape),
+            entry.T_world_camera,
+            depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
         )
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield the frames in the order they came; depths are exact to 0.015 %, colours to a few levels."""
-        self._file.seek(0)
-        for entry in self._entries:
-            shape = (entry.camera.height, entry.camera.width)
-            colours, valid, depth, *sigma = (np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes)
-            yield Frame(
-                entry.number,
-                entry.time_s,
-                cv2.cvtColor(np.asarray(cv2.imdecode(colours, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB),
-                entry.camera,
-                np.unpackbits(valid, count=shape[0] * shape[1]).reshape(shape).astype(bool),
-                _unpacked(depth, shape),
-                entry.T_world_camera,
-                depth_sigma_mm=_unpacked(sigma[0], shape) if sigma else None,
-            )
 
-
-def _median_mm(frame: Frame) -> float:
-    """Median of the known depth in a frame's usable pixels, mm; NaN where there is none."""
+def _median_depth_mm(frame: Frame) -> float:
+    """Return the median of the known depth in a frame's usable pixels, mm; NaN where there is none."""
     assert frame.depth_mm is not None
     some_mm = frame.depth_mm[::4, ::4][frame.valid[::4, ::4]]
     some_mm = some_mm[np.isfinite(some_mm)]
     return float(np.median(some_mm)) if some_mm.size else float("nan")
 
 
-def _packed(mm: np.ndarray) -> np.ndarray:
+def _encoded(mm: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
-        code = np.float32(1.5 - np.log(_LEAST_MM) / _LOG_STEP) + np.log(mm) * np.float32(1 / _LOG_STEP)
-    # What lies beyond is unknown, not at the end.
-    return np.where(np.isfinite(code) & (code < _MOST_CODE + 1), np.maximum(code, 1), 0).astype(np.uint16)
+        code = np.float32(1.5 - np.log(_MIN_MM) / _LOG_STEP) + np.log(mm) * np.float32(1 / _LOG_STEP)
+    # Beyond the range is unknown, not at its end.
+    return np.where(np.isfinite(code) & (code < _MAX_CODE + 1), np.maximum(code, 1), 0).astype(np.uint16)
 
 
-def _unpacked(code: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _decoded(code: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return _millimetres()[code.view(np.uint16).reshape(shape)]
 
 
 @cache
 def _millimetres() -> np.ndarray:
     """Return the depth that each code stands for, (65536,) float32."""
-    mm = _LEAST_MM * np.exp((np.arange(_MOST_CODE + 1) - 1) * _LOG_STEP)
+    mm = _MIN_MM * np.exp((np.arange(_MAX_CODE + 1) - 1) * _LOG_STEP)
     mm[0] = np.nan
     return mm.astype(np.float32)

@@ -1,22 +1,134 @@
-"""Mesh files: PLY as it is in the world, GLB as glTF viewers expect it."""
+"""The mesh: marching cubes on the distance field, chunk by chunk, welded, without floaters; PLY and GLB files.
+
+A chunk is 64^3 cells, so it needs one sample more on each side, which it shares with its neighbour; a vertex lies on a
+grid edge, and the edge's address welds the chunks exactly.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
 
+from scopemap.config.mapping import FusionAdvanced
+from scopemap.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
+
+_CHUNK_BLOCKS = 8
+_CHUNK = _CHUNK_BLOCKS * BLOCK
+# Keeps every vertex off the grid corners, where the edge it lies on would be ambiguous.
+_SMALLEST_DISTANCE_VOXELS = 1e-3
+# A cell's diagonal is sqrt(3) voxels, and a distance changes by no more than the step: twice that is a depth edge, not
+# a surface. Without the limit, walls of the truncation's depth would grow behind every fold's silhouette.
+_LARGEST_SPREAD_VOXELS = 3.5
+_UNSEEN_GREY = 128.0
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Mesh of one chunk: vertices (V, 3) in voxels, their edges' addresses (V, 3), colours (V, 3) 0..255, faces (F, 3)."""
+
+    vertices: np.ndarray
+    edges: np.ndarray
+    colours: np.ndarray
+    faces: np.ndarray
+
+
+def extract_mesh(blocks: VoxelBlocks, settings: FusionAdvanced, voxel_mm: float) -> trimesh.Trimesh:
+    """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
+
+    Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole, and so does the
+    space that a fold hides behind its silhouette. Components with
+    less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
+    """
+    corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
+    chunks = [
+        _extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners
+    ]
+    mesh = _weld([chunk for chunk in chunks if chunk is not None])
+    vertices, faces, colours = _without_floaters(*mesh, settings.min_component_share)
+    return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False)
+
+
+def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min_weight: float) -> _Chunk | None:
+    samples = Voxels(*(array[(slice(_CHUNK + 1),) * 3] for array in blocks.dense(corner, _CHUNK_BLOCKS + 1)))
+    smallest = _SMALLEST_DISTANCE_VOXELS * voxel_mm
+    tsdf = np.where(np.abs(samples.tsdf) < smallest, np.copysign(np.float32(smallest), samples.tsdf), samples.tsdf)
+    known = samples.weight >= max(min_weight, np.finfo(np.float32).tiny)
+    cells = _crossed_cells(tsdf, known, _LARGEST_SPREAD_VOXELS * voxel_mm)
+    if not cells.any():
+        return None
+    # scikit-image reads the mask of a cell at the cell's last corner.
+    mask = np.pad(cells, ((1, 0), (1, 0), (1, 0)))
+    local, faces, _, _ = marching_cubes(tsdf, 0.0, mask=mask, gradient_direction="descent")
+    low, high = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64)
+    offset = corner * BLOCK
+    return _Chunk(local + offset.astype(np.float64), low + high + 2 * offset, _colours(samples, local, low, high), faces)
+
+
+def _crossed_cells(tsdf: np.ndarray, known: np.ndarray, largest_spread_mm: float) -> np.ndarray:
+    """(n-1)^3 bool: all 8 corners known, on both sides of the surface, and not on both sides of a depth edge."""
+    low, high = _corners(tsdf, np.minimum), _corners(tsdf, np.maximum)
+    return _corners(known, np.logical_and) & (low < 0) & (high > 0) & (high - low <= largest_spread_mm)
+
+
+def _corners(samples: np.ndarray, combine: np.ufunc) -> np.ndarray:
+    """Combine the 8 corners of every cell of (n, n, n) samples, one axis after the other."""
+    samples = combine(samples[1:], samples[:-1])
+    samples = combine(samples[:, 1:], samples[:, :-1])
+    return combine(samples[:, :, 1:], samples[:, :, :-1])
+
+
+def _colours(samples: Voxels, vertices: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Mix the two ends of each vertex's grid edge; an end counts by how near and how well seen it is."""
+    share = (vertices - low).max(axis=1, keepdims=True)
+    total = (1 - share) * samples.colour[tuple(low.T)] + share * samples.colour[tuple(high.T)]
+    seen = total[:, 3:] > 0
+    return np.where(seen, total[:, :3] / np.where(seen, total[:, 3:], 1.0), _UNSEEN_GREY)
+
+
+def _weld(chunks: list[_Chunk]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join chunks; vertices on the same grid edge become one. Returns vertices, faces, colours."""
+    if not chunks:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3))
+    starts = np.cumsum([0, *(len(chunk.vertices) for chunk in chunks[:-1])])
+    faces = np.concatenate([chunk.faces + start for chunk, start in zip(chunks, starts, strict=True)])
+    edges = np.concatenate([chunk.edges for chunk in chunks])
+    edges -= edges.min(axis=0)
+    addresses = np.ravel_multi_index(tuple(edges.T), tuple(edges.max(axis=0) + 1))
+    _, first, inverse = np.unique(addresses, return_index=True, return_inverse=True)
+    vertices = np.concatenate([chunk.vertices for chunk in chunks])[first]
+    return vertices, inverse[faces], np.concatenate([chunk.colours for chunk in chunks])[first]
+
+
+def _without_floaters(
+    vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray, min_share: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if not len(faces):
+        return vertices, faces, colours
+    links = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    graph = coo_matrix((np.ones(links.shape[1], bool), links), shape=(len(vertices), len(vertices)))
+    component = connected_components(graph, directed=False)[1][faces[:, 0]]
+    sizes = np.bincount(component)
+    large = sizes >= min(min_share * len(faces), sizes.max())
+    used, renumbered = np.unique(faces[large[component]], return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3), colours[used]
 
 
 def save_mesh(mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None) -> list[Path]:
     """Write a mesh with vertex colours, world mm, as binary PLY and as GLB; return the files written.
 
-    The GLB is in metres and y-up, matt and visible from both sides, because a lumen is looked at from inside and
-    outside; its colours are linear as glTF asks (section 3.7.2.1). A mesh without faces gives no GLB.
+    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward), so a y-up viewer shows it upside
+    down. The GLB is glTF's: metres, y up, thus 0.001 of the trajectory's unit with y and z negated; matt and visible
+    from both sides, because a lumen is seen from inside and outside; linear colours (glTF 2.0, section 3.7.2.1).
+    A mesh without faces gives no GLB.
     """
     written: list[Path] = []
     if ply_file is not None:

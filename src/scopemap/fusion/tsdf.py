@@ -1,4 +1,4 @@
-"""Kernels of the truncated signed distance field (TSDF): what a frame measures, where, and into which voxels.
+"""The truncated signed distance field (TSDF): sparse voxel blocks, and the kernels that fuse a frame into them.
 
 The field holds the distance to the surface in mm: positive in free space (the camera's side), negative behind the
 surface, clipped to the truncation. Weighted running mean of Curless and Levoy, SIGGRAPH 1996, eq. 3-4; blocks of 8^3
@@ -20,6 +20,7 @@ _KEY_MASK = (1 << 21) - 1
 _RECENT = 1 << 15
 _NORMAL_REACH_PX = 3
 _COLOUR_BAND_VOXELS = 2.0
+_FIRST_CAPACITY = 256
 # Share of the truncation behind the surface from which on a voxel counts less and less.
 _FULL_WEIGHT_SHARE = 0.2
 
@@ -32,7 +33,7 @@ class Voxels(NamedTuple):
     colour: np.ndarray
 
 
-class View(NamedTuple):
+class TsdfCamera(NamedTuple):
     """A pinhole camera in the world: rotation (3, 3) and translation (3,) mm from world to camera, focal lengths px."""
 
     R: np.ndarray
@@ -43,7 +44,7 @@ class View(NamedTuple):
     cy: float
 
 
-class Surface(NamedTuple):
+class MeasuredSurface(NamedTuple):
     """What a frame measures, each (H, W) float32.
 
     Inverse depth 1/mm, NaN where there is none; distance of the tangent plane from the camera, mm; weight, 0..1.
@@ -79,12 +80,12 @@ def _slope(inverse_depth: np.ndarray, row: int, col: int, along_columns: bool, l
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def measure_surface(
-    inverse_depth: np.ndarray, view: View, largest_step: float, min_incidence: float, reach_mm: float
-) -> Surface:
+    inverse_depth: np.ndarray, camera: TsdfCamera, largest_step: float, min_incidence: float, max_depth_mm: float
+) -> MeasuredSurface:
     """Return tangent plane and weight of every pixel of `inverse_depth` (H, W) float32, 1/mm, NaN = unknown.
 
     On the plane n.X = 1 the inverse depth is n.(x, y, 1), so its slopes give n, and 1/|n| is the plane's distance from
-    the camera. Weight = cos(incidence) / (1 + (2 distance / reach)^2): 1 for a wall met head-on at the lens, falling
+    the camera. Weight = cos(incidence) / (1 + (2 distance / max_depth)^2): 1 for a wall met head-on at the lens, falling
     with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
     """
     height, width = inverse_depth.shape
@@ -96,17 +97,17 @@ def measure_surface(
             here = inverse_depth[row, col]
             if not here > 0:
                 continue
-            x, y = (col - view.cx) / view.fx, (row - view.cy) / view.fy
-            nx = view.fx * _slope(inverse_depth, row, col, True, largest_step)
-            ny = view.fy * _slope(inverse_depth, row, col, False, largest_step)
+            x, y = (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+            nx = camera.fx * _slope(inverse_depth, row, col, True, largest_step)
+            ny = camera.fy * _slope(inverse_depth, row, col, False, largest_step)
             nz = here - nx * x - ny * y
             plane = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
             distance = np.sqrt(x * x + y * y + 1.0) / here
             if plane >= min_incidence * distance:
                 kept[row, col] = here
                 plane_mm[row, col] = plane
-                weight[row, col] = plane / distance / (1.0 + (2.0 * distance / reach_mm) ** 2)
-    return Surface(kept, plane_mm, weight)
+                weight[row, col] = plane / distance / (1.0 + (2.0 * distance / max_depth_mm) ** 2)
+    return MeasuredSurface(kept, plane_mm, weight)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -122,13 +123,13 @@ def unpack(keys: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _blocks_between(a: float, b: float, wide: float, per_mm: float) -> tuple[int, int]:
-    """Return the first and the last block that the way from a to b, `wide` to either side, touches along an axis."""
+    """Return the first and the last block that the segment a to b, `wide` to either side, touches along an axis."""
     low, high = (a, b) if a < b else (b, a)
     return int(np.floor((low - wide) * per_mm)) >> 3, int(np.ceil((high + wide) * per_mm)) >> 3
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndarray:
+def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) -> np.ndarray:
     """Return keys, some of them repeated, of all blocks within the truncation of a measured pixel (H, W).
 
     Each ray is cut into pieces of half a block; the box around a piece, widened by the pixel's footprint, names the
@@ -137,10 +138,10 @@ def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndar
     block_mm = BLOCK * grid.voxel_mm
     pieces = int(np.ceil(4.0 * grid.truncation_mm / block_mm))
     piece_mm = 2.0 * grid.truncation_mm / pieces
-    footprint = 1.5 / min(view.fx, view.fy)
+    footprint = 1.5 / min(camera.fx, camera.fy)
     # Arrays read out of a tuple are counted references: once, not at every pixel.
-    R, per_mm = view.R, 1.0 / grid.voxel_mm
-    origin = -R.T @ view.t
+    R, per_mm = camera.R, 1.0 / grid.voxel_mm
+    origin = -R.T @ camera.t
     recent = np.full(_RECENT, -1, np.int64)
     keys, count = np.empty(4096, np.int64), 0
     # By piece: the blocks of the pixel before, which are most often this one's as well. At first, none.
@@ -150,7 +151,7 @@ def touched_blocks(inverse_depth: np.ndarray, view: View, grid: Grid) -> np.ndar
             if not inverse_depth[row, col] > 0:
                 continue
             depth = 1.0 / inverse_depth[row, col]
-            x, y = (col - view.cx) / view.fx, (row - view.cy) / view.fy
+            x, y = (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
             dx, dy = R[0, 0] * x + R[1, 0] * y + R[2, 0], R[0, 1] * x + R[1, 1] * y + R[2, 1]
             dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
             for piece in range(pieces):
@@ -197,12 +198,12 @@ def _sample(inverse_depth: np.ndarray, u: float, v: float, largest_step: float) 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _integrate_block(
-    voxels: Voxels, slot: int, corner: np.ndarray, surface: Surface, rgb: np.ndarray, view: View, grid: Grid
+    voxels: Voxels, slot: int, corner: np.ndarray, surface: MeasuredSurface, rgb: np.ndarray, camera: TsdfCamera, grid: Grid
 ) -> None:
     # Arrays read out of a tuple are counted references: once, not at every voxel.
     tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
     inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
-    R, t, truncation = view.R, view.t, grid.truncation_mm
+    R, t, truncation = camera.R, camera.t, grid.truncation_mm
     height, width = inverse_depths.shape
     for i in range(BLOCK):
         for j in range(BLOCK):
@@ -212,8 +213,8 @@ def _integrate_block(
                 depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
                 if depth <= 0:
                     continue
-                u = view.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth + view.cx
-                v = view.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth + view.cy
+                u = camera.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth + camera.cx
+                v = camera.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth + camera.cy
                 if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
                     continue
                 row, col = int(v + 0.5), int(u + 0.5)
@@ -238,7 +239,7 @@ def _integrate_block(
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def integrate_blocks(
-    voxels: Voxels, slots: np.ndarray, corners: np.ndarray, surface: Surface, rgb: np.ndarray, view: View, grid: Grid
+    voxels: Voxels, slots: np.ndarray, corners: np.ndarray, surface: MeasuredSurface, rgb: np.ndarray, camera: TsdfCamera, grid: Grid
 ) -> None:
     """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
 
@@ -248,4 +249,58 @@ def integrate_blocks(
     sees its front. Changes `voxels`.
     """
     for n in prange(len(slots)):
-        _integrate_block(voxels, slots[n], corners[n], surface, rgb, view, grid)
+        _integrate_block(voxels, slots[n], corners[n], surface, rgb, camera, grid)
+
+
+class VoxelBlocks:
+    """Blocks of 8^3 voxels found by the key of their block coordinate.
+
+    Attributes
+    ----------
+    voxels : storage of at least `len(self) + 1` blocks; slot 0 is a block that nothing is ever written to.
+    """
+
+    def __init__(self) -> None:
+        self.voxels = _zeros(_FIRST_CAPACITY)
+        # A dict finds the few thousand blocks of a frame in under a millisecond; a compiled hash table gains nothing.
+        self._slots: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def keys(self) -> np.ndarray:
+        """Return the (N,) int64 keys of all blocks, in the order in which they were made."""
+        return np.fromiter(self._slots, np.int64, len(self._slots))
+
+    def slots(self, keys: np.ndarray) -> np.ndarray:
+        """Return the (N,) int64 slots of `keys` (N,) int64; blocks that are not there yet are made, empty."""
+        index = self._slots
+        slots = np.array([index.setdefault(key, len(index) + 1) for key in keys.tolist()], dtype=np.int64)
+        capacity = len(self.voxels.weight)
+        if len(index) >= capacity:
+            spare = _zeros(max(capacity // 2, len(index) + 1 - capacity))
+            self.voxels = Voxels(*(np.concatenate(pair) for pair in zip(self.voxels, spare, strict=True)))
+        return slots
+
+    def dense(self, corner: np.ndarray, blocks: int) -> Voxels:
+        """Return the cube of `blocks`^3 blocks from block coordinate `corner` (3,) on as dense arrays (8 blocks, ...).
+
+        Where there is no block the weight is 0.
+        """
+        steps = range(blocks)
+        x, y, z = (int(c) for c in corner)
+        find = self._slots.get
+        slots = np.array([find(pack.py_func(x + i, y + j, z + k), 0) for i in steps for j in steps for k in steps])
+        return Voxels(*(_assemble(array[slots], blocks) for array in self.voxels))
+
+
+def _zeros(blocks: int) -> Voxels:
+    shape = (blocks, BLOCK, BLOCK, BLOCK)
+    return Voxels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((*shape, 4), np.float32))
+
+
+def _assemble(array: np.ndarray, blocks: int) -> np.ndarray:
+    """Turn (blocks^3, 8, 8, 8, ...) into (8 blocks, 8 blocks, 8 blocks, ...)."""
+    side, rest = blocks * BLOCK, array.shape[4:]
+    cube = np.moveaxis(array.reshape(blocks, blocks, blocks, BLOCK, BLOCK, BLOCK, *rest), (3, 4, 5), (1, 3, 5))
+    return cube.reshape(side, side, side, *rest)

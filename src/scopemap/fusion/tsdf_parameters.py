@@ -1,8 +1,8 @@
-"""How fine and how far to fuse: sizes that nobody set follow the scene, because millimetres seldom mean the same.
+"""TSDF parameters: those that are not set follow the scene, since the scale of millimetres differs from clip to clip.
 
-A laparoscope looks at a gallbladder from a hand's breadth, a colonoscope brushes the wall, and depth that a network
-guesses may be off by a factor. Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, uses them
-there, with a truncation of 5 mm); the same proportions are kept at every distance.
+A laparoscope is 100 mm from the tissue, a colonoscope close to the wall, and a network's depth may be off by a factor.
+Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, with a truncation of 5 mm); the same proportions
+are kept at every distance.
 """
 
 from __future__ import annotations
@@ -11,53 +11,43 @@ from typing import NamedTuple
 
 from scopemap.config import FusionSettings
 
-VOXELS_PER_DISTANCE = 60
+VOXELS_PER_MEDIAN_DEPTH = 60
 _VOXELS_PER_TRUNCATION = 5
-# So far away a voxel is still larger than a pixel, and a tube that narrows the view is seen for most of its length.
-_VOXELS_PER_REACH = 200
-# Below this no endoscope resolves anything, and memory would be spent on noise.
-_LEAST_VOXEL_MM = 0.01
+# At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
+_VOXELS_PER_MAX_DEPTH = 200
+# No endoscope resolves less; memory would be spent on noise.
+_MIN_VOXEL_MM = 0.01
 
 
-class Sizes(NamedTuple):
-    """Edge of a voxel, how far from the surface the field is kept, and up to which depth is fused, mm."""
+class TsdfParameters(NamedTuple):
+    """Edge of a voxel, truncation of the distance, and largest depth that is fused, mm."""
 
     voxel_mm: float
     truncation_mm: float
     max_depth_mm: float
 
+    @property
+    def description(self) -> str:
+        """A note on parameters that follow the scene, and how to set others."""
+        return (
+            f"fusion: voxels of {self.voxel_mm:g} mm, 1/{VOXELS_PER_MEDIAN_DEPTH} of the clip's median depth, and depth "
+            f"up to {self.max_depth_mm:g} mm; set fusion.voxel_mm for others"
+        )
 
-def follows_scene(settings: FusionSettings) -> bool:
-    """Whether the voxels are to be chosen when the scene is known."""
-    return settings.voxel_mm is None
 
+def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = None) -> TsdfParameters:
+    """Return the parameters that are set, and for the others those that suit tissue at `median_depth_mm`.
 
-def choose_sizes(settings: FusionSettings, typical_mm: float | None = None) -> Sizes:
-    """Return the sizes that are set, and for the others what suits tissue at a distance of `typical_mm`.
-
-    Raises `ValueError` where `voxel_mm` is not set and the distance is not known.
+    Raises `ValueError` where neither `voxel_mm` nor the depth is known.
     """
     voxel_mm = settings.voxel_mm
     if voxel_mm is None:
-        if typical_mm is None or not typical_mm > 0:
-            raise ValueError("fusing without fusion.voxel_mm: the scene's typical depth must be known")
-        # Two digits: nobody needs more, and a clip cut elsewhere gives the same.
-        voxel_mm = float(f"{max(typical_mm / VOXELS_PER_DISTANCE, _LEAST_VOXEL_MM):.2g}")
-    return Sizes(
+        if median_depth_mm is None or not median_depth_mm > 0:
+            raise ValueError("fusing without fusion.voxel_mm: the scene's median depth must be known")
+        # Two digits: a clip cut at another frame gives the same.
+        voxel_mm = float(f"{max(median_depth_mm / VOXELS_PER_MEDIAN_DEPTH, _MIN_VOXEL_MM):.2g}")
+    return TsdfParameters(
         voxel_mm,
         settings.truncation_mm or round(_VOXELS_PER_TRUNCATION * voxel_mm, 4),
-        settings.max_depth_mm or round(_VOXELS_PER_REACH * voxel_mm, 4),
-    )
-
-
-def with_sizes(settings: FusionSettings, sizes: Sizes) -> FusionSettings:
-    """Return the settings with the sizes that were used, as a result's settings state them."""
-    return settings.model_copy(update=sizes._asdict())
-
-
-def described(sizes: Sizes) -> str:
-    """Say which sizes the scene was given, and how to change them."""
-    return (
-        f"voxels of {sizes.voxel_mm:g} mm, 1/{VOXELS_PER_DISTANCE} of the clip's median depth, and depth up to "
-        f"{sizes.max_depth_mm:g} mm; set fusion.voxel_mm for others"
+        settings.max_depth_mm or round(_VOXELS_PER_MAX_DEPTH * voxel_mm, 4),
     )

@@ -1,44 +1,46 @@
-"""Volumetric fusion: posed depth frames in, one coloured surface out (METHOD section 3)."""
+"""Fuses posed frames with depth in a TSDF volume, at once or after the last one, and returns the surface as a mesh."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
-from scopemap.fusion.blocks import VoxelBlocks
-from scopemap.fusion.surface import extract_surface
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.mesh import extract_mesh
 from scopemap.fusion.tsdf import (
     BLOCK,
     KEY_OFFSET,
     Grid,
-    View,
+    TsdfCamera,
+    VoxelBlocks,
     integrate_blocks,
     measure_surface,
     touched_blocks,
     unpack,
 )
-from scopemap.fusion.tsdf_parameters import Sizes, choose_sizes
+from scopemap.fusion.tsdf_parameters import TsdfParameters, choose_parameters
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.uncertainty import depth_trust
 
-# Below this cosine a slanted wall cannot be told from a depth edge, whatever the setting.
-_LEAST_INCIDENCE = 0.05
+# Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
+_MIN_COSINE = 0.05
 
 
 class TsdfVolume:
     """An unbounded truncated signed distance field that grows with the frames fused into it.
 
-    sizes : of voxels, truncation and reach; by default those of the settings, which must then name `voxel_mm`
-    (`ValueError` otherwise).
+    parameters : by default those of the settings, which must then set `voxel_mm` (`ValueError` otherwise).
     """
 
-    def __init__(self, settings: FusionSettings, sizes: Sizes | None = None) -> None:
+    def __init__(self, settings: FusionSettings, parameters: TsdfParameters | None = None) -> None:
         self.settings = settings
-        self.sizes = sizes or choose_sizes(settings)
+        self.parameters = parameters or choose_parameters(settings)
         self._blocks = VoxelBlocks()
 
     @property
@@ -47,46 +49,101 @@ class TsdfVolume:
         return len(self._blocks)
 
     def integrate(self, frame: Frame) -> None:
-        """Fuse the valid pixels of a frame up to `max_depth_mm`; a frame without any changes nothing.
+        """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
         Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less.
 
-        Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or out of reach.
+        Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
         depth_mm, T_world_camera = self._checked(frame)
-        camera, settings, reach_mm = frame.camera, self.settings, self.sizes.max_depth_mm
+        camera, advanced, parameters = frame.camera, self.settings.advanced, self.parameters
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
-        view = View(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        steepest = max(settings.advanced.min_incidence, _LEAST_INCIDENCE)
+        pinhole = TsdfCamera(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+        steepest = max(advanced.min_incidence, _MIN_COSINE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
-        grid = Grid(self.sizes.voxel_mm, self.sizes.truncation_mm, step)
+        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step)
         with np.errstate(invalid="ignore"):
-            usable = frame.valid & (depth_mm > 0) & (depth_mm <= reach_mm)
+            usable = frame.valid & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, view, step, settings.advanced.min_incidence, reach_mm)
+        surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
         trust = depth_trust(
-            np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.advanced.depth_sigma_share
+            np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share
         )
         surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
-        keys = np.unique(touched_blocks(surface.inverse_depth, view, grid))
+        keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
-        integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, frame.rgb, view, grid)
+        integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, frame.rgb, pinhole, grid)
 
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
-        return extract_surface(self._blocks, self.settings, self.sizes.voxel_mm)
+        return extract_mesh(self._blocks, self.settings.advanced, self.parameters.voxel_mm)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         for name in ("depth_mm", "T_world_camera"):
             if getattr(frame, name) is None:
                 raise ValueError(f"fusing frame {frame.index}: it has no {name}; fuse tracked frames with depth only")
         depth_mm, T_world_camera = np.asarray(frame.depth_mm, np.float32), np.asarray(frame.T_world_camera, np.float64)
-        reach_mm = (KEY_OFFSET - 1) * BLOCK * self.sizes.voxel_mm
-        reach_mm -= 4 * self.sizes.max_depth_mm + self.sizes.truncation_mm
-        if not np.all(np.abs(T_world_camera[:3]) <= reach_mm):
+        largest_mm = (KEY_OFFSET - 1) * BLOCK * self.parameters.voxel_mm
+        largest_mm -= 4 * self.parameters.max_depth_mm + self.parameters.truncation_mm
+        if not np.all(np.abs(T_world_camera[:3]) <= largest_mm):
             raise ValueError(
-                f"fusing frame {frame.index}: its pose is not finite or over {reach_mm:.0f} mm from the origin; "
+                f"fusing frame {frame.index}: its pose is not finite or over {largest_mm:.0f} mm from the origin; "
                 "leave out lost frames or use a larger voxel"
             )
         return depth_mm, T_world_camera
+
+
+@dataclass(frozen=True)
+class FusedSurface:
+    """A surface, world mm, may be empty; the settings with the TSDF parameters that were used, and notes on these."""
+
+    mesh: trimesh.Trimesh
+    settings: FusionSettings
+    notes: list[str]
+
+
+class SurfaceFusion:
+    """Fuses tracked frames: at once, or after the last one where they are corrected then or voxels follow the scene.
+
+    store : for frames until then. corrected : whether a back end corrects them.
+    """
+
+    def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
+        self.settings, self.store = settings, store
+        self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
+        """Whether frames are stored until the last one."""
+        self._volume = TsdfVolume(settings) if settings.enabled and not self.at_end else None
+        self._tracked_frames = 0
+
+    @property
+    def at_once(self) -> bool:
+        """Whether frames are fused as they come."""
+        return self._volume is not None
+
+    def put(self, frame: Frame) -> None:
+        """Store a frame, or fuse it if it has a pose and is an n-th one (`settings.every`)."""
+        if self.at_end:
+            self.store.put(frame)
+        elif self._volume is not None and frame.T_world_camera is not None:
+            if self._tracked_frames % self.settings.every == 0:
+                self._volume.integrate(frame)
+            self._tracked_frames += 1
+
+    def fuse(self, frames: Iterable[Frame], main_frames: Collection[int]) -> FusedSurface:
+        """Return the surface of every n-th of the stored frames, all of which are consumed, or of those fused at once.
+
+        main_frames : numbers of those whose median depth the TSDF parameters follow.
+        """
+        volume, settings = self._volume, self.settings
+        median_mm = self.store.median_depth_mm(main_frames)
+        if self.at_end and settings.enabled and (median_mm or settings.voxel_mm):
+            volume = TsdfVolume(settings, choose_parameters(settings, median_mm))
+        for number, frame in enumerate(frames):
+            if volume is not None and number % settings.every == 0:
+                volume.integrate(frame)
+        if volume is None:
+            return FusedSurface(trimesh.Trimesh(), settings, [])
+        notes = [] if settings.voxel_mm is not None else [volume.parameters.description]
+        used = settings.model_copy(update=volume.parameters._asdict())
+        return FusedSurface(volume.extract_mesh(), used, notes)

@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse
 
 Status = Literal["initial", "ok", "lost"]
 
@@ -55,3 +56,10 @@ class FrameTracker(Protocol):
 
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its refined depth and its pose, the reference; False where it cannot be one."""
+
+
+def motion_between(previous: Track | None, current: Track) -> np.ndarray | None:
+    """Return T_current_previous (4, 4); None unless both frames are tracked in one map."""
+    if previous is None or "lost" in (previous.status, current.status) or previous.map != current.map:
+        return None
+    return inverse(current.T_world_camera) @ previous.T_world_camera

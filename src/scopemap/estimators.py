@@ -1,0 +1,70 @@
+"""Creates the estimators that the settings name, and reports what they depend on."""
+
+from __future__ import annotations
+
+import math
+
+from scopemap.config import Config
+from scopemap.depth.anchor import max_depth_mm
+from scopemap.depth.create import create_anchor, create_depth, files_folder
+from scopemap.depth.estimate import DepthEstimator
+from scopemap.depth.files import FilesDepth
+from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
+from scopemap.flow.create import create_flow
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.io.sequence import Sequence
+from scopemap.mapping.depth_correction import LARGEST_LOG_FACTOR
+from scopemap.masking.mask_files import create_masks
+from scopemap.pipeline import Estimators
+
+
+def create_estimators(config: Config, sequence: Sequence) -> Estimators:
+    """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do."""
+    networks, folder = config.networks, files_folder(config.depth)
+    beside = folder is not None and folder.resolve() == sequence.path.resolve()
+    depth = create_depth(
+        config.depth,
+        sequence.depth_rectifier if beside else sequence.rectifier,
+        networks.device,
+        sequence.depth_scale_mm,
+        calibrated=sequence.calibrated,
+    )
+    return Estimators(
+        depth,
+        create_anchor(config.depth, networks.device),
+        create_flow(networks.flow, networks.device),
+        create_flow(networks.keyframe_flow, networks.device),
+        create_flow(networks.keyframe_flow, networks.device),
+        create_perceptual(networks.perceptual, networks.device),
+        create_masks(config.mask, sequence.rectifier, sequence.source.masks),
+    )
+
+
+def largest_depth_mm(config: Config, estimators: Estimators) -> float:
+    """Return the largest depth that a result can hold, mm: of measured files theirs, else that of the settings.
+
+    A back end may scale predicted depth; three standard deviations of that are included.
+    """
+    if isinstance(estimators.depth, FilesDepth) and estimators.depth.measured_max_mm:
+        return estimators.depth.measured_max_mm
+    mapping, log_factor = config.mapping, 0.0
+    if mapping.method != "none":
+        log_factor = 3 * mapping.scale_sigma + (LARGEST_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
+    return math.exp(log_factor) * max_depth_mm(config.depth)
+
+
+def estimators_provenance(estimators: Estimators) -> dict[str, str]:
+    """Return names, versions and hashes of the estimators, and what fixed the scale of depth."""
+    parts = estimators.depth.provenance()
+    others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance] = {
+        "flow": estimators.flow,
+        "perceptual": estimators.perceptual,
+    }
+    if estimators.anchor.reference.name == "depth-pro":
+        others["anchor"] = estimators.anchor.reference
+    for role, part in others.items():
+        # Several parts have weights and hashes: the key names the part.
+        facts = part.provenance()
+        parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
+    masks = {} if estimators.masks is None else estimators.masks.provenance()
+    return parts | masks | {"keyframe_flow": estimators.keyframe_flow.name, "anchor": estimators.anchor.description}
