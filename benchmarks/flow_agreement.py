@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scopemap.tracking.flow_pose import flow_error_px
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
+from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points
 from scopemap.io.opening import open_sequence
-from scopemap.pipeline import Estimators, Pipeline, Step
-from scopemap.tracking.flow_pose import flow_error_px
+from scopemap.pipeline import Pipeline, Step
 
 LEAST_SHARE = 0.1
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
@@ -41,7 +42,7 @@ class Agreement(NamedTuple):
 def measure(path: Path, frames: int, config: Config) -> Agreement:
     """Track a sequence and compare its poses with the flow."""
     sequence = open_sequence(path, frames=slice(0, frames))
-    pipeline = Pipeline(config, Estimators.create(config, sequence))
+    pipeline = Pipeline(config, create_estimators(config, sequence))
     moved, off, steps = [], [], []
     last: Step | None = None
     for frame in sequence.frames():

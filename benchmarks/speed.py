@@ -21,13 +21,14 @@ import numpy as np
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
+from scopemap.estimators import create_estimators
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
-from scopemap.fusion import TsdfVolume
+from scopemap.fusion.volume import TsdfVolume
 from scopemap.io.opening import open_sequence
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
-from scopemap.pipeline import Estimators, Pipeline
+from scopemap.pipeline import Pipeline
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=337, height=270, seed=0)
 NETWORK_SIZE = (320, 256)
@@ -50,7 +51,7 @@ def timed(method: Callable[..., Any], part: str, seconds: dict[str, list[float]]
 def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], tuple[int, int]]:
     """Return milliseconds per frame of each part, and the working size."""
     sequence = open_sequence(path, frames=slice(0, frames))
-    pipeline, seconds = Pipeline(config, Estimators.create(config, sequence)), defaultdict(list)
+    pipeline, seconds = Pipeline(config, create_estimators(config, sequence)), defaultdict(list)
     parts = {
         "overlays, in mask": (pipeline._masker, "_overlays"),
         "mask": (pipeline, "_masker"),

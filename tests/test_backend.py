@@ -15,7 +15,6 @@ from scopemap.config import MappingSettings
 from scopemap.flow.corners import corners, sampled_at
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.fusion import FrameSpool
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, Correction, TrackedPose
@@ -290,26 +289,3 @@ def test_depth_that_would_have_to_change_too_much_leaves_all_as_tracked() -> Non
 def test_nothing_to_adjust_is_an_error_of_the_caller() -> None:
     with pytest.raises(ValueError, match="no keyframe"):
         Backend(MappingSettings(), DisFlow()).adjust()
-
-
-def test_a_waiting_frame_comes_back_as_it_was() -> None:
-    rng = np.random.default_rng(0)
-    frame = _frame(2)
-    depth_mm = np.exp(rng.uniform(-3, 8, frame.valid.shape)).astype(np.float32)
-    depth_mm[rng.random(depth_mm.shape) < 0.2] = np.nan
-    with_sigma = Frame(
-        7, 0.5, frame.rgb, CAMERA, rng.random(depth_mm.shape) < 0.5, depth_mm, POSES[1], "", 0.1 * depth_mm
-    )
-    spool = FrameSpool()
-    spool.put(with_sigma)
-    spool.put(frame)
-    assert len(spool) == 2
-    first, second = spool.frames()
-    assert np.abs(first.rgb.astype(int) - with_sigma.rgb).mean() < 2
-    np.testing.assert_array_equal(first.valid, with_sigma.valid)
-    np.testing.assert_allclose(first.depth_mm, depth_mm, rtol=2e-4)
-    np.testing.assert_allclose(first.depth_sigma_mm, 0.1 * depth_mm, rtol=2e-4)
-    np.testing.assert_array_equal(first.T_world_camera, POSES[1])
-    assert (first.index, first.time_s) == (7, 0.5)
-    assert second.depth_sigma_mm is None
-    assert second.index == 20

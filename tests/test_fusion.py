@@ -16,8 +16,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.frame import Frame
-from scopemap.fusion import TsdfVolume
 from scopemap.fusion.tsdf import _sample, pack, unpack
+from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)

@@ -12,8 +12,12 @@ from tiny_phantom import with_true_depth, write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, FusionSettings
+from scopemap.config.mapping import FusionAdvanced
+from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.fusion import FrameSpool, TsdfVolume, choose_sizes, follows_scene, with_sizes
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.tsdf_parameters import choose_parameters
+from scopemap.fusion.volume import SurfaceFusion, TsdfVolume
 
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 
@@ -25,51 +29,100 @@ def wall(depth_mm: float, index: int = 0) -> Frame:
 
 
 def test_a_hand_s_breadth_has_the_voxels_of_endo_depth_and_motion() -> None:
-    assert choose_sizes(FusionSettings(), 60.0) == (1.0, 5.0, 200.0)
+    assert choose_parameters(FusionSettings(), 60.0) == (1.0, 5.0, 200.0)
 
 
 def test_what_is_set_stays_and_the_rest_follows_it() -> None:
-    assert choose_sizes(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0)
-    assert choose_sizes(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0)
-    assert choose_sizes(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
+    assert choose_parameters(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0)
+    assert choose_parameters(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0)
+    assert choose_parameters(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
 
 
 def test_a_volume_without_sizes_is_refused() -> None:
-    for typical_mm in (None, float("nan"), 0.0):
-        with pytest.raises(ValueError, match="typical depth must be known"):
-            choose_sizes(FusionSettings(), typical_mm)
+    for median_mm in (None, float("nan"), 0.0):
+        with pytest.raises(ValueError, match="median depth must be known"):
+            choose_parameters(FusionSettings(), median_mm)
     with pytest.raises(ValueError, match=r"fusing without fusion\.voxel_mm"):
         TsdfVolume(FusionSettings())
 
 
-def test_settings_state_what_was_used_and_read_back(tmp_path: Path) -> None:
-    fusion = with_sizes(FusionSettings(), choose_sizes(FusionSettings(), 10.0))
-    (tmp_path / "config.toml").write_text(Config(fusion=fusion).toml(), encoding="utf-8")
-    read = Config.load(file=tmp_path / "config.toml").fusion
-    assert (read.voxel_mm, read.truncation_mm, read.max_depth_mm) == (0.17, 0.85, 34.0)
-    assert follows_scene(FusionSettings())
-    assert not follows_scene(read)
+def test_the_store_returns_what_it_was_given_in_order_and_by_number(tmp_path: Path) -> None:
+    store, frames = FrameStore(tmp_path), [wall(depth_mm, n) for n, depth_mm in enumerate((20_000.0, 30.0, 40.0))]
+    frames[1] = replace(frames[1], depth_sigma_mm=np.full((120, 160), 0.3, np.float32), T_world_camera=None)
+    for frame in frames:
+        store.put(frame)
+    assert len(store) == 3
+    for before, after in zip(frames, store.frames(), strict=True):
+        assert (after.index, after.camera) == (before.index, before.camera)
+        np.testing.assert_allclose(after.depth_mm, before.depth_mm, rtol=2e-4)
+        np.testing.assert_array_equal(after.valid, before.valid)
+        np.testing.assert_allclose(after.rgb, before.rgb, atol=3)
+    assert [frame.index for frame in store.frames({2, 0})] == [0, 2]
+    (lost,) = store.frames([1])
+    assert lost.T_world_camera is None
+    assert lost.depth_sigma_mm == pytest.approx(0.3, rel=2e-4)
+    store.put(wall(50.0, 3))
+    assert [frame.index for frame in store.frames()] == [0, 1, 2, 3]
 
 
-def test_what_is_too_far_to_be_kept_is_unknown() -> None:
-    spool = FrameSpool()
-    spool.put(wall(50_000.0))
-    spool.put(wall(20_000.0))
-    far, near = spool.frames()
+def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
+    store = FrameStore(tmp_path)
+    store.put(wall(30.0))
+    assert list(tmp_path.iterdir()) == []
+    store.close()
+    gone = FrameStore(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"cannot store frames in .*gone: No such file"):
+        gone.put(wall(30.0))
+
+
+def test_depth_beyond_the_range_is_unknown() -> None:
+    store = FrameStore()
+    store.put(wall(50_000.0))
+    (far,) = store.frames()
     assert far.depth_mm is not None
-    assert near.depth_mm is not None
     assert np.isnan(far.depth_mm).all()
-    np.testing.assert_allclose(near.depth_mm, 20_000.0, rtol=2e-4)
 
 
-def test_the_typical_depth_is_the_median_over_frames_of_what_is_usable() -> None:
-    spool = FrameSpool()
-    assert spool.typical_mm() is None
-    spool.put(replace(wall(70.0), valid=np.zeros((120, 160), bool)))
-    assert spool.typical_mm() is None
+def test_the_median_depth_is_that_of_the_frames_medians_in_usable_pixels() -> None:
+    store = FrameStore()
+    assert store.median_depth_mm() is None
+    store.put(replace(wall(70.0, 9), valid=np.zeros((120, 160), bool)))
+    assert store.median_depth_mm() is None
     for n, depth_mm in enumerate((10.0, 12.0, 90.0)):
-        spool.put(wall(depth_mm, n))
-    assert spool.typical_mm() == pytest.approx(12.0)
+        store.put(wall(depth_mm, n))
+    assert store.median_depth_mm() == pytest.approx(12.0, rel=2e-4)
+    assert store.median_depth_mm({2}) == pytest.approx(90.0, rel=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("corrected", "voxel_mm", "at_end"), [(False, 1.0, False), (True, 1.0, True), (False, None, True)]
+)
+def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
+    corrected: bool, voxel_mm: float | None, at_end: bool
+) -> None:
+    advanced = FusionAdvanced(min_weight=0.0)
+    settings = FusionSettings(voxel_mm=voxel_mm, every=2, advanced=advanced)
+    fusion = SurfaceFusion(settings, FrameStore(), corrected=corrected)
+    frames = [wall(60.0, n) for n in range(3)]
+    for frame in frames:
+        fusion.put(frame)
+    assert (fusion.at_end, fusion.at_once) == (at_end, not at_end)
+    surface = fusion.fuse(fusion.store.frames(), {0, 1, 2})
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, advanced=advanced))
+    for frame in frames[::2]:
+        volume.integrate(frame)
+    assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)
+    assert surface.settings.voxel_mm == 1.0
+    assert len(surface.notes) == (voxel_mm is None)
+    assert fusion.fuse([], ()).settings.voxel_mm in (voxel_mm, 1.0)
+
+
+def test_no_known_depth_gives_no_surface() -> None:
+    fusion = SurfaceFusion(FusionSettings(), FrameStore(), corrected=False)
+    nothing = replace(wall(60.0), depth_mm=np.full((120, 160), np.nan, np.float32))
+    fusion.put(nothing)
+    surface = fusion.fuse(fusion.store.frames(), {0})
+    assert (len(surface.mesh.vertices), surface.settings, surface.notes) == (0, FusionSettings(), [])
 
 
 @pytest.mark.parametrize("factor", [0.03, 30.0])

@@ -22,7 +22,7 @@ SOURCE = ROOT / "src" / "scopemap"
 LAYERS = (
     *("errors", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
     *("masking", "flow", "depth", "tracking", "mapping", "fusion", "calibration"),
-    *("pipeline", "reconstruction", "runner", "phantom", "evaluation", "inspection", "benchmark", "cli"),
+    *("pipeline", "estimators", "reconstruction", "runner", "phantom", "evaluation", "inspection", "benchmark", "cli"),
 )
 STAGES = {"masking", "flow", "depth", "tracking", "mapping", "fusion"}
 MAY_NOT_IMPORT = {"evaluation": STAGES | {"pipeline", "runner", "reconstruction"}}

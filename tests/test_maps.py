@@ -19,7 +19,7 @@ from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.fusion import TsdfVolume
+from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder

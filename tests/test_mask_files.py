@@ -15,11 +15,12 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import Config, MaskSettings
 from scopemap.errors import CalibrationError, InputError
+from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles, create_masks
 from scopemap.masking.masker import Masker
-from scopemap.pipeline import Estimators, Pipeline
+from scopemap.pipeline import Pipeline
 
 SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)
 RECTIFIER = Rectifier(SOURCE, working_camera(SOURCE, (320, 240)))
@@ -134,7 +135,7 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
         settings={"mask.files": str(masks), "mask.advanced.files_grow_px": 0, "depth.backend": "shading"}
     )
     sequence = open_sequence(images)
-    estimators = Estimators.create(config, sequence)
+    estimators = create_estimators(config, sequence)
     assert estimators.provenance()["masks"].startswith("3 files")
     percept = Pipeline(config, estimators).perceive(frames_of(sequence)[1])
     assert not percept.frame.valid[:, :160].any()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.fusion import save_mesh
+from scopemap.fusion.mesh import save_mesh
 
 
 @pytest.fixture

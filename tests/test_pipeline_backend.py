@@ -12,9 +12,9 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
+from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.mapping import Submap
-from scopemap.pipeline import Estimators, Pipeline, Step
+from scopemap.pipeline import Estimators, Step
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
@@ -52,14 +52,14 @@ class _Run:
 def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> _Run:
     folder = tmp_path_factory.mktemp("backend")
     phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}", frames=FRAMES)
-    create, steps = Estimators.create, []
+    create, steps = create_estimators, []
 
     def bent(config: Config, sequence: Any) -> Estimators:
         parts = create(config, sequence)
         return replace(parts, depth=_Bent(parts.depth))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Estimators, "create", bent)
+        patch.setattr("scopemap.runner.create_estimators", bent)
         config = with_true_depth(phantom, **SETTINGS, mapping__depth_step_sigma=request.param)
         adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
         plain = with_true_depth(phantom, **SETTINGS, mapping__method="none")
@@ -124,15 +124,6 @@ def test_the_run_says_what_the_back_end_did(run: _Run) -> None:
     assert any("keyframes adjusted" in note for note in notes)
     assert not any("back end" in note for note in run.tracked.provenance["notes"])
     assert run.adjusted.provenance["seconds"]["back end"] > 0
-
-
-def test_what_waited_is_fused_though_no_keyframe_ever_came(run: _Run) -> None:
-    config = with_true_depth(run.phantom, fusion__advanced__min_weight=0.0, **SETTINGS)
-    pipeline = Pipeline(config, Estimators.create(config, open_sequence(run.phantom)))
-    pipeline._waiting.put(run.steps[0].frame)
-    assert pipeline.submaps() == ([], [])
-    only = frozenset({run.steps[0].frame.index})
-    assert len(pipeline.fuse(Submap(0, (0,), only, only)).mesh.vertices) > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:

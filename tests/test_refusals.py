@@ -13,11 +13,12 @@ from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
+from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
-from scopemap.pipeline import Estimators, Pipeline
+from scopemap.pipeline import Pipeline
 from scopemap.runner import reconstruct
 
 
@@ -62,7 +63,7 @@ def test_a_run_never_overwrites_what_it_reads(folder: Path, tmp_path: Path, sour
 def test_masked_pixels_are_not_linked(folder: Path) -> None:
     config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
     sequence = open_sequence(folder)
-    pipeline = Pipeline(config, Estimators.create(config, sequence))
+    pipeline = Pipeline(config, create_estimators(config, sequence))
     percepts = [pipeline.perceive(frame) for frame in sequence.frames()]
     assert not percepts[0].frame.valid.all()
     for past, percept in itertools.pairwise(percepts):
@@ -75,16 +76,16 @@ def test_measured_depth_needs_no_link(folder: Path) -> None:
     assert not Mapis(config.mapis).links("measured")
     assert Mapis(config.mapis).links("depth")
     sequence = open_sequence(folder)
-    pipeline = Pipeline(config, Estimators.create(config, sequence))
+    pipeline = Pipeline(config, create_estimators(config, sequence))
     assert all(pipeline.perceive(frame).link is None for frame in sequence.frames())
 
 
 def test_facts_of_the_parts_do_not_overwrite_each_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = Config.load(settings={"networks.perceptual": "structure"})
-    estimators = Estimators.create(config, open_sequence(folder))
+    estimators = create_estimators(config, open_sequence(folder))
     monkeypatch.setattr(estimators.flow, "provenance", lambda: {"flow": "raft", "sha256": "f"})
     monkeypatch.setattr(estimators.perceptual, "provenance", lambda: {"perceptual": "lpips", "sha256": "p"})
-    facts = estimators.provenance()
+    facts = estimators_provenance(estimators)
     assert (facts["flow"], facts["flow sha256"], facts["perceptual sha256"]) == ("raft", "f", "p")
 
 

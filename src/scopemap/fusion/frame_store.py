@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ _MAX_CODE = 65535
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
-class _Entry(NamedTuple):
+@dataclass(frozen=True)
+class _Entry:
     """What is small of a frame, where its images begin in the file, and how many bytes each takes."""
 
     index: int

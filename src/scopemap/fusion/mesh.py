@@ -33,7 +33,7 @@ T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Mesh of one chunk: vertices (V, 3) in voxels, their edges' addresses (V, 3), colours (V, 3) 0..255, faces (F, 3)."""
+    """Mesh of a chunk: vertices (V, 3) in voxels, edge addresses (V, 3), colours (V, 3) 0..255, faces (F, 3)."""
 
     vertices: np.ndarray
     edges: np.ndarray
@@ -49,9 +49,7 @@ def extract_mesh(blocks: VoxelBlocks, settings: FusionAdvanced, voxel_mm: float)
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
-    chunks = [
-        _extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners
-    ]
+    chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
     mesh = _weld([chunk for chunk in chunks if chunk is not None])
     vertices, faces, colours = _without_floaters(*mesh, settings.min_component_share)
     return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False)
@@ -70,7 +68,9 @@ def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min
     local, faces, _, _ = marching_cubes(tsdf, 0.0, mask=mask, gradient_direction="descent")
     low, high = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64)
     offset = corner * BLOCK
-    return _Chunk(local + offset.astype(np.float64), low + high + 2 * offset, _colours(samples, local, low, high), faces)
+    return _Chunk(
+        local + offset.astype(np.float64), low + high + 2 * offset, _colours(samples, local, low, high), faces
+    )
 
 
 def _crossed_cells(tsdf: np.ndarray, known: np.ndarray, largest_spread_mm: float) -> np.ndarray:

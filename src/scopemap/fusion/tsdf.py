@@ -85,8 +85,8 @@ def measure_surface(
     """Return tangent plane and weight of every pixel of `inverse_depth` (H, W) float32, 1/mm, NaN = unknown.
 
     On the plane n.X = 1 the inverse depth is n.(x, y, 1), so its slopes give n, and 1/|n| is the plane's distance from
-    the camera. Weight = cos(incidence) / (1 + (2 distance / max_depth)^2): 1 for a wall met head-on at the lens, falling
-    with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
+    the camera. Weight = cos(incidence) / (1 + (2 distance / max_depth)^2): 1 for a frontal surface at the lens,
+    falling with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
     """
     height, width = inverse_depth.shape
     kept = np.full((height, width), np.nan, np.float32)
@@ -198,7 +198,13 @@ def _sample(inverse_depth: np.ndarray, u: float, v: float, largest_step: float) 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _integrate_block(
-    voxels: Voxels, slot: int, corner: np.ndarray, surface: MeasuredSurface, rgb: np.ndarray, camera: TsdfCamera, grid: Grid
+    voxels: Voxels,
+    slot: int,
+    corner: np.ndarray,
+    surface: MeasuredSurface,
+    rgb: np.ndarray,
+    camera: TsdfCamera,
+    grid: Grid,
 ) -> None:
     # Arrays read out of a tuple are counted references: once, not at every voxel.
     tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
@@ -239,7 +245,13 @@ def _integrate_block(
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def integrate_blocks(
-    voxels: Voxels, slots: np.ndarray, corners: np.ndarray, surface: MeasuredSurface, rgb: np.ndarray, camera: TsdfCamera, grid: Grid
+    voxels: Voxels,
+    slots: np.ndarray,
+    corners: np.ndarray,
+    surface: MeasuredSurface,
+    rgb: np.ndarray,
+    camera: TsdfCamera,
+    grid: Grid,
 ) -> None:
     """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
 

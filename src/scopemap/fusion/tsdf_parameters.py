@@ -1,8 +1,8 @@
 """TSDF parameters: those that are not set follow the scene, since the scale of millimetres differs from clip to clip.
 
 A laparoscope is 100 mm from the tissue, a colonoscope close to the wall, and a network's depth may be off by a factor.
-Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, with a truncation of 5 mm); the same proportions
-are kept at every distance.
+Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); other distances keep
+the proportions.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class TsdfParameters(NamedTuple):
     def description(self) -> str:
         """A note on parameters that follow the scene, and how to set others."""
         return (
-            f"fusion: voxels of {self.voxel_mm:g} mm, 1/{VOXELS_PER_MEDIAN_DEPTH} of the clip's median depth, and depth "
-            f"up to {self.max_depth_mm:g} mm; set fusion.voxel_mm for others"
+            f"fusion: voxels of {self.voxel_mm:g} mm, 1/{VOXELS_PER_MEDIAN_DEPTH} of the clip's median depth, and "
+            f"depth up to {self.max_depth_mm:g} mm; set fusion.voxel_mm for others"
         )
 
 

@@ -67,9 +67,7 @@ class TsdfVolume:
             usable = frame.valid & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
         surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
-        trust = depth_trust(
-            np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share
-        )
+        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
         surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
