@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scopemap.tracking.flow_pose import flow_error_px
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
@@ -23,6 +22,7 @@ from scopemap.geometry.se3 import inverse
 from scopemap.geometry.warp import carried_points
 from scopemap.io.opening import open_sequence
 from scopemap.pipeline import Pipeline, Step
+from scopemap.tracking.flow_pose import flow_error_px
 
 LEAST_SHARE = 0.1
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}

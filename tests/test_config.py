@@ -25,11 +25,11 @@ READERS = {
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner.py"],
     "mask": ["masking/*.py"],
     "depth": ["depth/*.py"],
-    "mapis": ["depth/mapis.py", "pipeline.py"],
-    "networks": ["pipeline.py", "runner.py"],
+    "mapis": ["depth/*.py", "pipeline.py"],
+    "networks": ["estimators.py"],
     "tracking": ["tracking/*.py"],
     "smoothing": ["tracking/smoothing.py"],
-    "mapping": ["mapping/backend.py", "mapping/feature_tracks.py", "pipeline.py"],
+    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py"],
     "fusion": ["fusion/*.py", "pipeline.py"],
 }
 

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import plane_scene
-import pytest
 from plane_scene import CAMERA
-from tiny_phantom import with_true_depth, write_tiny
 
-from scopemap import open_sequence
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.follow import CornerFollower
-from scopemap.frame import Correspondences2D3D, Frame
+from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.pipeline import Estimators, Pipeline
-from scopemap.tracking import Tracker
 
 HERE = plane_scene.pose()
 THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
@@ -51,32 +45,3 @@ def test_corners_of_masked_or_unknown_tissue_are_not_followed() -> None:
     assert seen.pixels[:, 0].max() < 120.5
     follower.start(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
     assert follower.find(_frame(1, THERE)) is None
-
-
-@pytest.mark.parametrize(
-    ("kind", "changes", "hosts"),
-    [
-        ("depth", {}, [None, 0, 0, 2, 2]),
-        ("measured", {}, [None] * 5),
-        ("depth", {"tracking__corner_depth_share": 0.0}, [None] * 5),
-        ("depth", {"networks__keyframe_flow": "none"}, [None] * 5),
-    ],
-)
-def test_the_tracker_is_given_the_corners_of_its_keyframe(
-    kind: str, changes: dict[str, object], hosts: list[int | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    phantom, given = write_tiny(tmp_path / "phantom", frames=5), []
-    light = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__keyframe_every": 2}
-    config = with_true_depth(phantom, depth__files_kind=kind, **light | changes)
-    sequence = open_sequence(phantom)
-    track = Tracker.track
-
-    def listening(self: Tracker, frame: Frame) -> object:
-        given.append(frame.keyframe_correspondences)
-        return track(self, frame)
-
-    monkeypatch.setattr(Tracker, "track", listening)
-    pipeline = Pipeline(config, Estimators.create(config, sequence))
-    for frame in sequence.frames():
-        pipeline.step(pipeline.perceive(frame))
-    assert [seen.host if isinstance(seen, Correspondences2D3D) else None for seen in given] == hosts

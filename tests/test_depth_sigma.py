@@ -18,8 +18,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame

@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from scopemap.config import TrackingSettings
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.follow import CornerFollower
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
 from scopemap.tracking.features import Landmarks, find_landmarks, locate
@@ -23,6 +25,7 @@ _BARE = 0.5  # texture of a wall that shows nothing but noise; tissue: 0.65 and 
 _BELIEVABLE_PX = 2.0  # median error of flow's own motion, up to which that bears a pose out
 _WORTH_KEEPING = 5  # frames tracked in a map, from which on it is looked for later
 _STILL_ALIKE = 0.8  # share of the correlation that corners may cost; more, and flow has followed something else
+_CONSISTENCY_PX = 1.0  # largest forward-backward error of flow at a corner
 _LONGEST_EXTRAPOLATION = 5  # frames for which the last motion is believed to go on
 
 
@@ -55,8 +58,10 @@ class Tracker:
     although they are clear, a new map begins, with a world of its own; a later loss may lead back to an older one.
     """
 
-    def __init__(self, settings: TrackingSettings) -> None:
+    def __init__(self, settings: TrackingSettings, flow: FlowEstimator | None = None) -> None:
         self.settings = settings
+        follows = flow is not None and flow.name != "none" and settings.corner_depth_share > 0
+        self._follower = CornerFollower(flow, _CONSISTENCY_PX) if flow is not None and follows else None
         self._keyframe: _Keyframe | None = None
         self._remembered: deque[_Keyframe] = deque(maxlen=settings.remembered_keyframes)
         self._remembered_elsewhere: deque[_Keyframe] = deque(maxlen=2 * settings.remembered_keyframes)
@@ -74,6 +79,8 @@ class Tracker:
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or say why there is none."""
         self._frames_since_keyframe += 1
+        if self._follower is not None and self._keyframe is not None and not self._keyframe.measured:
+            frame = replace(frame, keyframe_correspondences=self._follower.find(frame))
         if frame.valid.mean() < self.settings.min_valid_share:
             self._clear_frames_lost = 0
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
@@ -140,6 +147,8 @@ class Tracker:
         mean_mm = float(frame.depth_mm[known].mean())
         self._keyframe = _Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._map)
         self._remembered.append(self._keyframe)
+        if self._follower is not None:
+            self._follower.start(frame)
         self._frames_since_keyframe, self._agreement = 0, []
         return True
 
