@@ -56,15 +56,13 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         "overlays, in mask": (pipeline._masker, "_overlays"),
         "mask": (pipeline, "_masker"),
         "depth estimate": (pipeline.estimators.depth, "estimate"),
-        "flow, perceptual distance": (pipeline, "_link"),
+        "flow, perceptual distance": (pipeline._matcher, "match"),
         "track": (pipeline._tracker, "track"),
         "keyframe": (pipeline._tracker, "adopt"),
         "MAPIS": (pipeline._mapis, "refine"),
-        "wait to be fused": (pipeline._waiting, "put"),
+        "store": (pipeline.fusion, "put"),
         "fuse": (TsdfVolume, "integrate"),
     }
-    if pipeline._corners is not None:
-        parts["corners"] = (pipeline._corners, "find")
     if config.mapping.method == "full":
         parts["back end"] = (pipeline._mapper, "submaps")
     for part, (owner, name) in parts.items():
@@ -75,7 +73,8 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    pipeline.fuse(pipeline.submaps()[0][0])
+    submap = pipeline.submaps()[0][0]
+    pipeline.fusion.fuse(pipeline.corrected(submap), submap.main_frames)
     seldom = ("keyframe", "back end")
     per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
     # What does not happen at every frame is spread over all.
@@ -115,11 +114,11 @@ def main() -> None:
         model = config.depth.model if config.depth.backend == "scopenet" else ""
         network = measure_network(options.input or Path(folder), options.frames, model)
     unit = per_frame.pop("DIS")
-    counted = ("corners", "track", "keyframe", "MAPIS", "wait to be fused", "fuse")
+    counted = ("track", "keyframe", "MAPIS", "store", "fuse")
     both = sum(per_frame.get(part, 0.0) for part in counted)
     print(f"{width}x{height} px, median per frame; one DIS flow pair with its check: {unit:.1f} ms\n")
     print("| part | ms | in DIS pairs |\n|---|---|---|")
-    for part, ms in [*per_frame.items(), ("**corners + track + keyframe + MAPIS + fuse**", both), *network.items()]:
+    for part, ms in [*per_frame.items(), ("**track + keyframe + MAPIS + store + fuse**", both), *network.items()]:
         print(f"| {part} | {ms:.1f} | {ms / unit:.2f} |")
 
 

@@ -22,8 +22,9 @@ from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
+from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
-from scopemap.fusion import TsdfVolume
+from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.geometry.uncertainty import blended_share, by_variance, depth_trust, faded_share, sigma_share
 from scopemap.phantom.render import prepare, render_frame
@@ -354,7 +355,7 @@ class _Telling:
 
 def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "images")
-    create, runs = Estimators.create, {}
+    create, runs = create_estimators, {}
     # Shading tells no uncertainty of its own. Equal sigmas change no weight but that of the back end's depth prior.
     light = {"networks.flow": "dis", "networks.perceptual": "structure", "mapping.method": "none"}
     # Corners doubt all depth alike, and would hide what the photometric weights do.
@@ -365,7 +366,7 @@ def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.
             parts = create(config, sequence)
             return parts if left is None else replace(parts, depth=_Telling(parts.depth, left))
 
-        monkeypatch.setattr(Estimators, "create", telling)
+        monkeypatch.setattr("scopemap.runner.create_estimators", telling)
         steps: list[Step] = []
         runs[name] = reconstruct(open_sequence(folder), config, observers=(steps.append,)), steps[-1]
     result, step = runs["doubted"]
