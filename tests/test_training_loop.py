@@ -181,14 +181,14 @@ def test_recipes_survive_the_way_through_a_file(tmp_path):
 
 
 def test_one_command_renders_trains_evaluates_and_exports(tmp_path):
-    small, large = Part("small", 40, 32, 6), Part("held-out", 40, 32, 4)
+    small, large = Part("small", 40, 32, 3), Part("held-out", 40, 32, 2)
     recipe = replace(RECIPE, parts=(small,), uses=(Use("small", 1, 2, 1.0),), held_out=large)
     (tmp_path / "tiny.toml").write_text(recipe.toml())
     command = [sys.executable, "-m", "training", "--out", "run", "--recipe", "tiny.toml", "--threads", "1"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "6 of 6 scenes rendered" in done.stdout
+    assert "3 of 3 scenes rendered" in done.stdout
     assert "calibrated on training scenes" in done.stdout
     made = {path.name for path in (tmp_path / "run").iterdir()}
     assert made >= {"recipe.toml", "log.csv", "curves.png", "checkpoint.pt", "held_out.json", "scopenet.safetensors"}

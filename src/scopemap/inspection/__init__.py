@@ -1,1 +1,1 @@
-"""What is peculiar about a clinical video: `inspect` reads it once and says what was found; one kind in each file."""
+"""Inspection of a clinical video: `inspecting.inspect` reads it once and reports quality and format findings."""

@@ -1,4 +1,4 @@
-"""The one pass over a video: every picture is looked at once, in order, and only small copies are kept."""
+"""The one pass over a video: every frame is measured once, in order, and few are kept."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from scopemap.io.video import VideoFile
 from scopemap.io.video_format.stereo_packing import Packing, packing
 
 _KEPT = 8
-# What stereo packing is told from: pictures from all parts of a video, else every tenth of the beginning.
-_PEEKED, _PEEK_EVERY = 9, 10
+# Frames for the detection of stereo packing: from all parts of a video, else every tenth of the beginning.
+_SAMPLED, _SAMPLED_EVERY = 9, 10
 _NAMED = 3
 _ORDER = ("error", "warning", "info")
 
@@ -50,7 +50,7 @@ class Inspection:
     Attributes
     ----------
     path : the file or folder. size : of a picture (of one view, if there are two), px. clip : figures of every picture.
-    container : what the file's header says, None for folders. packed : how two views lie in a picture, or None.
+    container : facts in the file's header, None for folders. packed : layout of two views in a picture, or None.
     field, overlays : as found. insets : left, top, right, bottom, shares of width and height.
     findings : worst first. samples : a few views, evenly spread.
     """
@@ -106,7 +106,7 @@ def inspect(
 
     `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called
     after each. Raises `InputError` and `CalibrationError` where it cannot be opened, or holds fewer than two pictures.
-    Where reading stops later, that is part of what was found.
+    Where reading stops later, that is a finding.
     """
     plain = InputSettings(stereo="none", skip_duplicates=False)
     # Whether there are two views comes first: the camera may be that of one.
@@ -114,33 +114,73 @@ def inspect(
     settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
     sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
     media = sequence.source.media()
-    return _Pass(sequence, None if media is None else read_container(media), packed).inspection(listener)
+    container = None if media is None else read_container(media)
+    field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled(_KEPT)
+    measures, stopped = [], ""
+    try:
+        for item in _inspected(sequence):
+            for watcher in (field, overlays, insets, sampled):
+                watcher.add(item)
+            measures.append(item.measures)
+            if listener is not None:
+                listener(len(measures), sequence.count)
+    except ScopemapError as error:
+        stopped = str(error)
+    if len(measures) < 2:
+        found = stopped or f"{len(measures)} picture(s) could be read, two are needed"
+        raise InputError(f"inspecting {sequence.path}: {found}")
+    clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection)
+    findings = [
+        *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
+        *_of_source(sequence.warnings),
+        *(container.findings() if container is not None else []),
+        *check_timing(clip, container.length_s if container is not None else None),
+        *check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
+        *check_repeats(clip),
+        *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
+        *check_frames(clip),
+    ]
+    height, width = sampled.kept[0].small.shape[:2]
+    return Inspection(
+        path=sequence.path,
+        size=(sequence.source.width, sequence.source.height),
+        clip=clip,
+        container=container,
+        packed=packed,
+        field=field.field(),
+        overlays=tuple(overlays.overlays()),
+        insets=tuple((a / width, b / height, c / width, d / height) for a, b, c, d in insets.boxes()),
+        findings=tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.severity))),
+        samples=tuple(sampled.kept),
+    )
 
 
 def _packed(source: Source) -> Packing | None:
-    pictures: list[np.ndarray] = []
     if source.name not in (*UNKNOWN_MAKE, RosBag.name):
         return None  # the readers of data sets know what a picture holds
-    # Where reading stops, the pass over all of it says why.
+    pictures: list[np.ndarray] = []
+    # Where reading stops here, it stops in the pass over the video, too, and is reported there.
     with suppress(ScopemapError):
         if isinstance(source, VideoFile):
-            pictures = source.samples(_PEEKED)
+            pictures = source.samples(_SAMPLED)
         else:
-            pictures.extend(frame.rgb for frame in source.frames(slice(0, _PEEKED * _PEEK_EVERY, _PEEK_EVERY)))
+            pictures.extend(frame.rgb for frame in source.frames(slice(0, _SAMPLED * _SAMPLED_EVERY, _SAMPLED_EVERY)))
     return packing(pictures, source.pixel_aspect)
 
 
-def _positions(sequence: Sequence) -> Callable[[int, int], int]:
-    """Return what tells the position in the input of the n-th picture that is read, with this index.
+def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
+    """Yield the frames, measured, with their positions in the input.
 
-    Images that turn out unreadable have one, too; damaged pictures of a video are not counted by `--frames`.
+    Unreadable images have a position, too; damaged frames of a video are not counted by `--frames`.
     """
-    known = sequence.source.stamps(slice(None))
+    known = sequence.source.stamps(slice(None)) or []
     start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
-    if known is None:
-        return lambda number, _: start + step * number
     positions = {index: position for position, (index, _) in enumerate(known)}
-    return lambda number, index: positions.get(index, start + step * number)
+    inspector = FrameInspector()
+    for number, item in enumerate(sequence.source.frames(sequence.selection)):
+        rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
+        frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
+        yield inspector(positions.get(item.index, start + step * number), item.rgb, frame)
 
 
 def _of_source(warnings: list[str]) -> list[VideoFinding]:
@@ -152,82 +192,16 @@ def _of_source(warnings: list[str]) -> list[VideoFinding]:
 
 
 class _Sampled:
-    """Keeps a few views of a video of unknown length, evenly spread."""
+    """Keeps a few frames of a video of unknown length, evenly spread."""
 
     def __init__(self, most: int) -> None:
         self._most, self._step, self._seen = most, 1, 0
         self.kept: list[InspectedFrame] = []
 
-    def add(self, view: InspectedFrame) -> None:
+    def add(self, item: InspectedFrame) -> None:
         if self._seen % self._step == 0 and len(self.kept) == self._most:
             self.kept = self.kept[::2]
             self._step *= 2
         if self._seen % self._step == 0:
-            self.kept.append(view)
+            self.kept.append(item)
         self._seen += 1
-
-
-class _Pass:
-    """One pass over a sequence."""
-
-    def __init__(self, sequence: Sequence, container: Container | None, packed: Packing | None) -> None:
-        self._sequence, self._container, self._packed = sequence, container, packed
-        self._field, self._overlays, self._insets = FieldWatcher(), OverlayWatcher(), InsetWatcher()
-        self._sampled = _Sampled(_KEPT)
-
-    def inspection(self, listener: Callable[[int, int | None], None] | None) -> Inspection:
-        """Read all pictures and return what was found."""
-        sequence = self._sequence
-        figures, stopped = [], ""
-        try:
-            for view in self._views():
-                figures.append(view.measures)
-                if listener is not None:
-                    listener(len(figures), sequence.count)
-        except ScopemapError as error:
-            stopped = str(error)
-        if len(figures) < 2:
-            found = stopped or f"{len(figures)} picture(s) could be read, two are needed"
-            raise InputError(f"inspecting {sequence.path}: {found}")
-        clip = Clip(tuple(figures), sequence.source.stamped, sequence.selection)
-        findings = sorted(self._findings(clip, stopped), key=lambda finding: _ORDER.index(finding.severity))
-        samples = tuple(self._sampled.kept)
-        height, width = samples[0].small.shape[:2]
-        return Inspection(
-            path=sequence.path,
-            size=(sequence.source.width, sequence.source.height),
-            clip=clip,
-            container=self._container,
-            packed=self._packed,
-            field=self._field.field(),
-            overlays=tuple(self._overlays.overlays()),
-            insets=tuple((a / width, b / height, c / width, d / height) for a, b, c, d in self._insets.boxes()),
-            findings=tuple(findings),
-            samples=samples,
-        )
-
-    def _views(self) -> Iterator[InspectedFrame]:
-        viewer, sequence, position_of = FrameInspector(), self._sequence, _positions(self._sequence)
-        for number, item in enumerate(sequence.source.frames(sequence.selection)):
-            rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
-            frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
-            view = viewer(position_of(number, item.index), item.rgb, frame)
-            for watcher in (self._field, self._overlays, self._insets, self._sampled):
-                watcher.add(view)
-            yield view
-
-    def _findings(self, clip: Clip, stopped: str) -> list[VideoFinding]:
-        container = self._container
-        pictures = [view.rgb for view in self._sampled.kept if not view.measures.blank]
-        return [
-            *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
-            *_of_source(self._sequence.warnings),
-            *(container.findings() if container is not None else []),
-            *check_timing(clip, container.length_s if container is not None else None),
-            *check_packing(self._packed, pictures),
-            *check_repeats(clip),
-            *self._field.findings(),
-            *self._overlays.findings(),
-            *self._insets.findings(),
-            *check_frames(clip),
-        ]

@@ -42,7 +42,7 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
 
     Above, frames of the video: field of view cyan, overlays yellow, pictures in the picture magenta. Below them, the
     same as a run sees them: what its mask leaves out is tinted blue. Then figures over time, and a band for each
-    kind of stretch that was found.
+    kind of finding about stretches of frames.
     """
     views = _chosen(inspection.samples)
     bands = [(f.code, f.stretches) for f in inspection.findings if f.stretches and f.code in _BANDS]

@@ -82,7 +82,7 @@ def _distances_along(centres: np.ndarray) -> np.ndarray:
     """Distance of each centre from the blind end through the lumen: a station that fits paths going to and fro."""
     distances = cdist(centres, centres)
     links = np.where(distances < 2.0 * _SPACING_MM, distances, 0)
-    # A file may jump: consecutive centres stay linked whatever lies between them.
+    # A path file may jump: consecutive centres stay linked at any distance.
     for i in range(len(centres) - 1):
         links[i, i + 1] = links[i + 1, i] = distances[i, i + 1]
     return dijkstra(links, directed=False, indices=len(centres) - 1)

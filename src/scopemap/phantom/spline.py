@@ -1,6 +1,6 @@
 """Uniform cubic B-spline over a 3-D grid: value and gradient at a point, in numba.
 
-Coordinates are in voxels: coefficient (i, j, k) lies at (i, j, k). M. Unser, "Splines: a perfect fit for signal and
+Coordinates are in voxels: coefficient (i, j, k) is at (i, j, k). M. Unser, "Splines: a perfect fit for signal and
 image processing", IEEE Signal Processing Magazine 16(6), 1999, eq. 9.
 """
 
@@ -31,7 +31,7 @@ def _slopes(f: float) -> tuple[float, float, float, float]:
 
 @njit(cache=True, nogil=True)
 def spline(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Return value and gradient (per voxel) at grid coordinates; the caller has checked that they lie inside."""
+    """Return value and gradient (per voxel) at grid coordinates; the caller has checked `inside`."""
     i, j, k = int(x), int(y), int(z)
     wx, wy, wz = _weights(x - i), _weights(y - j), _weights(z - k)
     sx, sy, sz = _slopes(x - i), _slopes(y - j), _slopes(z - k)

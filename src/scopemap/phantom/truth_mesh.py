@@ -61,7 +61,7 @@ def surface_mesh(volume: Volume, where: np.ndarray) -> trimesh.Trimesh:
 
 
 def _defined(shape: tuple[int, ...]) -> np.ndarray:
-    """Voxels (X, Y, Z) bool whose neighbourhood lies inside the spline's domain."""
+    """Voxels (X, Y, Z) bool whose neighbourhood is inside the spline's domain."""
     inside = np.zeros(shape, bool)
     inside[(slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3] = True
     return inside

@@ -1,6 +1,6 @@
 """Volume: a scene's shape as one smooth function on a grid.
 
-The shape is the zero set of a uniform cubic B-spline whose coefficients lie on a grid, positive in the free space and
+The shape is the zero set of a uniform cubic B-spline with coefficients on a grid, positive in the free space and
 negative in tissue. The spline itself is the definition of the surface, not an approximation of one, so depth and mesh
 can be exact. Two of its properties make marching safe: in a cell it stays within the range of the 4x4x4
 coefficients around it (convex hull), and its slope within that of their differences.
