@@ -249,6 +249,13 @@ def test_a_picture_of_another_size_than_the_header_says_is_left_out(tmp_path: Pa
     assert source.warnings == ["image 1 cannot be decoded and was left out"]
 
 
+def test_only_single_images_are_limited_in_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.io.datasets.dicom_files._MOST_IMAGE_BYTES", 100)
+    assert len(pictures(native(tmp_path / "a.dcm", film()))) == 4
+    with pytest.raises(InputError, match="one image: it holds 0 MB, expected 0 MB at most"):
+        open_sequence(write_frames(tmp_path / "b"))
+
+
 def test_claims_take_no_memory(tmp_path: Path) -> None:
     file = native(tmp_path / "a.dcm", film(), Rows=60_000, Columns=60_000)
     with pytest.raises(InputError, match="more than 64 million pixels"):

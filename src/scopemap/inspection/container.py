@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import BinaryIO
 
 import av
 
@@ -57,7 +56,7 @@ class Container:
         return found
 
 
-def read_container(media: str | BinaryIO) -> Container | None:
+def read_container(media: str) -> Container | None:
     """Return the facts in the header and first picture of a video, None where it cannot be opened."""
     try:
         with av.open(media, "r", metadata_errors="replace") as container:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from typing import BinaryIO
 
 import numpy as np
 
@@ -104,7 +103,7 @@ class PreparedSource(SourceDefaults):
         """Return number and time stamp of the selected frames, None where only reading on would tell."""
         return self._source.stamps(selection)
 
-    def media(self) -> str | BinaryIO | None:
+    def media(self) -> str | None:
         """Return what FFmpeg opens, None where there is no video."""
         return self._source.media()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -96,8 +96,8 @@ class Source(Protocol):
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
 
-    def media(self) -> str | BinaryIO | None:
-        """Return what FFmpeg opens, a name or a file, where the frames are those of one video; None elsewhere."""
+    def media(self) -> str | None:
+        """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
 
     def pose(self, index: int) -> np.ndarray | None:
         """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
@@ -122,7 +122,7 @@ class SourceDefaults:
     width: int
     height: int
 
-    def media(self) -> str | BinaryIO | None:
+    def media(self) -> str | None:
         """Nothing: no video."""
         return None
 

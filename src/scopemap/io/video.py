@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import av
 import numpy as np
@@ -105,8 +105,8 @@ class VideoFile(SourceDefaults):
         """Only decoding tells how many frames there are, and when."""
         return None
 
-    def media(self) -> str | BinaryIO:
-        """Return what FFmpeg opens: the file's name, or its bytes where these are part of another file."""
+    def media(self) -> str:
+        """Return what FFmpeg opens: the file's name, or that of its bytes within another file."""
         return str(self.path)
 
     def _opened(self) -> InputContainer:

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -94,7 +93,7 @@ class Dicom(SourceDefaults):
             return None
         return [(number, self._time_s(number)) for number in self.numbers[selection]]
 
-    def media(self) -> str | BinaryIO | None:
+    def media(self) -> str | None:
         """Return the video's stream; None where there is none."""
         return None if self._video is None else self._video.media()
 

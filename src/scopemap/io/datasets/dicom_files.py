@@ -133,9 +133,11 @@ def read_header(file: Path) -> Header:
         frames = claimed
         if not _is_mpeg(syntax):
             _check_decoder(file, syntax)
-            check_bytes(f"{file}, one image", max((size for _, size in fragments), default=0), _MOST_IMAGE_BYTES)
             room = min(stream.seek(0, io.SEEK_END) - start, length)
-            found = len(fragments) if length == _UNDEFINED else room // max(_native_bytes(fields), 1)
+            found = room // max(_native_bytes(fields), 1)
+            if length == _UNDEFINED:
+                found = len(fragments)
+                check_bytes(f"{file}, one image", max((size for _, size in fragments), default=0), _MOST_IMAGE_BYTES)
             frames = min(claimed, found)
     return Header(file, syntax, frames, claimed - frames, start, fragments, fields)
 
