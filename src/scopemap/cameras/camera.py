@@ -42,7 +42,7 @@ class CameraModel(Protocol):
 
 
 def source_pixel(pixels: np.ndarray, working: PinholeCamera, source: CameraModel) -> np.ndarray:
-    """Return where pixels (..., 2) of the rectified, working image lie in the source's image, px; NaN beyond its field.
+    """Return where pixels (..., 2) of the rectified, working image are in the source's image, px; NaN beyond its field.
 
     A run's folder holds both cameras: `camera.yaml` is `working`, `source_camera.yaml` is `source`.
     """

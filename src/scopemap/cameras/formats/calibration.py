@@ -96,9 +96,11 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
 def fitted_to(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
     """Return `camera` resized for images of `image_size` (width, height), px; `name` is the calibration's in errors.
 
-    Raises `CalibrationError` unless the aspects agree within 1 %.
+    Raises `CalibrationError` unless the aspects agree within 1 % and the camera is plausible.
     """
-    return _resized(camera, image_size, f"the calibration {name}")
+    scaled = _resized(camera, image_size, f"the calibration {name}")
+    check_plausible(scaled, f"the calibration {name}")
+    return scaled
 
 
 def _resized(camera: CameraModel, image_size: Size, name: str) -> CameraModel:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera
 from scopemap.errors import CalibrationError
 
 
@@ -26,28 +26,21 @@ def write_calibration(
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
     if not storage.isOpened():
         raise CalibrationError(f"cannot write the calibration to {file}: is its folder there and writable?")
-    plane = camera.plane if isinstance(camera, FovCamera) else camera.central
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
-    storage.write("camera_matrix", plane.matrix)
+    storage.write("camera_matrix", (camera.plane if isinstance(camera, FovCamera) else camera.central).matrix)
     if isinstance(camera, OmnidirectionalCamera):
-        storage.write("camera_model", "omnidirectional")
-        storage.write("polynomial", np.array([camera.polynomial]))
-        storage.write("stretch", np.array([camera.stretch]))
+        model, terms = "omnidirectional", {"polynomial": camera.polynomial, "stretch": camera.stretch}
+    elif isinstance(camera, FovCamera):
+        model, terms = "fov", {"distortion_coefficients": (camera.omega,)}
     else:
-        model, distortion = _lens(camera)
-        storage.write("camera_model", model)
-        storage.write("distortion_coefficients", np.array([distortion]))
+        model = "fisheye" if isinstance(camera, FisheyeCamera) else "opencv"
+        terms = {"distortion_coefficients": getattr(camera, "distortion", (0.0,) * 5)}
+    storage.write("camera_model", model)
+    for name, values in terms.items():
+        storage.write(name, np.array([values]))
     if depth_scale_mm is not None:
         storage.write("depth_scale", float(depth_scale_mm))
     if focal_sigma_px is not None:
         storage.write("focal_sigma_px", float(focal_sigma_px))
     storage.release()
-
-
-def _lens(camera: CameraModel) -> tuple[str, tuple[float, ...]]:
-    if isinstance(camera, FovCamera):
-        return "fov", (camera.omega,)
-    if isinstance(camera, FisheyeCamera):
-        return "fisheye", camera.distortion
-    return "opencv", camera.distortion if isinstance(camera, OpenCvCamera) else (0.0,) * 5

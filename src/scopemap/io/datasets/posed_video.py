@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.calibration import check_plausible, fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
@@ -78,7 +78,6 @@ class PosedVideo(SourceDefaults):
     def _set_camera(self, camera: CameraModel, file: Path) -> None:
         """Take `camera`, read from `file`, brought to the size of the view."""
         fitted = fitted_to(camera, (self.width, self.height), str(file))
-        check_plausible(fitted, f"the calibration {file}")
         self.camera = fitted
         self.camera_source = f"calibration of the data set, {file.name}{rescaled_note(camera, fitted)}"
 
