@@ -200,13 +200,13 @@ def test_moving_is_the_inverse_of_the_warp() -> None:
 
 
 def test_path_keeps_clear_of_the_wall(phantom: Phantom) -> None:
-    spec = PhantomSpec(scene=phantom.spec.scene, frames=150, width=32, height=32, seed=5)
+    spec = PhantomSpec(scene=phantom.spec.scene, frames=60, width=32, height=32, seed=5)
     poses = camera_path(spec)
     scene = build_scene(spec, poses)
     for displacement in (REST, breathing(2.0, 10.0, 5).at(5)):
         positions = poses[:, :3, 3] - displacement.at(poses[:, :3, 3])
         assert scene.volume.values_at(positions)[0].min() > 5.0
-        for index in (0, 80, 149):
+        for index in (0, 30, 59):
             assert np.nanmin(march(scene.volume, spec.camera, poses[index], displacement).distance_mm) > 5.0
 
 
