@@ -14,10 +14,9 @@ from drawn_inputs import number_in, picture
 from test_datasets_stereomis import write_frames
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
-from scopemap.errors import CalibrationError, InputError
+from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.errors import InputError
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
 
@@ -100,13 +99,6 @@ def test_a_procedure(tmp_path: Path) -> None:
     assert sequence.warnings == []
 
 
-def test_several_procedures_are_named(tmp_path: Path) -> None:
-    folder = write_endomapper(tmp_path)
-    shutil.copytree(folder, folder.parent / "Seq_002")
-    with pytest.raises(InputError, match=r"holds 2 sequences .*Seq_001.*Seq_002"):
-        open_sequence(tmp_path)
-
-
 @pytest.mark.parametrize("number", [1, "1", "01", "Endoscope_01"])
 def test_every_form_of_the_endoscopes_number(number: object, tmp_path: Path) -> None:
     assert open_sequence(write_endomapper(tmp_path, number)).calibrated
@@ -143,17 +135,6 @@ def test_a_calibration_that_is_named_but_not_there_is_told(tmp_path: Path) -> No
     assert any("names Endoscope_12, but Endoscope_12_geometrical.xml is neither" in w for w in sequence.warnings)
     (sequence.path / "Seq_001_info.json").unlink()
     assert any("Seq_001_info.json is missing" in note for note in open_sequence(sequence.path).notes)
-
-
-def test_every_model_of_the_calibration(tmp_path: Path) -> None:
-    file = tmp_path / "a_geometrical.xml"
-    pinhole = PinholeCamera(*KB4[:4], *SIZE)
-    file.write_text(xml(KB4[:4], "calibu_fu_fv_u0_v0"))
-    assert read_calibration(file, SIZE).camera == pinhole
-    file.write_text(xml((*KB4[:4], -0.2, 0.05), "calibu_fu_fv_u0_v0_k1_k2"))
-    assert read_calibration(file, SIZE).camera == OpenCvCamera(pinhole, (-0.2, 0.05, 0.0, 0.0))
-    file.write_text(xml(tuple(2 * value for value in KB4[:4]) + KB4[4:], size=(320, 240)))
-    assert read_calibration(file, (320, 240)).camera.central.width == 320
 
 
 def test_a_calibration_of_another_size_is_rescaled(tmp_path: Path) -> None:
@@ -271,32 +252,6 @@ def test_an_info_file_that_is_none_is_one_sentence(text: str, message: str, tmp_
     (folder / "Seq_001_info.json").write_text(text)
     with pytest.raises(InputError, match=message):
         open_sequence(folder)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "it holds 0 numbers"),
-        ("<rig><camera/></rig>", "it has no 3x3 camera matrix"),
-        ('<?xml version="1.0" encoding="none"?><rig/>', "none of the formats"),
-        (xml(kind="calibu_fu_fv_u0_v0_w"), "the type 'calibu_fu_fv_u0_v0_w' of its camera_model is not known"),
-        (xml(KB4[:7]), "holds 7 parameters, expected 8"),
-        (xml((float("nan"), *KB4[1:])), "expected 8 finite ones"),
-        (xml(KB4).replace("79.8", "wide"), "could not convert"),
-        (xml(KB4).replace("<width> 160 </width>", ""), "could not convert"),
-        (xml(size=(0, 0)), "its size is 0x0 px"),
-        (xml(size=(200, 120)), "another aspect"),
-        (xml((900.0, *KB4[1:])), "does not fit images of 160x120 px"),
-        (xml((*KB4[:2], 300.0, *KB4[3:])), "principal point 300"),
-    ],
-)
-def test_a_calibration_that_is_none_is_one_sentence(text: str, message: str, tmp_path: Path) -> None:
-    folder = write_endomapper(tmp_path)
-    (tmp_path / "Calibrations" / "Endoscope_01" / "Endoscope_01_geometrical.xml").write_text(text)
-    with pytest.raises(CalibrationError, match=message) as caught:
-        open_sequence(folder)
-    assert "Endoscope_01_geometrical.xml" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_one_video_is_wanted_and_readable(tmp_path: Path) -> None:

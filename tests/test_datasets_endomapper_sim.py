@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import struct
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import InputError
 from scopemap.io.datasets import endomapper_sim
 from scopemap.io.datasets.exr import read_exr_red
 from scopemap.io.datasets.reference import reference_trajectory
@@ -125,12 +124,6 @@ def test_numbers_are_those_of_the_rows_also_in_a_part(tmp_path: Path) -> None:
     np.testing.assert_allclose(reference.times_s, [2 / 30, 3 / 30])
 
 
-def test_several_sequences_are_named(tmp_path: Path) -> None:
-    shutil.copytree(write_sim(tmp_path / "Seq_0"), tmp_path / "Seq_1")
-    with pytest.raises(InputError, match=r"holds 2 sequences \(Seq_0, Seq_1\)"):
-        open_sequence(tmp_path)
-
-
 def test_the_calibration_that_was_downloaded_and_ones_own(tmp_path: Path) -> None:
     folder = write_sim(tmp_path / "Seq_0")
     text = "fx: 500\nfy: 501\ncx: 470\ncy: 350\n\ncols: 960\nrows: 720\n"
@@ -170,15 +163,6 @@ def test_times_that_do_not_increase_are_left_out(tmp_path: Path) -> None:
     sequence = open_sequence(folder)
     np.testing.assert_allclose([time for _, time in sequence.source.stamps(slice(None))], np.arange(FRAMES) / 30)
     assert any("the times do not increase" in warning for warning in sequence.warnings)
-
-
-def test_depth_may_be_missing_and_a_picture_damaged(tmp_path: Path) -> None:
-    folder = write_sim(tmp_path / "Seq_0")
-    (folder / "depth" / "aov_image_0001.exr").unlink()
-    (folder / "rgb" / "image_0002.png").write_bytes(b"no picture")
-    sequence = open_sequence(folder)
-    assert [(frame.index, truth.depth_mm is None) for frame, truth in sequence] == [(0, False), (1, True), (3, False)]
-    assert any("image_0002.png cannot be read and was left out" in warning for warning in sequence.warnings)
 
 
 def test_without_a_decoder_there_is_no_depth_and_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,34 +245,6 @@ def test_a_trajectory_that_is_none_is_one_sentence(text: str | bytes, message: s
         open_sequence(folder)
     assert "trajectory.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "it holds 0 numbers"),
-        ("fx: 500\nfy: 501\n", "it has no cx, cy"),
-        ("fx: a\n", "fx must be a finite number, found 'a'"),
-        ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: nan\nrows: 720\n", "cols must be a finite number"),
-        ("fx: 500\nfy: 501\ncx: 970\ncy: 350\ncols: 960\nrows: 720\n", "focal length 500, 501 px"),
-        ("fx: 500\nfy: 501\ncx: 470\ncy: 350\ncols: 960\nrows: 960\n", "another aspect"),
-    ],
-)
-def test_a_calibration_that_is_none_is_one_sentence(text: str, message: str, tmp_path: Path) -> None:
-    folder = write_sim(tmp_path / "Seq_0")
-    (folder / "calibration.txt").write_text(text)
-    with pytest.raises(CalibrationError, match=message):
-        open_sequence(folder)
-
-
-def test_pictures_of_another_size_and_with_one_number_are_refused(tmp_path: Path) -> None:
-    folder = write_sim(tmp_path / "Seq_0")
-    save(folder / "rgb" / "image_0003.png", picture(3, (48, 36)))
-    with pytest.raises(InputError, match=r"image_0003\.png: it is 48x36 px"):
-        list(open_sequence(folder).frames())
-    save(folder / "rgb" / "image_3.png", picture(3, SIZE))
-    with pytest.raises(InputError, match="have the same number"):
-        open_sequence(folder)
 
 
 def test_nothing_to_read_and_no_trajectory(tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import MaskSettings
 from scopemap.config.input import MaskAdvanced
 from scopemap.errors import CalibrationError, InputError
@@ -99,13 +97,6 @@ def test_it_is_found_from_outside(outer: str, tmp_path: Path) -> None:
     assert open_sequence(tmp_path).path == folder
 
 
-def test_several_scenes_are_named(tmp_path: Path) -> None:
-    write_scene(tmp_path / "cutting")
-    write_scene(tmp_path / "pulling")
-    with pytest.raises(InputError, match=r"holds 2 sequences \(cutting, pulling\)"):
-        open_sequence(tmp_path)
-
-
 def test_a_folder_of_images_without_poses_is_no_scene(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "pulling")
     (folder / "poses_bounds.npy").unlink()
@@ -138,14 +129,6 @@ def test_other_poses_are_in_the_axes_of_llff(tmp_path: Path) -> None:
     assert any("down, right, back" in note for note in sequence.notes)
 
 
-def test_poses_are_known_without_images_and_depth(tmp_path: Path) -> None:
-    source = open_sequence(write_scene(tmp_path / "a", llff(moving()))).source
-    for inner in ("images", "depth"):
-        shutil.rmtree(tmp_path / "a" / inner)
-    np.testing.assert_allclose(source.pose(9), moving()[3], atol=1e-12)
-    assert source.stamps(slice(3, None)) == [(9, 0.3), (10, 10 / 30)]
-
-
 def test_a_row_that_is_not_finite_is_a_frame_without_a_pose(tmp_path: Path) -> None:
     rows = llff(moving())
     rows[2, :4] = np.nan
@@ -166,22 +149,6 @@ def test_no_finite_pose_is_said(tmp_path: Path) -> None:
     sequence = open_sequence(write_scene(tmp_path / "a", rows))
     assert reference_trajectory(sequence) is None
     assert any("no finite pose" in warning for warning in sequence.warnings)
-
-
-def test_a_depth_file_that_is_missing_leaves_the_pose(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a")
-    (folder / "depth" / "frame-9.depth.png").unlink()
-    truths = [truth for _, truth in open_sequence(folder)]
-    assert [truth.depth_mm is None for truth in truths] == [False, False, False, True, False]
-    assert truths[3].T_world_camera is not None
-
-
-def test_a_calibration_of_ones_own_wins(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a", llff(at_rest(), focal_px=1e9))
-    write_calibration(PinholeCamera(77.0, 78.0, 41.0, 30.0, *SIZE), folder / "camera.yaml", depth_scale_mm=0.5)
-    sequence = open_sequence(folder)
-    assert (sequence.camera.fx, sequence.camera.cx) == (77.0, 41.0)
-    assert sequence.source.truth(1).depth_mm[30, 30] == 30.5
 
 
 def test_the_camera_of_larger_images_is_rescaled(tmp_path: Path) -> None:
@@ -287,44 +254,11 @@ def test_a_bad_file_of_poses_is_one_sentence(
     assert "poses_bounds.npy" in str(caught.value)
 
 
-def test_no_damage_to_the_header_ends_in_another_error(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a")
-    file, random = folder / "poses_bounds.npy", np.random.default_rng(0)
-    sound, refused = file.read_bytes(), 0
-    for _ in range(300):
-        content = bytearray(sound)
-        for place in random.integers(0, 128, 3):
-            content[place] = random.integers(0, 256)
-        file.write_bytes(content)
-        try:
-            open_sequence(folder)
-        except (InputError, CalibrationError):
-            refused += 1
-    assert refused > 200
-
-
 def test_rows_of_a_camera_at_rest_do_for_images_that_were_left_out(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "a", llff(at_rest(8)))
     sequence = open_sequence(folder)
     np.testing.assert_array_equal(sequence.source.pose(10), np.eye(4))
     assert any("8 rows for 5 images" in warning for warning in sequence.warnings)
-
-
-def test_an_unreadable_image_is_left_out_and_its_row_with_it(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a", llff(moving()))
-    (folder / "images" / "frame-1.color.png").write_bytes(b"no picture")
-    sequence = open_sequence(folder)
-    pairs = list(sequence)
-    assert [number_in(frame.rgb) for frame, _ in pairs] == [0, 2, 9, 10]
-    np.testing.assert_allclose(pairs[1][1].T_world_camera, moving()[2], atol=1e-12)
-    assert any("frame-1.color.png cannot be read" in warning for warning in sequence.warnings)
-
-
-def test_images_of_two_sizes_are_refused(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "a")
-    save(folder / "images" / "frame-9.color.png", picture(9, (40, 32)))
-    with pytest.raises(InputError, match=r"frame-9\.color\.png: it is 40x32 px"):
-        list(open_sequence(folder))
 
 
 def test_two_depth_files_for_one_frame_are_refused(tmp_path: Path) -> None:

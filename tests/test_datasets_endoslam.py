@@ -14,8 +14,7 @@ from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
 
 SIZE = (96, 96)
@@ -153,16 +152,6 @@ def test_images_after_the_last_row_have_no_pose_and_go_on_in_time(tmp_path: Path
     assert [frame.time_s for frame in sequence.frames()] == [t for _, t in sequence.source.stamps(slice(None))]
 
 
-def test_poses_and_stamps_read_no_image_and_no_depth(tmp_path: Path) -> None:
-    organ = write_unity(tmp_path / "UnityCam" / "Colon")
-    sequence = open_sequence(organ)
-    shutil.rmtree(organ / "Pixelwise Depths")
-    shutil.rmtree(organ / "Frames")
-    trajectory = reference_trajectory(sequence)
-    assert trajectory.indices.tolist() == [0, 1, 2, 3]
-    np.testing.assert_allclose(trajectory.positions_mm[3], [690, -9010, -3100])
-
-
 @pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize("up", ["Colon", ".", "..", "../.."])
 def test_it_is_found_from_above_and_in_repeated_folders(up: str, again: bool, tmp_path: Path) -> None:
@@ -171,13 +160,6 @@ def test_it_is_found_from_above_and_in_repeated_folders(up: str, again: bool, tm
     assert (sequence.source.name, sequence.path) == ("endoslam", organ)
     assert sequence.source.truth(0).depth_mm[50, 0] == 400
     np.testing.assert_array_equal(sequence.camera.matrix, K)
-
-
-def test_several_organs_are_named(tmp_path: Path) -> None:
-    write_unity(tmp_path / "UnityCam" / "Colon")
-    write_unity(tmp_path / "UnityCam" / "Small Intestine")
-    with pytest.raises(InputError, match=r"holds 2 sequences \(Colon, Small Intestine\)"):
-        open_sequence(tmp_path / "UnityCam")
 
 
 def test_equal_rotations_are_warned_of(tmp_path: Path) -> None:
@@ -258,25 +240,6 @@ def test_depth_of_another_kind_is_refused_and_missing_depth_is_none(tmp_path: Pa
             source.truth(number)
     assert source.truth(1).depth_mm is None
     np.testing.assert_array_equal(source.truth(3).depth_mm, 30)
-
-
-def test_unreadable_images_are_left_out_and_equal_numbers_refused(tmp_path: Path) -> None:
-    organ = write_unity(tmp_path / "UnityCam" / "Colon")
-    (organ / "Frames" / "image_0001.png").write_bytes(b"no picture")
-    sequence = open_sequence(organ)
-    assert [frame.index for frame in sequence.frames()] == [0, 2, 3]
-    assert any("image_0001.png cannot be read" in warning for warning in sequence.warnings)
-    save(organ / "Frames" / "image_2.png", picture(2, SIZE))
-    with pytest.raises(InputError, match="several images have the same number"):
-        open_sequence(organ)
-
-
-@pytest.mark.parametrize(("text", "message"), [("1,2,3", "holds 3 numbers"), ("46,0,400,0,46,40,0,0,1", "point 400")])
-def test_cam_txt_that_is_none_is_a_calibration_error(text: str, message: str, tmp_path: Path) -> None:
-    organ = write_unity(tmp_path / "UnityCam" / "Colon")
-    (organ.parent / "Calibration" / "cam.txt").write_text(text)
-    with pytest.raises(CalibrationError, match=message):
-        open_sequence(organ)
 
 
 # ---- real organs

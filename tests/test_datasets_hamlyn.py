@@ -10,11 +10,9 @@ import pytest
 from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
 from scopemap.masking.masker import Masker
 
@@ -73,12 +71,6 @@ def test_a_rectified_sequence(tmp_path: Path) -> None:
     assert any("no pose is known" in note for note in sequence.notes)
 
 
-def test_it_has_no_reference_trajectory(tmp_path: Path) -> None:
-    sequence = open_sequence(write_rectified(tmp_path))
-    assert sequence.source.pose(3) is None
-    assert reference_trajectory(sequence) is None
-
-
 @pytest.mark.parametrize(
     "place",
     [
@@ -109,34 +101,6 @@ def test_the_nearest_intrinsics_win(tmp_path: Path) -> None:
     assert sequence.source.truth(3).depth_mm[30, 30] == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize("form", MATRICES)
-def test_every_form_of_the_matrix_is_read(form: str, tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "K.txt", MATRICES[form])
-    np.testing.assert_allclose(read_calibration(tmp_path / "K.txt", SIZE).camera.central.matrix, K)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "holds 0 numbers"),
-        ("1 2 3", "holds 3 numbers"),
-        ("a b c", "none of the formats"),
-        ("70 0 400 0 70 30 0 0 1", "principal point 400, 30"),
-        ("0 0 40 0 70 30 0 0 1", "does not fit images of 80x64 px"),
-        ("70 0 40\n5 70 30\n0 0 1", "is no camera matrix"),
-        ("70 0 40\n0 70 30\n0 0 7", "is no camera matrix"),
-        ("nan 0 40 0 70 30 0 0 1", "NaN or infinity"),
-    ],
-)
-def test_intrinsics_that_are_none_are_one_sentence(text: str, message: str, tmp_path: Path) -> None:
-    folder = write_rectified(tmp_path)
-    (folder / "intrinsics.txt").write_text(text)
-    with pytest.raises(CalibrationError, match=message) as caught:
-        open_sequence(folder)
-    assert "\n" not in str(caught.value)
-    assert "intrinsics.txt" in str(caught.value)
-
-
 def test_without_intrinsics_the_camera_is_assumed_and_said(tmp_path: Path) -> None:
     sequence = open_sequence(write_images(tmp_path / "rectified05", [0, 1]))
     assert not sequence.calibrated
@@ -149,15 +113,6 @@ def test_the_root_of_one_sequence_leads_to_it_and_of_several_names_them(tmp_path
     write_images(tmp_path / "rectified04", [0, 1])
     with pytest.raises(InputError, match=r"holds 2 sequences \(rectified01, rectified04\); give one of them"):
         open_sequence(tmp_path)
-
-
-def test_depth_that_is_missing_is_none_and_of_8_bit_refused(tmp_path: Path) -> None:
-    folder = write_rectified(tmp_path)
-    (folder / "depth01" / "0000000004.png").unlink()
-    assert [truth is None for _, truth in open_sequence(folder)] == [False, True, False]
-    cv2.imwrite(str(folder / "depth01" / "0000000010.png"), depth_image().astype(np.uint8))
-    with pytest.raises(InputError, match=r"0000000010\.png: expected a depth image of one 16-bit channel"):
-        open_sequence(folder).source.truth(10)
 
 
 def test_black_side_bars_are_masked_without_being_asked_for(tmp_path: Path) -> None:
@@ -173,12 +128,6 @@ def test_black_side_bars_are_masked_without_being_asked_for(tmp_path: Path) -> N
     assert not masked[-1].valid[:, :27].any()
     assert not masked[-1].valid[:, -22:].any()
     assert masked[-1].valid[:, 33:92].mean() > 0.95
-
-
-def test_no_image_is_a_sentence(tmp_path: Path) -> None:
-    (tmp_path / "image01").mkdir()
-    with pytest.raises(InputError, match="there is no image"):
-        open_sequence(tmp_path, dataset="hamlyn")
 
 
 # ---- the trackers' test sequences

@@ -131,16 +131,6 @@ def test_without_truth_there_is_none(tmp_path: Path) -> None:
     assert "no pose is known: there is no poses_gt.txt" in sequence.notes
 
 
-def test_selected_frames_and_stamps_read_no_depth(tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    sequence = open_sequence(folder, frames=slice(1, 3))
-    for file in (folder / "depths").iterdir():
-        file.write_bytes(b"no image")
-    assert [frame.index for frame in sequence.frames()] == [9, 10]
-    assert sequence.source.stamps(sequence.selection) == [(9, pytest.approx(0.36)), (10, pytest.approx(0.4))]
-    assert reference_trajectory(sequence).indices.tolist() == [10]
-
-
 def test_a_calibration_beside_the_images_wins_with_its_depth_scale(tmp_path: Path) -> None:
     folder = write_oneslam(tmp_path / "colon")
     write_calibration(PinholeCamera(60.0, 61.0, 39.0, 33.0, *SIZE), folder / "camera.yaml", depth_scale_mm=0.002)
@@ -156,13 +146,6 @@ def test_without_a_rate_30_per_second_are_assumed_and_said(tmp_path: Path) -> No
     sequence = open_sequence(folder)
     assert [frame.time_s for frame in frames_of(sequence)] == pytest.approx([0.1, 0.3, 1 / 3, 0.8])
     assert any("frame number / 30 s (assumed" in note for note in sequence.notes)
-
-
-def test_names_sort_by_their_last_number(tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    (folder / "images" / "00000003.jpg").rename(folder / "images" / "z2_00000003.jpg")
-    sequence = open_sequence(folder)
-    assert [(f.index, number_in(f.rgb)) for f in frames_of(sequence)] == [(n, n) for n in NUMBERS]
 
 
 # ---- what is wrong with a folder
@@ -192,14 +175,6 @@ def test_a_calibration_that_is_none_is_one_sentence(stated: object, message: str
     assert "calibration.json" in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b'{"intrinsics": {"fx": 70,', b"\xff\xfe\x00", b"[" * 100_000])
-def test_a_calibration_that_breaks_off_is_refused(content: bytes, tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    (folder / "calibration.json").write_bytes(content)
-    with pytest.raises(CalibrationError, match=r"cannot read the calibration in .*calibration\.json"):
-        open_sequence(folder, dataset="oneslam")
-
-
 @pytest.mark.parametrize(
     "content", [b"", b"[1, 2]", b'{"FPS": 30}', b'{"intrinsics": ', b" " * (2 << 20), b"[" * 100_000]
 )
@@ -208,15 +183,6 @@ def test_another_calibration_json_is_not_taken_for_ours(content: bytes, tmp_path
     (folder / "calibration.json").write_bytes(content)
     sequence = open_sequence(folder)
     assert (sequence.source.name, sequence.path) == ("images", folder / "images")
-
-
-@pytest.mark.parametrize("content", [b"", b'{"intrinsics": {"fx": 900, "fy": 900, "cx": 40, "cy": 32}}'])
-def test_a_camera_that_is_given_stands_in_for_a_bad_one(content: bytes, tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    (folder / "calibration.json").write_bytes(content)
-    (tmp_path / "mine.txt").write_text("60 60 40 32")
-    sequence = open_sequence(folder, dataset="oneslam", camera=tmp_path / "mine.txt")
-    assert (sequence.camera.fx, sequence.source.truth(3).quality) == (60.0, "registered")
 
 
 @pytest.mark.parametrize("rate", [0, -25, "fast", [25], float("nan"), float("inf")])
@@ -271,17 +237,6 @@ def test_two_images_for_one_frame_and_images_without_a_number_are_refused(tmp_pa
         open_sequence(folder)
 
 
-def test_images_that_are_broken_or_of_another_size(tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    (folder / "images" / "00000009.jpg").write_bytes(b"no image")
-    sequence = open_sequence(folder)
-    assert [frame.index for frame in frames_of(sequence)] == [3, 10, 24]
-    assert any("00000009.jpg cannot be read and was left out" in warning for warning in sequence.warnings)
-    save(folder / "images" / "00000010.jpg", picture(10, (40, 32)))
-    with pytest.raises(InputError, match=r"00000010\.jpg: it is 40x32 px"):
-        frames_of(open_sequence(folder))
-
-
 def test_masks_and_depth_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     folder = write_oneslam(tmp_path / "colon")
     cv2.imwrite(str(folder / "depths" / "00000003.png"), np.full((32, 40), 500, np.uint16))
@@ -298,13 +253,3 @@ def test_masks_and_depth_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "mask.bmp"), np.full((20, 30), 255, np.uint8))
     with pytest.raises(InputError, match="found 30x20 px"):
         open_sequence(folder)
-
-
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
-    folder = write_oneslam(tmp_path / "colon")
-    (folder / "calibration.json").unlink()
-    assert open_sequence(folder).source.name == "images"
-    with pytest.raises(CalibrationError, match=r"cannot read the calibration in .*calibration\.json"):
-        open_sequence(folder, dataset="oneslam")
-    with pytest.raises(InputError, match="there is no image"):
-        open_sequence(folder / "depths", dataset="oneslam")

@@ -27,7 +27,7 @@ from drawn_scared import (
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError, InputError, ScopemapError
+from scopemap.errors import InputError, ScopemapError
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.datasets.scared import ScaredKeyframe
 from scopemap.io.opening import open_sequence
@@ -217,12 +217,6 @@ def test_no_permission_is_a_sentence(downloaded: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(ScaredKeyframe, "recognises", staticmethod(refuse))
     with pytest.raises(InputError, match="no permission to look into it"):
         open_sequence(downloaded)
-
-
-def test_a_calibration_error_names_the_file(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
-    with pytest.raises(CalibrationError, match=r"endoscope_calibration\.yaml cannot be used: it has no 3x3"):
-        open_sequence(keyframe)
 
 
 def test_unpacked_images_without_a_pose_are_left_out(keyframe: Path) -> None:

@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
 
 SIZE = (80, 64)
@@ -78,13 +75,6 @@ def test_an_experiment(truth: str, tmp_path: Path) -> None:
     assert sequence.warnings == []
     told = " ".join(sequence.notes)
     assert all(words in told for words in ("no video", "no pose is known", "the CT scan", truth))
-
-
-def test_it_has_no_reference_trajectory(tmp_path: Path) -> None:
-    sequence = open_sequence(write_experiment(tmp_path / "Experiment_1"))
-    assert sequence.source.stamps(slice(1, None)) == [(10, 10 / 30), (11, 11 / 30)]
-    assert sequence.source.pose(10) is None
-    assert reference_trajectory(sequence) is None
 
 
 @pytest.mark.parametrize("outer", ["", "SERV-CT", "SERV-CT/SERV-CT"])
@@ -168,15 +158,6 @@ def test_pictures_of_another_camera_are_brought_to_that_of_the_first(tmp_path: P
     assert any("1 pictures of other cameras" in note for note in sequence.notes)
 
 
-def test_a_calibration_of_ones_own_wins(tmp_path: Path) -> None:
-    folder = write_experiment(tmp_path / "Experiment_1")
-    write_calibration(PinholeCamera(77.0, 78.0, 40.0, 30.0, *SIZE), folder / "camera.yaml", depth_scale_mm=0.01)
-    (folder / "Rectified_calibration" / "010.json").write_text("damaged")
-    sequence = open_sequence(folder)
-    assert sequence.camera.fx == 77.0
-    assert sequence.source.truth(9).depth_mm[30, 30] == pytest.approx(0.01 * (256 * 59 + 64))
-
-
 def test_a_calibration_that_is_missing_is_that_of_the_first_and_said(tmp_path: Path) -> None:
     folder = write_experiment(tmp_path / "Experiment_1")
     (folder / "Rectified_calibration" / "009.json").unlink()
@@ -226,30 +207,6 @@ def test_a_calibration_that_is_none_is_one_sentence(text: str, message: str, tmp
 # ---- pictures and depth that are damaged
 
 
-def test_an_unreadable_picture_is_left_out(tmp_path: Path) -> None:
-    folder = write_experiment(tmp_path / "Experiment_1")
-    (folder / "Left_rectified" / "010.png").write_bytes(b"no picture")
-    sequence = open_sequence(folder)
-    assert [(frame.index, number_in(frame.rgb)) for frame, _ in sequence] == [(9, 9), (11, 11)]
-    assert any("010.png cannot be read" in warning for warning in sequence.warnings)
-
-
-def test_pictures_of_two_sizes_are_refused(tmp_path: Path) -> None:
-    folder = write_experiment(tmp_path / "Experiment_1")
-    save(folder / "Left_rectified" / "011.png", picture(11, (40, 32)))
-    with pytest.raises(InputError, match=r"011\.png: it is 40x32 px"):
-        list(open_sequence(folder))
-
-
-def test_depth_of_8_bit_or_damaged_is_refused(tmp_path: Path) -> None:
-    folder = write_experiment(tmp_path / "Experiment_1")
-    file = folder / "Ground_truth_CT" / "DepthL" / "010.png"
-    for content in (cv2.imencode(".png", np.full((64, 80), 9, np.uint8))[1].tobytes(), b"", b"damaged"):
-        file.write_bytes(content)
-        with pytest.raises(InputError, match=r"010\.png: expected a depth image of one 16-bit channel"):
-            open_sequence(folder).source.truth(10)
-
-
 def test_occlusions_of_another_size_or_damaged_are_refused(tmp_path: Path) -> None:
     folder = write_experiment(tmp_path / "Experiment_1")
     file = folder / "Ground_truth_CT" / "OcclusionL" / "010.png"
@@ -257,9 +214,3 @@ def test_occlusions_of_another_size_or_damaged_are_refused(tmp_path: Path) -> No
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"010\.png: expected an image of 80x64 px, the size of the depth"):
             open_sequence(folder).source.truth(10)
-
-
-def test_no_picture_is_a_sentence(tmp_path: Path) -> None:
-    (tmp_path / "Left_rectified").mkdir()
-    with pytest.raises(InputError, match="there is no image"):
-        open_sequence(tmp_path, dataset="serv-ct")

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 from drawn_inputs import number_in, picture, save
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
 
 SIZE = (95, 95)
@@ -116,17 +113,6 @@ def test_frames_sorted_by_number_keep_their_lines(tmp_path: Path) -> None:
     assert sequence.source.truth(2).depth_mm is None
 
 
-def test_poses_are_read_without_images_or_depth(tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    sequence = open_sequence(folder)
-    for file in folder.iterdir():
-        file.write_bytes(b"")
-    trajectory = reference_trajectory(sequence)
-    assert trajectory.indices.tolist() == [0, 1, 2, 3]
-    np.testing.assert_allclose(trajectory.times_s, np.arange(4) / 30)
-    np.testing.assert_allclose(trajectory.positions_mm[2], [-40, -55, 60])
-
-
 # ---- where it lies
 
 
@@ -177,15 +163,6 @@ def test_poses_of_another_trajectory_are_not_taken(tmp_path: Path) -> None:
 
 
 # ---- calibration and depth of other kinds
-
-
-def test_a_calibration_beside_the_frames_wins(tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    camera = PinholeCamera(60.0, 61.0, 40.0, 41.0, *SIZE)
-    write_calibration(camera, folder / "camera.yaml", depth_scale_mm=0.001)
-    sequence = open_sequence(folder)
-    assert sequence.camera == camera
-    assert sequence.source.truth(0).depth_mm[15, 0] == pytest.approx(32.64)
 
 
 def test_without_cam_txt_the_camera_is_assumed_and_said(tmp_path: Path) -> None:
@@ -252,44 +229,3 @@ def test_fewer_lines_than_images_and_binary_poses(tmp_path: Path) -> None:
     (tmp_path / "SavedPosition_S1.txt").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match=r"SavedPosition_S1\.txt"):
         open_sequence(folder)
-
-
-def test_two_images_of_one_number_are_refused(tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    save(folder / "FrameBuffer_1.png", picture(1, SIZE))
-    with pytest.raises(InputError, match="several images have the same number"):
-        open_sequence(folder)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("1 2 3", "holds 3 numbers"), ("45 0 500 0 45 47 0 0 1", "principal point 500"), ("f", "none of the formats")],
-)
-def test_cam_txt_that_is_none_is_a_calibration_error(text: str, message: str, tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    (tmp_path / "cam.txt").write_text(text)
-    with pytest.raises(CalibrationError, match=message):
-        open_sequence(folder)
-
-
-def test_depth_of_another_kind_is_refused_and_missing_depth_is_none(tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    cv2.imwrite(str(folder / "Depth_0000.png"), np.zeros((95, 95, 3), np.uint8))
-    (folder / "Depth_0001.png").unlink()
-    (folder / "Depth_0002.png").write_bytes((folder / "Depth_0003.png").read_bytes()[:30])
-    source = open_sequence(folder).source
-    for number in (0, 2):
-        with pytest.raises(InputError, match=rf"Depth_000{number}\.png: expected a depth image"):
-            source.truth(number)
-    assert source.truth(1).depth_mm is None
-
-
-def test_unreadable_images_are_left_out_and_other_sizes_refused(tmp_path: Path) -> None:
-    folder = write_simcol(tmp_path)
-    (folder / "FrameBuffer_0001.png").write_bytes(b"no picture")
-    sequence = open_sequence(folder)
-    assert [frame.index for frame in sequence.frames()] == [0, 2, 3]
-    assert any(r"FrameBuffer_0001.png cannot be read" in warning for warning in sequence.warnings)
-    save(folder / "FrameBuffer_0003.png", picture(3, (80, 80)))
-    with pytest.raises(InputError, match="80x80 px"):
-        list(sequence.frames())

@@ -108,28 +108,6 @@ def test_selected_frames_keep_number_and_stamp(tmp_path: Path) -> None:
     np.testing.assert_allclose(reference.positions_mm, [[100, 2000, -500], [300, 2000, -500]], atol=1e-7)
 
 
-def test_poses_and_stamps_read_no_image_and_no_depth(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / ROOM)
-    sequence = open_sequence(folder)
-    for file in [*(folder / "rgb").iterdir(), *(folder / "depth").iterdir()]:
-        file.unlink()
-    assert len(reference_trajectory(sequence)) == 4
-
-
-def test_without_truth_there_is_none(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / ROOM)
-    (folder / "groundtruth.txt").unlink()
-    sequence = open_sequence(folder)
-    assert sequence.source.pose(0) is None
-    assert sequence.source.truth(0).T_world_camera is None
-    assert "no pose is known: there is no groundtruth.txt" in sequence.notes
-    (folder / "depth.txt").unlink()
-    sequence = open_sequence(folder)
-    assert sequence.source.name == "tum"
-    assert [truth for _, truth in sequence] == [None] * 4
-    assert reference_trajectory(sequence) is None
-
-
 # ---- cameras
 
 
@@ -300,39 +278,12 @@ def test_rows_that_are_none_are_named(file: str, line: str, message: str, tmp_pa
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("file", "content", "message"),
-    [
-        ("rgb.txt", b"# nothing\n", "it names no image"),
-        ("rgb.txt", b"1.0 rgb/none.png\n2.0 rgb/nor-this.png\n", "none of the 2 images that it names is there"),
-        ("rgb.txt", b"1.0 " + b"x" * 300 + b".png\n", "none of the 1 images"),
-        ("rgb.txt", b"1.0 rgb/\0.png\n", "none of the 1 images"),
-        ("rgb.txt", b"\xff\xfe\x00", "cannot read"),
-        ("depth.txt", b"", "it names no image"),
-        ("groundtruth.txt", b"", "it holds no pose"),
-        ("groundtruth.txt", b"\xff\xfe\x00", "groundtruth.txt"),
-    ],
-)
-def test_files_that_hold_nothing_are_named(file: str, content: bytes, message: str, tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / ROOM)
-    (folder / file).write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        open_sequence(folder)
-
-
 def test_a_colour_image_with_two_depths_is_refused(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / ROOM)
     colour = f"rgb/{STAMPS[2]:.6f}.png"
     (folder / "associations.txt").write_text(f"1.0 {colour} 2.0 depth/a.png\n1.0 {colour} 2.0 depth/b.png\n")
     with pytest.raises(InputError, match=r"line 2: .* has another depth image in an earlier line"):
         open_sequence(folder)
-
-
-def test_depth_of_8_bit_is_refused(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / ROOM)
-    cv2.imwrite(str(folder / f"depth/{STAMPS[0] + 0.005:.6f}.png"), np.full((48, 64), 90, np.uint8))
-    with pytest.raises(InputError, match="one 16-bit channel"):
-        open_sequence(folder).source.truth(0)
 
 
 def test_folders_of_others_are_left_to_them(tmp_path: Path) -> None:
