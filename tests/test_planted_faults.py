@@ -233,7 +233,7 @@ FAULTS: dict[str, Fault] = {
     "a text named as a stream": Fault(partial(_spoil_stream, lambda data: b"text\n"), UNREAD, _streamed),
     "all pictures but one cut off": Fault(_spoil_most, ("frame-few", *UNREAD), _stored_alone),
     "one picture alone": Fault(_only_one, ("frame-few", "refused")),
-    "a picture of another size": Fault(_smaller, ("reading-stopped", "refused"), _sized, named=0),
+    "a picture of another size": Fault(_smaller, ("reading-stopped", "refused", "frame-unreadable"), _sized, named=0),
     "a picture missing": Fault(_leave_out, ("number-gap", "time-irregular", "refused", "source")),
     "a number twice": Fault(_number_again, ("number-repeated", "refused"), _numbered),
     "a picture repeated": Fault(_same_as_before, ("frame-repeated",), named=0),
