@@ -22,7 +22,7 @@ from scopemap.calibration.targets import (
     nearest_px,
     other_target_seen,
 )
-from scopemap.calibration.views import Search, View, edge_width_px, select_views
+from scopemap.calibration.views import Search, BoardView, edge_width_px, select_views
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError
@@ -40,7 +40,7 @@ def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
         if corners is None:
             search.without.append(grey)
         else:
-            search.views.append(View(index, f"{index}.png", corners, edge_width_px(grey, corners.pixels), corners))
+            search.views.append(BoardView(index, f"{index}.png", corners, edge_width_px(grey, corners.pixels), corners))
     return search
 
 
@@ -120,7 +120,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
             # By so much the plate bends from view to view: errors of the corners of one view are alike.
             pixels = studio.corners_px(pose, bow_mm=rng.normal(0, 0.05))
             corners = Corners(CHECKERBOARD.corners_mm, pixels + rng.normal(0, 0.05, pixels.shape))
-            views.append(View(i, "", corners, 1.0, corners))
+            views.append(BoardView(i, "", corners, 1.0, corners))
         fit = with_deviations(fit_camera(views, SIZE, form, near=PINHOLE), views)
         off = np.array(list(fit.parameters.values())) - true
         shares.append(off / np.array(list(fit.deviations.values())))
@@ -211,7 +211,7 @@ def test_a_still_board_is_refused(pinhole_search: Search) -> None:
         calibrate(still, CHECKERBOARD)
 
 
-def replace_views(search: Search, views: list[View]) -> Search:
+def replace_views(search: Search, views: list[BoardView]) -> Search:
     return replace(search, views=views, looked_at=len(views))
 
 

@@ -16,8 +16,7 @@ from scopemap.config.mapping import FusionAdvanced
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.tsdf_parameters import choose_parameters
-from scopemap.fusion.volume import SurfaceFusion, TsdfVolume
+from scopemap.fusion.volume import SurfaceFusion, TsdfVolume, choose_parameters
 
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 

@@ -195,6 +195,51 @@ def test_copyleft_tools_are_not_imported() -> None:
     _none([module.at(node) for module, node in names])
 
 
+def _module_names() -> dict[str, _Module]:
+    def dotted(module: _Module) -> str:
+        return "scopemap." + module.name.removesuffix(".py").replace("/", ".")
+
+    return {dotted(module).removesuffix(".__init__"): module for module in MODULES}
+
+
+def _dependencies(name: str, modules: dict[str, _Module]) -> set[str]:
+    """The modules that a module imports, also inside functions; the root package imports its names when asked."""
+    found = set()
+    for node in ast.walk(modules[name].tree) if name != "scopemap" else ():
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & set(modules)
+            found |= inner or {str(node.module)}
+    return (found & set(modules)) - {name}
+
+
+def import_closure(start: str) -> set[str]:
+    """All modules of scopemap that importing and using one of them can import, packages included."""
+    modules, found, left = _module_names(), set[str](), {start}
+    while left:
+        name = left.pop()
+        found.add(name)
+        parents = {name.rsplit(".", depth)[0] for depth in range(1, name.count(".") + 1)}
+        left |= (_dependencies(name, modules) | parents) - found
+    return found
+
+
+def test_the_pipeline_imports_few_modules() -> None:
+    closure = import_closure("scopemap.pipeline")
+    assert "scopemap.mapping.backend" in closure
+    assert len(closure) <= 60, "\n".join(sorted(closure))
+
+
+def test_no_import_circles() -> None:
+    modules = _module_names()
+    left = {name: _dependencies(name, modules) for name in modules}
+    while leaves := [name for name, needed in left.items() if not needed & set(left)]:
+        for name in leaves:
+            del left[name]
+    _none([f"{name} imports {', '.join(sorted(needed & set(left)))}" for name, needed in left.items()])
+
+
 # ---- names and words
 
 

@@ -11,9 +11,8 @@ import pytest
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
 from scopemap.config.input import MaskAdvanced
-from scopemap.frame import Frame
+from scopemap.frame import Frame, is_constant
 from scopemap.io.opening import open_sequence
-from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.masking.masker import Masker
 
 SETTINGS = MaskSettings()

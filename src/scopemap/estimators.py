@@ -7,9 +7,9 @@ import math
 from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.create import create_anchor, create_depth, files_folder
-from scopemap.depth.estimate import DepthEstimator
+from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.depth.files import FilesDepth
-from scopemap.depth.perceptual import PerceptualDistance, create_perceptual
+from scopemap.depth.perceptual import create_perceptual
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.io.sequence import Sequence

@@ -8,11 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 
+_CONSTANT_RANGE = 4
+# Width of the box filter that leaves little of a sensor's noise.
+_NOISE_WIDTH_PX = 9
 TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "predicted"]
 
 
@@ -96,3 +100,10 @@ class Truth:
     T_world_camera: np.ndarray | None = None
     depth_mm: np.ndarray | None = None
     quality: TruthQuality = "exact"
+
+
+def is_constant(rgb: np.ndarray) -> bool:
+    """Return whether an image (H, W, 3) uint8 is black or of one colour, up to noise."""
+    smooth = cv2.blur(rgb, (_NOISE_WIDTH_PX, _NOISE_WIDTH_PX))
+    low, high = np.percentile(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
+    return bool(high - low <= _CONSTANT_RANGE)

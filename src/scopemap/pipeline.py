@@ -18,17 +18,15 @@ import numpy as np
 
 from scopemap.config import Config
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.correspondence import DenseCorrespondence, FrameMatcher
-from scopemap.depth.estimate import DepthEstimator, DepthKind
+from scopemap.depth.correspondence import DenseCorrespondence, DenseMatcher
+from scopemap.depth.estimate import DepthEstimator, DepthKind, PerceptualDistance
 from scopemap.depth.mapis import Mapis, RefinedDepth
-from scopemap.depth.perceptual import PerceptualDistance
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
 from scopemap.mapping.submaps import Mapper, Submap
-from scopemap.masking.mask_files import MaskFiles
-from scopemap.masking.masker import Masker
+from scopemap.masking.masker import Masker, StoredMasks
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.tracking.tracker import Tracker
@@ -44,7 +42,7 @@ class Estimators:
     corner_flow: FlowEstimator
     keyframe_flow: FlowEstimator
     perceptual: PerceptualDistance
-    masks: MaskFiles | None = None
+    masks: StoredMasks | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ class Pipeline:
         # Frames that are fused at once cannot be sorted into submaps.
         tracking = config.tracking.model_copy(update={"new_map_after": 0} if self.fusion.at_once else {})
         self._masker = Masker(config.mask, estimators.masks)
-        self._matcher = FrameMatcher(config.mapis, estimators.flow, estimators.perceptual)
+        self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._tracker = tracker or Tracker(tracking, estimators.corner_flow)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)

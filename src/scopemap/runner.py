@@ -24,11 +24,10 @@ from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
 from scopemap.estimators import create_estimators, estimators_provenance, largest_depth_mm
-from scopemap.frame import Frame
+from scopemap.frame import Frame, is_constant
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of

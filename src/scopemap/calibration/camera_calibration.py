@@ -20,7 +20,7 @@ from scopemap.calibration.intrinsics import (
     without_outliers,
 )
 from scopemap.calibration.targets import Target, other_target_seen
-from scopemap.calibration.views import LeftOut, Search, View, select_views, views_per_pixel
+from scopemap.calibration.views import LeftOut, Search, BoardView, select_views, views_per_pixel
 from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
@@ -50,7 +50,7 @@ class CameraCalibration:
     """
 
     fit: Fit
-    views: list[View]
+    views: list[BoardView]
     held_out_px: dict[LensForm, float]
     left_out: list[LeftOut]
     blurred: list[LeftOut]
@@ -64,7 +64,7 @@ class CameraCalibration:
         return sum(len(view.found) - len(view.corners) for view in self.views)
 
     @property
-    def example(self) -> View:
+    def example(self) -> BoardView:
         """The view with most corners found, of these the largest: to be shown."""
         return max(self.views, key=lambda view: (len(view.found), float(np.prod(np.ptp(view.found.pixels, 0)))))
 
@@ -201,7 +201,7 @@ def _too_few(found: str, advice: str) -> InputError:
     return InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")
 
 
-def _flexible_fits(views: list[View], size: tuple[int, int], forms: list[LensForm]) -> dict[str, Fit]:
+def _flexible_fits(views: list[BoardView], size: tuple[int, int], forms: list[LensForm]) -> dict[str, Fit]:
     """Return the fit with most coefficients by model; `CalibrationError` where neither model fits."""
     fits: dict[str, Fit] = {}
     for model, form in {form.model: form for form in forms}.items():

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from scopemap.calibration.targets import Corners
-from scopemap.calibration.views import LeftOut, View
+from scopemap.calibration.views import LeftOut, BoardView
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
@@ -96,7 +96,7 @@ class Fit:
         return {name: float(known[name]) for name in ("fx", "fy", "cx", "cy", *self.form.terms)}
 
 
-def fit_camera(views: list[View], size: tuple[int, int], form: LensForm, near: CameraModel | None = None) -> Fit:
+def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel | None = None) -> Fit:
     """Return the camera of `form` for frames of `size` (width, height) with the smallest reprojection error.
 
     `near` is a camera to start from, else several starts are tried. Raises `CalibrationError` where none converges.
@@ -117,7 +117,7 @@ def fit_camera(views: list[View], size: tuple[int, int], form: LensForm, near: C
     return best
 
 
-def with_deviations(fit: Fit, views: list[View]) -> Fit:
+def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
     """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to views drawn anew, 20 of them.
 
     OpenCV's own standard deviations follow from the noise of single corners and are too small by a factor of 2.3 where
@@ -148,7 +148,7 @@ def choose_form(errors_px: dict[LensForm, float]) -> LensForm:
     return best
 
 
-def held_out_error_px(views: list[View], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
+def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
     """Return the RMS reprojection error, px, in views that the form was not fitted to (5 folds); inf: a fit failed.
 
     In these only the pose of the target is fitted. `near` is a camera of the same model to start from.
@@ -166,7 +166,7 @@ def held_out_error_px(views: list[View], size: tuple[int, int], form: LensForm, 
         return np.inf
 
 
-def without_outliers(views: list[View], size: tuple[int, int], form: LensForm) -> tuple[list[View], list[LeftOut]]:
+def without_outliers(views: list[BoardView], size: tuple[int, int], form: LensForm) -> tuple[list[BoardView], list[LeftOut]]:
     """Return the views that agree on a camera of `form`, without stray corners, and those that do not: a third at most.
 
     As long as the error of the worst view is far from what is usual, it is left out, or up to a tenth of its corners
@@ -196,7 +196,7 @@ def without_outliers(views: list[View], size: tuple[int, int], form: LensForm) -
     return [view for view in kept if len(view.corners) >= _FEWEST_CORNERS], out
 
 
-def _without_worst_corners(view: View, camera: CameraModel, T: np.ndarray, limit_px: float) -> View | None:
+def _without_worst_corners(view: BoardView, camera: CameraModel, T: np.ndarray, limit_px: float) -> BoardView | None:
     """Return the view without the corners that keep it from `limit_px`, None where these are more than a tenth."""
     corners = view.corners
     for _ in range(len(corners) // 10):
@@ -207,7 +207,7 @@ def _without_worst_corners(view: View, camera: CameraModel, T: np.ndarray, limit
     return None
 
 
-def _attempt(views: list[View], size: tuple[int, int], form: LensForm, start: PinholeCamera | None) -> Fit | None:
+def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, start: PinholeCamera | None) -> Fit | None:
     """Return OpenCV's fit from `start`, None: its own guess; None where it fails."""
     boards = [view.corners.board_mm.astype(np.float32)[:, None] for view in views]
     pixels = [view.corners.pixels.astype(np.float32)[:, None] for view in views]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scopemap.calibration.camera_calibration import CameraCalibration
-from scopemap.calibration.views import View, views_per_pixel
+from scopemap.calibration.views import BoardView, views_per_pixel
 from scopemap.errors import InputError
 from scopemap.report.canvas import headline, new_figure
 
@@ -48,7 +48,7 @@ def draw_calibration(calibration: CameraCalibration, example: np.ndarray, file: 
         raise InputError(f"drawing the calibration into {file}: {error}") from None
 
 
-def _draw_example(axes: Axes, view: View, frame: np.ndarray) -> None:
+def _draw_example(axes: Axes, view: BoardView, frame: np.ndarray) -> None:
     axes.imshow(frame)
     axes.plot(*view.found.pixels.T, "x", color="#ff3030", markersize=7)
     axes.plot(*view.corners.pixels.T, "o", color="#00ff55", markersize=8, fillstyle="none")

@@ -27,7 +27,7 @@ Listener = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """The target in one frame.
 
     Attributes
@@ -61,7 +61,7 @@ class Search:
     selection: slice = field(default_factory=lambda: slice(None))
     every: int = 1
     looked_at: int = 0
-    views: list[View] = field(default_factory=list)
+    views: list[BoardView] = field(default_factory=list)
     without: list[np.ndarray] = field(default_factory=list)
 
 
@@ -69,7 +69,7 @@ class Search:
 class LeftOut:
     """A view that was not used, and why."""
 
-    view: View
+    view: BoardView
     reason: str
 
 
@@ -77,7 +77,7 @@ class LeftOut:
 class Selected:
     """Views to calibrate with; those that were blurred; the number of those like a selected one."""
 
-    views: list[View]
+    views: list[BoardView]
     blurred: list[LeftOut]
     alike: int
 
@@ -108,7 +108,7 @@ def find_views(
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = target.find(grey)
         if corners is not None:
-            search.views.append(View(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels), corners))
+            search.views.append(BoardView(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels), corners))
         else:
             missed += 1
             if missed & (missed - 1) == 0:  # the 1st, 2nd, 4th, 8th ...: few, from all parts of a long video
@@ -119,7 +119,7 @@ def find_views(
     return search
 
 
-def image_of(view: View, source: Source, search: Search) -> np.ndarray:
+def image_of(view: BoardView, source: Source, search: Search) -> np.ndarray:
     """Return the frame (h, w, 3) uint8 of a view that `search` found in `source`, read anew."""
     for frame in source.frames(search.selection):
         if frame.index == view.index:
@@ -139,7 +139,7 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(np.median(widths))
 
 
-def select_views(views: list[View], size: tuple[int, int], most: int = _MOST_VIEWS) -> Selected:
+def select_views(views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS) -> Selected:
     """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, best first.
 
     The next view is the one with most new cells of the image under its corners and the greatest distance, in position,
@@ -171,7 +171,7 @@ def select_views(views: list[View], size: tuple[int, int], most: int = _MOST_VIE
     return Selected([sharp[i] for i in chosen], blurred, len(sharp) - len(chosen))
 
 
-def views_per_pixel(views: list[View], size: tuple[int, int], across: int = 160) -> np.ndarray:
+def views_per_pixel(views: list[BoardView], size: tuple[int, int], across: int = 160) -> np.ndarray:
     """Return how many views have a pixel within their corners: (h, w) int, the image on a grid `across` wide."""
     scale = across / size[0]
     count = np.zeros((max(1, round(size[1] * scale)), across), dtype=int)
@@ -181,7 +181,7 @@ def views_per_pixel(views: list[View], size: tuple[int, int], across: int = 160)
     return count
 
 
-def _pose(view: View, size: tuple[int, int]) -> np.ndarray:
+def _pose(view: BoardView, size: tuple[int, int]) -> np.ndarray:
     """Position (2), log size and tilt (2) of the target, all about 1 at most, from the homography to the image."""
     board, pixels = view.corners.board_mm[:, :2], view.corners.pixels
     centre, extent = board.mean(axis=0), float(np.linalg.norm(np.ptp(board, axis=0)))
@@ -197,7 +197,7 @@ def _pose(view: View, size: tuple[int, int]) -> np.ndarray:
     return np.array([*H[:2, 2], log_size, *tilt])
 
 
-def _cells(view: View, size: tuple[int, int]) -> np.ndarray:
+def _cells(view: BoardView, size: tuple[int, int]) -> np.ndarray:
     """Which cells of a grid over the image hold a corner, flat bool."""
     side = size[0] / _CELLS_ACROSS
     covered = np.zeros((max(1, round(size[1] / side)), _CELLS_ACROSS), dtype=bool)

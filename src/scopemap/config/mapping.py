@@ -54,7 +54,7 @@ class FusionAdvanced(Settings):
 
 
 class FusionSettings(Settings):
-    """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.tsdf_parameters`."""
+    """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.volume`."""
 
     enabled: bool = Field(True, description="false: no mesh")
     voxel_mm: float | None = Field(

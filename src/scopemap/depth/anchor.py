@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
-from scopemap.depth.power_law import apply_power_law, ray_lengths
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError, SettingsError, check_shape
 from scopemap.frame import Frame
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
@@ -229,6 +229,22 @@ class AnchoredDepth:
 def max_depth_mm(settings: DepthSettings) -> float:
     """Return the largest valid predicted depth, mm: `settings.max_depth_mm`, or the far end of near-far if larger."""
     return max(settings.max_depth_mm, *(settings.near_far_mm or (0.0,)))
+
+
+def apply_power_law(depth_mm: np.ndarray, camera: PinholeCamera, exponent: float, pivot_mm: float) -> np.ndarray:
+    """Return depth (H, W) float32 after the power law pivot * (r / pivot)^exponent on the distance r along the ray.
+
+    depth_mm : (H, W), NaN = unknown; values <= 0 become NaN. pivot_mm : distance that the law keeps, same unit.
+    """
+    check_shape("depth_mm", depth_mm, (camera.height, camera.width))
+    along = ray_lengths(camera)
+    distance = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) * along
+    return (pivot_mm * (distance / pivot_mm) ** exponent / along).astype(np.float32)
+
+
+def ray_lengths(camera: PinholeCamera) -> np.ndarray:
+    """Return the ratio of distance along the ray to depth, (H, W) float32, at least 1."""
+    return np.linalg.norm(camera.rays, axis=-1)
 
 
 def _check_range(settings: DepthSettings) -> None:

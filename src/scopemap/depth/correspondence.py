@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap.config import MapisSettings
-from scopemap.depth.perceptual import PerceptualDistance
+from scopemap.depth.estimate import PerceptualDistance
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Correspondences2D3D, Frame
@@ -31,7 +31,7 @@ class DenseCorrespondence:
     usable_share: float = 1.0
 
 
-class FrameMatcher:
+class DenseMatcher:
     """Matches masked frames, in order, with the previous one."""
 
     def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:

@@ -1,4 +1,4 @@
-"""The interface of depth estimators and the type that they return."""
+"""The contracts of depth estimators and of perceptual distances."""
 
 from __future__ import annotations
 
@@ -45,6 +45,34 @@ class DepthEstimator(Protocol):
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the estimate for a frame, of the frame's size."""
+        ...
+
+    def provenance(self) -> dict[str, str]:
+        """Return what the result depends on, as text: names, versions, hashes."""
+        ...
+
+
+@dataclass(frozen=True)
+class PerceptualResult:
+    """How different two images look.
+
+    Attributes
+    ----------
+    map : (H, W) float32 >= 0, the distance around each pixel; 0 = alike.
+    score : the distance of the whole images, the mean of `map`.
+    """
+
+    map: np.ndarray
+    score: float
+
+
+class PerceptualDistance(Protocol):
+    """Distance between two images as people see them."""
+
+    name: str
+
+    def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
+        """Compare two (H, W, 3) uint8 images of one size; the order does not matter."""
         ...
 
     def provenance(self) -> dict[str, str]:

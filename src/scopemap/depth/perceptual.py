@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from scopemap.depth.estimate import PerceptualDistance, PerceptualResult
 from scopemap.errors import SettingsError, WeightsError, check_shape
 from scopemap.io import weights
 from scopemap.io.device import choose_device
@@ -25,34 +24,6 @@ CHECKPOINTS = ("alexnet", "alexnet-features")
 
 # lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
 _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
-
-
-@dataclass(frozen=True)
-class PerceptualResult:
-    """How different two images look.
-
-    Attributes
-    ----------
-    map : (H, W) float32 >= 0, the distance around each pixel; 0 = alike.
-    score : the distance of the whole images, the mean of `map`.
-    """
-
-    map: np.ndarray
-    score: float
-
-
-class PerceptualDistance(Protocol):
-    """Distance between two images as people see them."""
-
-    name: str
-
-    def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
-        """Compare two (H, W, 3) uint8 images of one size; the order does not matter."""
-        ...
-
-    def provenance(self) -> dict[str, str]:
-        """Return what the result depends on, as text: names, versions, hashes."""
-        ...
 
 
 def create_perceptual(name: str = "auto", device: str = "auto") -> PerceptualDistance:

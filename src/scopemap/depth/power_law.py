@@ -23,6 +23,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
+from scopemap.depth.anchor import apply_power_law, ray_lengths
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
 from scopemap.errors import check_shape
 from scopemap.flow.consistency import pair_flow
@@ -132,22 +133,6 @@ class _Sample:
         moved = points @ so3_exp(unknowns[:3]).T + unknowns[3:6]
         moved[:, 2] = np.maximum(moved[:, 2], _MIN_Z)
         return self.camera.project(moved)
-
-
-def apply_power_law(depth_mm: np.ndarray, camera: PinholeCamera, exponent: float, pivot_mm: float) -> np.ndarray:
-    """Return depth (H, W) float32 after the power law pivot * (r / pivot)^exponent on the distance r along the ray.
-
-    depth_mm : (H, W), NaN = unknown; values <= 0 become NaN. pivot_mm : distance that the law keeps, same unit.
-    """
-    check_shape("depth_mm", depth_mm, (camera.height, camera.width))
-    along = ray_lengths(camera)
-    distance = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) * along
-    return (pivot_mm * (distance / pivot_mm) ** exponent / along).astype(np.float32)
-
-
-def ray_lengths(camera: PinholeCamera) -> np.ndarray:
-    """Return the ratio of distance along the ray to depth, (H, W) float32, at least 1."""
-    return np.linalg.norm(camera.rays, axis=-1)
 
 
 def fit_exponent(sequence: Sequence, config: Config, estimator: DepthEstimator) -> ExponentFit:

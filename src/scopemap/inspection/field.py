@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.inspection.clip import VideoFinding
 from scopemap.inspection.frame_measures import InspectedFrame
-from scopemap.masking.field_of_view import hull_of_largest
+from scopemap.masking.masker import hull_of_largest
 
 Shape = Literal["full", "bars", "circle", "cut corners", "rounded corners"]
 Box = tuple[float, float, float, float]

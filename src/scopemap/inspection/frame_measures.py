@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
-from scopemap.frame import Frame
-from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, is_constant, mean_difference
-from scopemap.masking.field_of_view import FieldOfView
-from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, Masker, is_lit, specular
+from scopemap.frame import Frame, is_constant
+from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, mean_difference
+from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, FieldOfView, Masker, is_lit, specular
 from scopemap.tracking.sharpness import detail_of
 
 SMALL_PX = 320

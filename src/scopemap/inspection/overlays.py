@@ -9,7 +9,7 @@ import numpy as np
 
 from scopemap.inspection.clip import VideoFinding
 from scopemap.inspection.frame_measures import InspectedFrame
-from scopemap.masking.field_of_view import hull_of_largest
+from scopemap.masking.masker import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
 
 _MARGIN_SHARE, _NEAR_PX, _BLACK_PX = 0.02, 3, 9

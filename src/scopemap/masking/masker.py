@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
-from scopemap.frame import Frame
-from scopemap.io.video_format.redundant_frames import is_constant
-from scopemap.masking.field_of_view import FieldOfView
-from scopemap.masking.mask_files import MaskFiles
+from scopemap.frame import Frame, is_constant
 from scopemap.masking.overlays import OverlayFinder
 
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
@@ -25,6 +23,67 @@ _HIGHLIGHT_GROW_PX = 2
 BORDER_PX = 3
 # Width of the mean that leaves little of a sensor's noise.
 _CALM_WIDTH_PX = 5
+_MIN_FIELD_SHARE = 0.05
+
+
+class FieldOfView:
+    """The convex hull (circle, octagon and rectangle are convex) of the largest area that was lit in any frame so far.
+
+    Dark tissue in the lumen is thus not taken for the surround. border_px : by which the hull is shrunk, from pixels
+    that the rectification could not fill too, but not from the image's own edge.
+    """
+
+    def __init__(self, border_px: int) -> None:
+        self._border_px = border_px
+        self._lit: np.ndarray | None = None
+        self._field: np.ndarray | None = None
+
+    def __call__(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:
+        """Return the field of view, (H, W) bool, and learn from this frame.
+
+        lit : (H, W) bool, as `masking.is_lit` has it. rectified : (H, W) bool, which pixels show anything.
+        """
+        # Single bright pixels are noise of the coding in the black surround.
+        lit = cv2.morphologyEx((lit & rectified).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+        known = self._lit
+        if known is not None and self._field is not None and known.shape == lit.shape:
+            if not (lit & ~known).any():
+                return self._field
+            lit |= known
+        self._lit = lit
+        side = 2 * self._border_px + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        self._field = cv2.erode((hull_of_largest(lit) & rectified).astype(np.uint8), disc).astype(bool)
+        return self._field
+
+
+def hull_of_largest(lit: np.ndarray) -> np.ndarray:
+    """Return the convex hull, (H, W) bool, of the largest component; all of the image where that is hardly anything."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8))
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    if areas.size == 0 or areas.max() < _MIN_FIELD_SHARE * lit.size:
+        return np.ones_like(lit)
+    component = (labels == 1 + int(np.argmax(areas))).astype(np.uint8)
+    contours, _ = cv2.findContours(component, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = cv2.convexHull(np.concatenate(contours))
+    return cv2.fillConvexPoly(np.zeros_like(component), hull, 1).astype(bool)
+
+
+class StoredMasks(Protocol):
+    """Masks of pixels that show no tissue, made by others: `mask_files.MaskFiles`."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings about the masks that were asked for so far."""
+        ...
+
+    def covered(self, index: int) -> np.ndarray | None:
+        """Return the masked pixels of a frame, (H, W) bool; None without a mask."""
+        ...
+
+    def provenance(self) -> dict[str, str]:
+        """Return the origin of the masks."""
+        ...
 
 
 class Masker:
@@ -33,7 +92,7 @@ class Masker:
     files : masks of pixels that show no tissue, or None.
     """
 
-    def __init__(self, settings: MaskSettings, files: MaskFiles | None = None) -> None:
+    def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView(BORDER_PX)
         self._overlays = OverlayFinder() if settings.overlays else None

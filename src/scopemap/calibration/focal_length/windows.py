@@ -12,9 +12,8 @@ from scopemap.cameras.rectification import Rectifier, working_camera, working_si
 from scopemap.config import Config
 from scopemap.flow.corners import corners, followed
 from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
+from scopemap.frame import Frame, is_constant
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.redundant_frames import is_constant
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 

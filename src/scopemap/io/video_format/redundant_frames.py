@@ -7,8 +7,9 @@ differences then add up until they count.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
+
+from scopemap.frame import is_constant
 
 LEAST_DIFFERENCE = 0.5
 """Mean absolute difference below which a frame repeats another, grey levels of 255: what lossy coding leaves."""
@@ -16,16 +17,6 @@ LEAST_DIFFERENCE = 0.5
 # Black borders are the same in all frames: they are not compared.
 _BLACK_LEVEL = 16
 _LONGEST_SIDE_PX = 480
-_CONSTANT_RANGE = 4
-# Width of the box filter that leaves little of a sensor's noise.
-_NOISE_WIDTH_PX = 9
-
-
-def is_constant(rgb: np.ndarray) -> bool:
-    """Return whether an image (H, W, 3) uint8 is black or of one colour, up to noise."""
-    smooth = cv2.blur(rgb, (_NOISE_WIDTH_PX, _NOISE_WIDTH_PX))
-    low, high = np.percentile(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
-    return bool(high - low <= _CONSTANT_RANGE)
 
 
 def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
