@@ -22,7 +22,7 @@ from scopemap.calibration.targets import (
     nearest_px,
     other_target_seen,
 )
-from scopemap.calibration.views import Search, BoardView, edge_width_px, select_views
+from scopemap.calibration.views import BoardView, Search, edge_width_px, select_views
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError
@@ -40,7 +40,8 @@ def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
         if corners is None:
             search.without.append(grey)
         else:
-            search.views.append(BoardView(index, f"{index}.png", corners, edge_width_px(grey, corners.pixels), corners))
+            width_px = edge_width_px(grey, corners.pixels)
+            search.views.append(BoardView(index, f"{index}.png", corners, width_px, corners))
     return search
 
 

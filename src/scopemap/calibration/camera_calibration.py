@@ -20,7 +20,7 @@ from scopemap.calibration.intrinsics import (
     without_outliers,
 )
 from scopemap.calibration.targets import Target, other_target_seen
-from scopemap.calibration.views import LeftOut, Search, BoardView, select_views, views_per_pixel
+from scopemap.calibration.views import BoardView, LeftOut, Search, select_views, views_per_pixel
 from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from scopemap.calibration.targets import Corners
-from scopemap.calibration.views import LeftOut, BoardView
+from scopemap.calibration.views import BoardView, LeftOut
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError

@@ -108,7 +108,8 @@ def find_views(
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = target.find(grey)
         if corners is not None:
-            search.views.append(BoardView(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels), corners))
+            width_px = edge_width_px(grey, corners.pixels)
+            search.views.append(BoardView(frame.index, frame.name, corners, width_px, corners))
         else:
             missed += 1
             if missed & (missed - 1) == 0:  # the 1st, 2nd, 4th, 8th ...: few, from all parts of a long video
