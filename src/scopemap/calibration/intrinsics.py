@@ -166,7 +166,9 @@ def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensF
         return np.inf
 
 
-def without_outliers(views: list[BoardView], size: tuple[int, int], form: LensForm) -> tuple[list[BoardView], list[LeftOut]]:
+def without_outliers(
+    views: list[BoardView], size: tuple[int, int], form: LensForm
+) -> tuple[list[BoardView], list[LeftOut]]:
     """Return the views that agree on a camera of `form`, without stray corners, and those that do not: a third at most.
 
     As long as the error of the worst view is far from what is usual, it is left out, or up to a tenth of its corners
