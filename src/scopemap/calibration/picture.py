@@ -1,4 +1,4 @@
-"""The picture of a calibration: a view with its corners, all residuals over the picture's area, the error per view."""
+"""The picture of a calibration: a view with its corners, all residuals over the image, the error per view."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def calibrate(
     ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option(help="Name of a reader (see `scopemap datasets list`); told from what lies there if left out."),
+        typer.Option(help="Name of a reader (see `scopemap datasets list`); recognised by content if left out."),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -175,5 +175,5 @@ def _print(done: CameraCalibration) -> None:
         f"{100 * done.coverage:.0f} % of the picture"
     )
     tried = sorted(done.held_out_px.items(), key=lambda item: item[1])
-    told = [f"{form.described} " + (f"{error:.3f} px" if error < inf else "impossible") for form, error in tried]
-    typer.echo("error in views held out: " + "; ".join(told))
+    errors = [f"{form.described} " + (f"{error:.3f} px" if error < inf else "impossible") for form, error in tried]
+    typer.echo("error in views held out: " + "; ".join(errors))

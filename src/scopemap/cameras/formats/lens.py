@@ -75,7 +75,7 @@ def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tup
 def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float]) -> tuple[CameraModel, str]:
     """Return the camera with the lens that the words `model` name, and a note on what was assumed, "" for nothing.
 
-    No words, and words that name no lens (the endoscope's name), stand for OpenCV's. Zeros at the end do not count.
+    No words, and words that name no lens (the endoscope's name), mean OpenCV's. Zeros at the end do not count.
     Raises `ValueError` for a model that has no counterpart here, and for a wrong number of coefficients.
     """
     if len(coefficients) > MOST_TERMS:
