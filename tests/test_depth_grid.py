@@ -13,6 +13,7 @@ from scopemap.config import MappingSettings
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.mapping import LARGEST_LOG_FACTOR, Backend, Correction
+from scopemap.mapping.submaps import corrected_frame
 from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid
 
 HEIGHT, WIDTH = 120, 160
@@ -117,7 +118,7 @@ def test_a_frame_between_two_keyframes_takes_a_share_of_both_grids() -> None:
         np.eye(4),
         depth_sigma_mm=np.array([[3.0, np.nan]], np.float32),
     )
-    done = correction.frame(frame)
+    done = corrected_frame(frame, correction)
     assert done.depth_sigma_mm is not None
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
     assert "corrected by 22 %" in correction.description

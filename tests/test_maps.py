@@ -24,6 +24,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, Correction, Mapper, TrackedPose
+from scopemap.mapping.submaps import corrected_frame
 from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
@@ -157,7 +158,7 @@ def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
     assert sorted(correction.S_common_map) == [0, 1]
     assert "2 maps joined" in correction.description
     for frame, at_mm in zip(frames, places, strict=True):
-        moved = correction.frame(frame)
+        moved = corrected_frame(frame, correction)
         assert moved.T_world_camera is not None
         assert moved.depth_mm is not None
         np.testing.assert_allclose(moved.T_world_camera, plane_scene.pose(at_mm=at_mm), atol=0.1)

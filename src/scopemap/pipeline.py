@@ -25,7 +25,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
-from scopemap.mapping.submaps import Mapper, Submap
+from scopemap.mapping.submaps import Mapper, Submap, corrected_frame
 from scopemap.masking.masker import Masker, StoredMasks
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
@@ -129,7 +129,7 @@ class Pipeline:
     def corrected(self, submap: Submap) -> Iterator[Frame]:
         """Yield the stored frames of a submap with corrected pose and depth, to be fused by `fusion.fuse`."""
         for frame in self.fusion.store.frames(submap.frames):
-            yield frame if submap.correction is None else submap.correction.frame(frame)
+            yield corrected_frame(frame, submap.correction)
 
     def _with_correspondences(self, percept: Percept) -> Frame:
         points = self._matcher.observed_points(percept.link, self._last_frame)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.mapping.depth_correction import DepthGrid
@@ -79,21 +78,6 @@ class Correction:
         T_world_camera = self._world(index).transform_poses(T_world_camera)
         poses = [self.T_world_world[k] @ T_world_camera for k in (before, after)]
         return mean_near(poses[0], [poses[1]], [share])
-
-    def frame(self, frame: Frame) -> Frame:
-        """Return a tracked frame with its pose and its depth corrected."""
-        if frame.T_world_camera is None:
-            raise ValueError("a frame to be corrected needs a pose")
-        pose = self.pose(frame.index, frame.T_world_camera)
-        if frame.depth_mm is None:
-            return replace(frame, T_world_camera=pose)
-        factors, sigma_mm = self.depth_factors(frame.index, frame.depth_mm), frame.depth_sigma_mm
-        return replace(
-            frame,
-            T_world_camera=pose,
-            depth_mm=frame.depth_mm * factors,
-            depth_sigma_mm=None if sigma_mm is None else sigma_mm * factors,
-        )
 
     def depth_factor(self, index: int) -> float:
         """Return what all depth of the frame with this number is to be multiplied by, before what its grids ask for."""

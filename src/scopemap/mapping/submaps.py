@@ -7,7 +7,7 @@ submap; the relative pose of the others stays unknown, and each is a result of i
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
@@ -94,3 +94,15 @@ class Mapper:
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)
+
+
+def corrected_frame(frame: Frame, correction: Correction | None) -> Frame:
+    """Return a tracked frame with its pose, its depth and the standard deviation of that corrected."""
+    if correction is None:
+        return frame
+    if frame.T_world_camera is None or frame.depth_mm is None:
+        raise ValueError("a frame to be corrected needs a pose and a depth")
+    pose = correction.pose(frame.index, frame.T_world_camera)
+    factors = correction.depth_factors(frame.index, frame.depth_mm)
+    sigma_mm = None if frame.depth_sigma_mm is None else frame.depth_sigma_mm * factors
+    return replace(frame, T_world_camera=pose, depth_mm=frame.depth_mm * factors, depth_sigma_mm=sigma_mm)
