@@ -13,8 +13,8 @@ from scopemap.config import MappingSettings
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.mapping import LARGEST_LOG_FACTOR, Backend, Correction
-from scopemap.mapping.submaps import corrected_frame
 from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid
+from scopemap.mapping.submaps import corrected_frame
 
 HEIGHT, WIDTH = 120, 160
 
