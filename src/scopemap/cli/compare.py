@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 
 from scopemap.benchmark.result import without_nan
-from scopemap.cli.evaluate import AlignChoice, UnitChoice
-from scopemap.cli.options import AsJson, Quiet
+from scopemap.cli.options import Align, AsJson, Quiet, Unit
 
 
 def compare(
@@ -26,11 +25,9 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
     names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
     align: Annotated[
-        AlignChoice, typer.Option(help="Alignment; a benchmark's runs keep the figures that they were measured with.")
-    ] = AlignChoice.SIM3,
-    unit: Annotated[
-        UnitChoice, typer.Option(help="Unit of trajectory files that do not say their own.")
-    ] = UnitChoice.MM,
+        Align, typer.Option(help="Alignment; a benchmark's runs keep the figures that they were measured with.")
+    ] = "sim3",
+    unit: Annotated[Unit, typer.Option(help="Unit of trajectory files that do not state one.")] = "mm",
     consistency: Annotated[
         bool, typer.Option("--consistency", help="Also the consistency of depth over time.")
     ] = False,
@@ -44,9 +41,9 @@ def compare(
     from scopemap.benchmark.plan import ProtocolPlan
     from scopemap.benchmark.tables import benchmark_tables
 
-    protocol = ProtocolPlan(align=align.value, consistency=consistency)
+    protocol = ProtocolPlan(align=align, consistency=consistency)
     given = [name.strip() for name in names.split(",")] if names else []
-    runs = compare_runs(paths, truth, protocol, names=given, unit=unit.value)
+    runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
     if as_json:

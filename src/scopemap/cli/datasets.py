@@ -1,4 +1,4 @@
-"""`scopemap datasets`: which data sets are read, and what is wrong with one."""
+"""`scopemap datasets`: list the data sets that are read, and check one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from scopemap.cli.figures import without_nan
+from scopemap.benchmark.result import without_nan
+from scopemap.cli.figures import print_findings, value_table
 from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Data sets: list what is read, check one.", no_args_is_help=True)
 
-_COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
 _ASKED = "Whether "
 
 
@@ -101,18 +101,9 @@ def _first_line(documented: object) -> str:
 
 
 def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None:
-    console = Console()
     typer.echo(str(path))
     if figures:
-        table = Table("figure")
-        table.add_column("value", justify="right")
-        for name, value in figures.items():
-            table.add_row(name, f"{value:.5g}" if isinstance(value, float) else escape(str(value)))
-        console.print(table)
-    if findings:
-        table = Table("severity", "code", "what was found")
-        for finding in findings:
-            table.add_row(finding.severity, finding.code, escape(finding.message), style=_COLOURS[finding.severity])
-        console.print(table)
+        Console().print(value_table(figures))
+    print_findings([(finding.severity, finding.code, finding.message) for finding in findings])
     counts = Counter(finding.severity for finding in findings)
     typer.echo(f"errors: {counts['error']}, warnings: {counts['warning']}")

@@ -1,16 +1,15 @@
-"""`scopemap evaluate`: a run, or anyone's trajectory file, against the truth."""
+"""`scopemap evaluate`: compare a run or a trajectory file with the truth."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from scopemap.cli.figures import OutputForm, show
-from scopemap.cli.options import AsJson
+from scopemap.cli.options import Align, AsJson, Unit
 from scopemap.errors import CalibrationError, InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -18,35 +17,11 @@ if TYPE_CHECKING:
     from scopemap.io.sequence import Sequence
     from scopemap.trajectory.trajectory import Trajectory
 
-# Below this ratio of singular values the rotation about the path is hardly fixed by it.
+# Below this ratio of singular values the path hardly determines the rotation about it.
 _WEAK_LINE_RATIO = 1e-3
 
 
-class AlignChoice(StrEnum):
-    """Ways to align."""
-
-    NONE = "none"
-    ORIGIN = "origin"
-    SE3 = "se3"
-    SIM3 = "sim3"
-    SCALE = "scale"
-
-
-class DepthChoice(StrEnum):
-    """Ways to scale depth before it is compared."""
-
-    NONE = "none"
-    MEDIAN = "median"
-    SCALE_AND_SHIFT = "scale-and-shift"
-    SEQUENCE_MEDIAN = "sequence-median"
-    SEQUENCE_SCALE_AND_SHIFT = "sequence-scale-and-shift"
-
-
-class UnitChoice(StrEnum):
-    """Units of foreign files."""
-
-    MM = "mm"
-    M = "m"
+DepthScaling = Literal["none", "median", "scale-and-shift", "sequence-median", "sequence-scale-and-shift"]
 
 
 def evaluate(
@@ -66,18 +41,14 @@ def evaluate(
         ),
     ],
     align: Annotated[
-        AlignChoice,
-        typer.Option(help="Fit before measuring: origin = first frames onto each other, scale = sizes alone."),
-    ] = AlignChoice.SIM3,
+        Align,
+        typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone."),
+    ] = "sim3",
     align_first: Annotated[
         int | None, typer.Option(min=3, metavar="N", help="Fit on the first N tracked frames only.")
     ] = None,
-    unit: Annotated[
-        UnitChoice, typer.Option(help="Unit of a trajectory file that does not say its own.")
-    ] = UnitChoice.MM,
-    truth_unit: Annotated[
-        UnitChoice | None, typer.Option(help="The same for the truth; as --unit if left out.")
-    ] = None,
+    unit: Annotated[Unit, typer.Option(help="Unit of a trajectory file that does not state one.")] = "mm",
+    truth_unit: Annotated[Unit | None, typer.Option(help="The same for the truth; as --unit if left out.")] = None,
     kind: Annotated[str, typer.Option(help="Form of the trajectory file where its content fits two.")] = "auto",
     truth_kind: Annotated[str, typer.Option(help="The same for the truth, or the name of a data set.")] = "auto",
     paper_units: Annotated[
@@ -92,7 +63,7 @@ def evaluate(
     ] = None,
     icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,
     depth: Annotated[
-        DepthChoice | None,
+        DepthScaling | None,
         typer.Option(help="Also a run's depth maps against true depth, scaled so."),
     ] = None,
     consistency: Annotated[
@@ -115,14 +86,14 @@ def evaluate(
     from scopemap.trajectory.formats.opening import read_trajectory
 
     form = OutputForm.JSON if as_json else OutputForm.CSV if as_csv else OutputForm.LINE if quiet else OutputForm.TABLE
-    estimate = read_trajectory(trajectory, unit=unit.value, kind=kind)
-    reference = read_reference(truth, unit=(truth_unit or unit).value, kind=truth_kind)
+    estimate = read_trajectory(trajectory, unit=unit, kind=kind)
+    reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:
         if not (depth or consistency):
             raise InputError(f"{truth} knows no true poses; if it knows depth: --depth median compares that alone")
         show(_depths(trajectory, truth, depth, consistency=consistency), form)
         return
-    matched = match(estimate, reference, align.value, first=align_first)
+    matched = match(estimate, reference, align, first=align_first)
     figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
     if paper_units:
         figures["paper"] = paper_figures(matched)
@@ -168,10 +139,10 @@ def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) ->
     return {name: report.figures | {"description": report.description} for name, report in reports.items()}
 
 
-def _depths(trajectory: Path, truth: Path, scaling: DepthChoice | None, *, consistency: bool) -> dict[str, Any]:
+def _depths(trajectory: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> dict[str, Any]:
     from scopemap.benchmark.scoring import depth_groups
 
-    return depth_groups(trajectory, truth, scaling.value if scaling else None, consistency=consistency)
+    return depth_groups(trajectory, truth, scaling, consistency=consistency)
 
 
 def _warn(matched: MatchedTrajectories) -> None:
@@ -183,6 +154,6 @@ def _warn(matched: MatchedTrajectories) -> None:
     if matched.similarity.line_ratio < _WEAK_LINE_RATIO:
         typer.echo(
             f"warning: the path is nearly a straight line (D2/D1 = {matched.similarity.line_ratio:.1e}); the rotation "
-            "about it is poorly fixed, so are the rotation errors",
+            "about it is poorly determined, and so are the rotation errors",
             err=True,
         )

@@ -1,4 +1,4 @@
-"""How figures are shown: as a table for people, as JSON, as CSV."""
+"""Prints figures as tables, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from scopemap.benchmark.result import without_nan
@@ -34,7 +35,7 @@ _LABELS = {
     "rpe_10mm_path_deg": "RPE over 10 mm of true path, RMSE (deg)",
     "tlr": "TLR, path estimated / true, unaligned",
     "coverage": "tracked share of the true poses in its span",
-    "longest_tracked": "longest stretch without loss (frames)",
+    "longest_tracked": "longest segment without loss (frames)",
     "frames_until_loss": "frames until the first loss",
     "mesh_accuracy_mm": "mesh to true surface, mean (mm)",
     "mesh_accuracy_p90_mm": "mesh to true surface, 90th percentile (mm)",
@@ -55,6 +56,9 @@ _PAPER_ROWS = (
     ("TLR", "tlr"),
     ("lost frames (%)", "lost_percent"),
 )
+
+
+_COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
 
 
 class OutputForm(Enum):
@@ -111,13 +115,14 @@ def _tables(figures: dict[str, Any]) -> None:
             f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
             f"scale {figures['scale']:.5g}"
         )
-        console.print(_table(title, {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}))
+        rows = {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}
+        console.print(value_table(rows, title=title))
     for name, group in figures.items():
         if name == "paper":
             rows = {label: " +- ".join(_text(group[key]) for key in keys) for label, *keys in _PAPER_ROWS}
-            console.print(_table("in the paper's units", rows))
+            console.print(value_table(rows, title="in the paper's units"))
         elif isinstance(group, dict) and name != "sources":
-            console.print(_table(name, {key: _text(value) for key, value in _flat(group)}))
+            console.print(value_table({key: _text(value) for key, value in _flat(group)}, title=name))
 
 
 def _text(value: Any) -> str:
@@ -126,9 +131,25 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def _table(title: str, rows: dict[str, str]) -> Table:
-    table = Table("figure", title=title, title_justify="left")
+def value_table(rows: Mapping[str, Any], *, title: str | None = None, head: str = "figure") -> Table:
+    """Return a table of one name and value per row."""
+    table = Table(head, title=title, title_justify="left")
     table.add_column("value", justify="right")
-    for row in rows.items():
-        table.add_row(*row)
+    for name, value in rows.items():
+        table.add_row(name, escape(value if isinstance(value, str) else _short(value)))
     return table
+
+
+def print_findings(findings: Sequence[tuple[str, str, str]]) -> None:
+    """Print a table of (severity, code, message), if there are any."""
+    if findings:
+        table = Table("severity", "code", "what was found")
+        for severity, code, message in findings:
+            table.add_row(severity, code, escape(message), style=_COLOURS[severity])
+        Console().print(table)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

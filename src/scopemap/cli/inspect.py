@@ -1,25 +1,22 @@
-"""`scopemap inspect`: what is peculiar about a clinical video, and which option answers it."""
+"""`scopemap inspect`: report the peculiarities of a clinical video, and the options for them."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from scopemap.cli.figures import without_nan
+from scopemap.benchmark.result import without_nan
+from scopemap.cli.figures import print_findings, value_table
 from scopemap.cli.options import AsJson, Quiet, parse_slice
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError
 
 if TYPE_CHECKING:
     from scopemap.inspection.inspecting import Inspection
-
-_COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
 
 
 def inspect(
@@ -102,26 +99,11 @@ def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
 
 
 def _print(source: Path, found: Inspection) -> None:
-    console = Console()
     typer.echo(str(source))
-    table = Table("fact")
-    table.add_column("value", justify="right")
-    for name, value in found.facts.items():
-        table.add_row(name, _text(value))
-    console.print(table)
-    if found.findings:
-        table = Table("severity", "code", "what was found")
-        for finding in found.findings:
-            table.add_row(finding.severity, finding.code, escape(finding.message), style=_COLOURS[finding.severity])
-        console.print(table)
-    advised = [finding for finding in found.findings if finding.advice]
-    for finding in advised:
-        typer.echo(f"advice: {finding.code}: {finding.advice}")
+    Console().print(value_table(found.facts, head="fact"))
+    print_findings([(finding.severity, finding.code, finding.message) for finding in found.findings])
+    for finding in found.findings:
+        if finding.advice:
+            typer.echo(f"advice: {finding.code}: {finding.advice}")
     if not found.findings:
         typer.echo("nothing peculiar was found")
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

@@ -1,15 +1,17 @@
-"""Options that several commands share, and their texts turned into values; what cannot be read is a `SettingsError`."""
+"""Options that several commands share, and parsers of their texts, which raise `SettingsError`."""
 
 from __future__ import annotations
 
 import json
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from scopemap.errors import SettingsError
 
+Align = Literal["none", "origin", "se3", "sim3", "scale"]
+Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
 SetPairs = Annotated[

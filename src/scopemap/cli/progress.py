@@ -1,4 +1,4 @@
-"""Progress of runs and renderings: a bar with rate, time left and state; plain lines where there is no terminal."""
+"""Progress of runs and renderings on stderr: a bar, or a line every ten seconds where there is no terminal."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from scopemap.pipeline import Step
 
 _SECONDS_BETWEEN_LINES = 10.0
@@ -18,33 +20,56 @@ _SECONDS_BETWEEN_LINES = 10.0
 
 @contextmanager
 def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[[Step], None], ...]]:
-    """Yield the observers (one, or none if `silent`) that show how a run of `total` frames goes, on stderr."""
+    """Yield the observers (one, or none if `silent`) that show the progress of a run of `total` frames."""
     if silent:
         yield ()
-    elif not sys.stderr.isatty():
-        yield (_Lines(total),)
+        return
+    state = _State(total)
+    if not sys.stderr.isatty():
+        lines = _Lines()
+
+        def write(step: Step) -> None:
+            state.add(step)
+            lines.write(state.line, last=state.done == total)
+
+        yield (write,)
+        return
+    with _bar("tracking", "{task.fields[rate]}", "{task.fields[state]}") as bar:
+        # Before the first frame the camera may be estimated, kernels compiled and networks loaded.
+        task = bar.add_task("tracking", total=total, rate="", state="preparing")
+
+        def show(step: Step) -> None:
+            state.add(step)
+            rate = "" if state.rate is None else f"{state.rate:.1f} frames/s"
+            bar.update(task, advance=1, rate=rate, state=state.text)
+
+        yield (show,)
+
+
+@contextmanager
+def count_progress(doing: str, done: str, *, silent: bool) -> Iterator[Callable[[int, int | None], None] | None]:
+    """Yield a function that shows (frames done, all frames or None) in these words; None if `silent`."""
+    if silent:
+        yield None
+    elif sys.stderr.isatty():
+        with _bar(doing) as bar:
+            task = bar.add_task(doing, total=None)
+            yield lambda count, total: bar.update(task, completed=count, total=total)
     else:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        lines = _Lines()
+        yield lambda count, total: lines.write(f"{done} {count}{_of(total)} frames", last=count == total)
 
-        columns = (
-            TextColumn("tracking"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[state]}"),
-        )
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            # An unknown camera is looked for, kernels are compiled, networks loaded, before a frame passes.
-            task, state = bar.add_task("", total=total, rate="", state="preparing"), _State(total)
 
-            def show(step: Step) -> None:
-                state.add(step)
-                rate = "" if state.rate is None else f"{state.rate:.1f} frames/s"
-                bar.update(task, advance=1, rate=rate, state=state.text)
+def _bar(doing: str, *fields: str) -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-            yield (show,)
+    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), *map(TextColumn, fields))
+    return Progress(*columns, console=Console(stderr=True))
+
+
+def _of(total: int | None) -> str:
+    return f" of {total}" if total else ""
 
 
 class _State:
@@ -56,8 +81,16 @@ class _State:
 
     @property
     def rate(self) -> float | None:
-        """Frames per second since the first one, which waits for all that is prepared; None so far."""
+        """Frames per second since the first one, without start-up; None before the second."""
         return (self.done - 1) / max(time.perf_counter() - self.started, 1e-9) if self.done > 1 else None
+
+    @property
+    def line(self) -> str:
+        speed = ""
+        if self.rate is not None:
+            left = f", {max(self._total - self.done, 0) / self.rate:.0f} s left" if self._total else ""
+            speed = f"{self.rate:.1f} frames/s{left}, "
+        return f"frame {self.done}{_of(self._total)}: {speed}{self.text}"
 
     def add(self, step: Step) -> None:
         if self.done == 0:
@@ -69,54 +102,18 @@ class _State:
         else:
             self.text = "ok" + (f", {self.lost} lost so far" if self.lost else "")
         if self.done == self._total:
-            # Keyframes are adjusted, depth fused, files written: seconds to minutes in which no frame passes.
+            # Seconds to minutes in which no frame passes.
             self.text += "; adjusting, fusing and writing"
 
 
 class _Lines:
-    """One line now and then."""
+    """Writes a line if the last one was ten seconds ago."""
 
-    def __init__(self, total: int | None) -> None:
-        self._total, self._state, self._last = total, _State(total), time.perf_counter()
+    def __init__(self) -> None:
+        self._written = time.perf_counter()
 
-    def __call__(self, step: Step) -> None:
-        self._state.add(step)
-        state, now = self._state, time.perf_counter()
-        if now - self._last < _SECONDS_BETWEEN_LINES and state.done != self._total:
-            return
-        self._last = now
-        speed = ""
-        if state.rate is not None:
-            left = "" if not self._total else f", {max(self._total - state.done, 0) / state.rate:.0f} s left"
-            speed = f"{state.rate:.1f} frames/s{left}, "
-        total = f" of {self._total}" if self._total else ""
-        typer.echo(f"frame {state.done}{total}: {speed}{state.text}", err=True)
-
-
-@contextmanager
-def count_progress(doing: str, done: str, *, silent: bool) -> Iterator[Callable[[int, int | None], None] | None]:
-    """Yield what shows (frames done, in all or None) on stderr, in these words; None if `silent`."""
-    if silent:
-        yield None
-    elif sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import Progress
-
-        with Progress(console=Console(stderr=True)) as bar:
-            task = bar.add_task(doing, total=None)
-            yield lambda count, total: bar.update(task, completed=count, total=total)
-    else:
-        yield _CountLines(done)
-
-
-class _CountLines:
-    """One line now and then."""
-
-    def __init__(self, done: str) -> None:
-        self._done, self._last = done, time.perf_counter()
-
-    def __call__(self, count: int, total: int | None) -> None:
+    def write(self, line: str, *, last: bool) -> None:
         now = time.perf_counter()
-        if now - self._last >= _SECONDS_BETWEEN_LINES or count == total:
-            self._last = now
-            typer.echo(f"{self._done} {count}{f' of {total}' if total else ''} frames", err=True)
+        if last or now - self._written >= _SECONDS_BETWEEN_LINES:
+            self._written = now
+            typer.echo(line, err=True)

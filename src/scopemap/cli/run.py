@@ -1,11 +1,10 @@
-"""`scopemap run`: from a video to poses, depth and a surface."""
+"""`scopemap run`: camera poses, depth and a surface from a video."""
 
 from __future__ import annotations
 
 import json
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,31 +19,6 @@ if TYPE_CHECKING:
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
 
 
-class PresetChoice(StrEnum):
-    """Presets of settings."""
-
-    PAPER = "paper"
-    DEFAULT = "default"
-    REALTIME = "realtime"
-
-
-class DeviceChoice(StrEnum):
-    """Where networks run."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
-
-
-class StereoChoice(StrEnum):
-    """How two views lie in one picture."""
-
-    AUTO = "auto"
-    NONE = "none"
-    LEFT_RIGHT = "left-right"
-    TOP_BOTTOM = "top-bottom"
-
-
 def run(
     source: Annotated[
         Path,
@@ -52,7 +26,7 @@ def run(
     ],
     out: Annotated[Path, typer.Option(help="Folder for the result.")],
     preset: Annotated[
-        PresetChoice | None,
+        Literal["paper", "default", "realtime"] | None,
         typer.Option(help="paper: the method as published; default: best of what needs no download; realtime: fast."),
     ] = None,
     config: Annotated[
@@ -60,7 +34,7 @@ def run(
     ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option(help="Name of a reader (see `scopemap datasets list`); told from what lies there if left out."),
+        typer.Option(help="Name of a reader (`scopemap datasets list`); default: recognised by the files."),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -81,15 +55,16 @@ def run(
         typer.Option(
             min=5.0,
             max=170.0,
-            help="Horizontal field of view, degrees, where the camera is unknown; else what the motion tells, or 70.",
+            help="Horizontal field of view, degrees, of an unknown camera; default: estimated from the motion, or 70.",
         ),
     ] = None,
     stereo: Annotated[
-        StereoChoice | None,
-        typer.Option(help="Two views in one picture, of which the left or upper is used; auto: told from the video."),
+        Literal["auto", "none", "left-right", "top-bottom"] | None,
+        typer.Option(help="Two views in one image, of which the left or upper is used; auto: recognised."),
     ] = None,
     deinterlace: Annotated[
-        bool, typer.Option("--deinterlace", help="Use one field of interlaced pictures, its missing rows interpolated.")
+        bool,
+        typer.Option("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
     ] = False,
     near_far: Annotated[
         str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
@@ -100,19 +75,17 @@ def run(
     ] = None,
     flow: Annotated[
         str | None,
-        typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small if at hand, else dis."),
+        typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small with its weights, else dis."),
     ] = None,
     frames: Annotated[
         str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(help="Use at most so many frames per second, by the time stamps.")
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="Working size, px; else the input's over a whole number, at most 400 px."),
+        typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
     ] = None,
-    device: Annotated[DeviceChoice | None, typer.Option(help="Where networks run.")] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="Device of the networks.")] = None,
     settings: SetPairs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
     as_json: AsJson = False,
@@ -123,16 +96,16 @@ def run(
 
     given: dict[str, Any] = {
         "input.camera_fit": camera_fit,
-        "input.stereo": stereo.value if stereo else None,
+        "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
         "input.fps": fps,
         "depth.backend": depth,
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
         "networks.flow": flow,
-        "networks.device": device.value if device else None,
+        "networks.device": device,
     }
     chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
-    resolved = Config.load(preset.value if preset else None, config, chosen)
+    resolved = Config.load(preset, config, chosen)
 
     from scopemap.io.opening import open_sequence
     from scopemap.runner import reconstruct
@@ -166,7 +139,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 
 
 def summary_lines(result: Reconstruction) -> list[str]:
-    """Return what a person wants to know of a run, one fact per line."""
+    """Return the summary of a run, one fact per line."""
     facts = result.provenance
     lines = [
         f"{facts['tracked']} of {facts['frames']} frames tracked, path {result.trajectory.path_length_mm:.1f} mm",
