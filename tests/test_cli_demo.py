@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from scopemap.benchmark import demonstration
-from scopemap.benchmark.demonstration import DemoFigures, Demonstration
+from scopemap.benchmark.demonstration import Demonstration
 from scopemap.cli import main
 from scopemap.errors import InputError, SettingsError
 from scopemap.io import weights
@@ -52,25 +52,25 @@ def demo(out: Path, nothing_outside: Path) -> Demonstration:
 
 
 @pytest.fixture(scope="module")
-def figures(demo: Demonstration) -> DemoFigures:
+def figures(demo: Demonstration) -> dict[str, float]:
     return demonstration.measure(demo)
 
 
-def test_every_frame_is_tracked_near_the_truth(figures: DemoFigures) -> None:
-    assert figures.frames == figures.tracked == TINY.frames
-    assert figures.path_mm > 1
-    assert 0 < figures.ate_sim3_mm < 0.1 * figures.path_mm
-    assert figures.ate_sim3_mm <= figures.ate_origin_mm < 0.5 * figures.path_mm
-    assert 0.3 < figures.scale < 3
-    assert 0 < figures.rotation_mean_deg <= figures.rotation_max_deg < 2
+def test_every_frame_is_tracked_near_the_truth(figures: dict[str, float]) -> None:
+    assert figures["frames"] == figures["tracked"] == TINY.frames
+    assert figures["path_mm"] > 1
+    assert 0 < figures["ate_sim3_mm"] < 0.1 * figures["path_mm"]
+    assert figures["ate_sim3_mm"] <= figures["ate_origin_mm"] < 0.5 * figures["path_mm"]
+    assert 0.3 < figures["scale"] < 3
+    assert 0 < figures["rotation_mean_deg"] <= figures["rotation_max_deg"] < 2
 
 
-def test_mesh_and_depth_resemble_the_truth(figures: DemoFigures) -> None:
-    assert 0 < figures.mesh_median_mm < 10
-    assert figures.mesh_median_mm <= figures.mesh_accuracy_mm < 40
-    assert 0 < figures.mesh_completeness_mm < 40
-    assert 0 < figures.depth_abs_rel < 0.4
-    assert 0 < figures.raw_depth_abs_rel < 0.4
+def test_mesh_and_depth_resemble_the_truth(figures: dict[str, float]) -> None:
+    assert 0 < figures["mesh_median_mm"] < 10
+    assert figures["mesh_median_mm"] <= figures["mesh_accuracy_mm"] < 40
+    assert 0 < figures["mesh_completeness_mm"] < 40
+    assert 0 < figures["depth_abs_rel"] < 0.4
+    assert 0 < figures["raw_depth_abs_rel"] < 0.4
 
 
 def test_the_run_is_a_run(demo: Demonstration, out: Path) -> None:
@@ -153,7 +153,7 @@ def test_the_command(demo: Demonstration, out: Path, capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     summary = json.loads(said.out)
     assert said.err == ""
-    assert set(DemoFigures.__dataclass_fields__) < set(summary)
+    assert {"frames", "path_mm", "scale", "mesh_accuracy_mm", "raw_depth_abs_rel"} < set(summary)
     assert summary["tracked"] == TINY.frames
     assert all(Path(file).is_file() for file in summary["pictures"])
 

@@ -42,36 +42,6 @@ _DRAWN_FRAMES = 4
 
 
 @dataclass(frozen=True)
-class DemoFigures:
-    """Errors of a run; NaN where nothing could be measured.
-
-    Attributes
-    ----------
-    frames, tracked : all frames and those not lost. path_mm : length of the true path.
-    ate_sim3_mm, ate_origin_mm : RMSE of the position after Sim(3), and with only the first poses aligned.
-    scale : factor of Sim(3), true over estimated.
-    rotation_mean_deg, rotation_max_deg : rotation error since the first frame, no alignment.
-    mesh_accuracy_mm, mesh_median_mm : distance of the mesh (moved by Sim(3)) to the true surface, mean and median.
-    mesh_completeness_mm : mean distance of the seen part of the true surface to the mesh.
-    depth_abs_rel, raw_depth_abs_rel : mean relative error of refined and of raw depth, each frame scaled by its median.
-    """
-
-    frames: int
-    tracked: int
-    path_mm: float
-    ate_sim3_mm: float
-    ate_origin_mm: float
-    scale: float
-    rotation_mean_deg: float
-    rotation_max_deg: float
-    mesh_accuracy_mm: float
-    mesh_median_mm: float
-    mesh_completeness_mm: float
-    depth_abs_rel: float
-    raw_depth_abs_rel: float
-
-
-@dataclass(frozen=True)
 class Demonstration:
     """A phantom, its reconstruction, and the depth of each frame, raw and refined, (H, W) float32 mm by frame index."""
 
@@ -133,29 +103,38 @@ def run_on_phantom(out: Path, config: Config, observers: tuple[Observer, ...] = 
     return Demonstration(sequence, result, raw_mm, refined_mm)
 
 
-def measure(demo: Demonstration) -> DemoFigures:
-    """Compare poses, mesh and depth with the truth; raises `AlignmentError` where hardly a frame was tracked."""
+def measure(demo: Demonstration) -> dict[str, float]:
+    """Return the errors of the run, NaN where nothing could be measured.
+
+    frames, tracked : all frames and those not lost. path_mm : length of the true path.
+    ate_sim3_mm, ate_origin_mm : RMSE of the position after Sim(3), and with only the first poses aligned.
+    scale : factor of Sim(3), true over estimated.
+    rotation_mean_deg, rotation_max_deg : rotation error since the first frame, no alignment.
+    mesh_accuracy_mm, mesh_median_mm : distance of the mesh (moved by Sim(3)) to the true surface, mean and median.
+    mesh_completeness_mm : mean distance of the seen part of the true surface to the mesh.
+    depth_abs_rel, raw_depth_abs_rel : mean relative error of refined and of raw depth, each frame scaled by its median.
+
+    Raises `AlignmentError` where hardly a frame was tracked.
+    """
     sim3, truth = pose_report(demo.matched), read_trajectory(demo.sequence.path)
-    accuracy_mm = median_mm = completeness_mm = float("nan")
+    mesh = dict.fromkeys(("mesh_accuracy_mm", "mesh_median_mm", "mesh_completeness_mm"), float("nan"))
     if len(demo.result.mesh.faces):
         surface = compare_surfaces(demo.aligned_mesh, demo.true_mesh)
-        accuracy_mm, median_mm = surface.accuracy.mean_mm, surface.accuracy.median_mm
-        completeness_mm = surface.completeness.mean_mm
-    return DemoFigures(
-        frames=sim3.frames,
-        tracked=sim3.tracked,
-        path_mm=truth.path_length_mm,
-        ate_sim3_mm=sim3.ate_rmse_mm,
-        ate_origin_mm=pose_report(match(demo.result.trajectory, truth, "origin")).ate_rmse_mm,
-        scale=sim3.scale,
-        rotation_mean_deg=sim3.rotation_unaligned_mean_deg,
-        rotation_max_deg=sim3.rotation_unaligned_max_deg,
-        mesh_accuracy_mm=accuracy_mm,
-        mesh_median_mm=median_mm,
-        mesh_completeness_mm=completeness_mm,
-        depth_abs_rel=_abs_rel(demo.sequence, demo.refined_mm),
-        raw_depth_abs_rel=_abs_rel(demo.sequence, demo.raw_mm),
-    )
+        mesh = {"mesh_accuracy_mm": surface.accuracy.mean_mm, "mesh_median_mm": surface.accuracy.median_mm}
+        mesh |= {"mesh_completeness_mm": surface.completeness.mean_mm}
+    return {
+        "frames": sim3.frames,
+        "tracked": sim3.tracked,
+        "path_mm": truth.path_length_mm,
+        "ate_sim3_mm": sim3.ate_rmse_mm,
+        "ate_origin_mm": pose_report(match(demo.result.trajectory, truth, "origin")).ate_rmse_mm,
+        "scale": sim3.scale,
+        "rotation_mean_deg": sim3.rotation_unaligned_mean_deg,
+        "rotation_max_deg": sim3.rotation_unaligned_max_deg,
+        **mesh,
+        "depth_abs_rel": _abs_rel(demo.sequence, demo.refined_mm),
+        "raw_depth_abs_rel": _abs_rel(demo.sequence, demo.raw_mm),
+    }
 
 
 def draw(demo: Demonstration, folder: Path) -> list[Path]:

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 from scopemap.benchmark.entry import Entry, entries_of
-from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.methods.registry import create_method
 from scopemap.benchmark.plan import Plan, found_sequences
 from scopemap.benchmark.result import FILE_NAME, RunResult
@@ -85,9 +84,8 @@ def run_entry(entry: Entry) -> RunResult:
     try:
         entry.render_phantom()
         sequence = entry.open()
-        method = create_method(entry.method, entry.data)
-        task = Task(sequence, entry.shared_settings(), entry.seed, entry.sequence.name)
-        timing = method.run(task, entry.run_folder)
+        method = create_method(entry.method, entry.data, entry.sequence.name, entry.seed)
+        timing = method.run(sequence, entry.shared_settings(), entry.run_folder)
         memory_mb = _peak_memory_mb()
         figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
     except ScopemapError as error:
@@ -97,7 +95,7 @@ def run_entry(entry: Entry) -> RunResult:
         entry.method.name,
         entry.seed,
         figures=figures,
-        timing=_timing(timing) | {"peak_memory_mb": memory_mb},
+        timing=timing | {"peak_memory_mb": memory_mb},
         facts=_facts(entry) | {"truth": _quality_of_truth(sequence)},
     )
 
@@ -189,11 +187,6 @@ def _quality_of_truth(sequence: Sequence) -> str:
     stamps = sequence.source.stamps(sequence.selection)
     truth = sequence.source.truth(stamps[0][0]) if stamps else None
     return truth.quality if truth else ""
-
-
-def _timing(timing: Timing) -> dict[str, float]:
-    stages = {f"seconds_{stage.replace(' ', '_')}": seconds for stage, seconds in timing.seconds.items()}
-    return {"ms_per_frame": timing.ms_per_frame, "track_ms_per_frame": timing.track_ms_per_frame, **stages}
 
 
 def _peak_memory_mb() -> float:

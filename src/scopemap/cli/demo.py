@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 import time
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from scopemap.benchmark.result import without_nan
 from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress, run_progress
-
-if TYPE_CHECKING:
-    from scopemap.benchmark.demonstration import DemoFigures
 
 
 def demo(
@@ -48,7 +44,8 @@ def demo(
     pictures = demonstration.draw(done, out / "pictures")
     seconds = time.perf_counter() - started
     if as_json:
-        typer.echo(json.dumps(_summary(figures, out, pictures, seconds), indent=2))
+        paths = {"phantom": str(out / "phantom"), "run": str(out / "run"), "pictures": [str(file) for file in pictures]}
+        typer.echo(json.dumps(without_nan(figures) | paths | {"seconds": round(seconds, 1)}, indent=2))
     elif not quiet:
         for line in _lines(figures, out, seconds):
             typer.echo(line)
@@ -59,22 +56,18 @@ def _tell(text: str, silent: bool) -> None:
         typer.echo(text, err=True)
 
 
-def _summary(figures: DemoFigures, out: Path, pictures: list[Path], seconds: float) -> dict[str, object]:
-    known = {key: None if math.isnan(value) else value for key, value in asdict(figures).items()}
-    places = {"phantom": str(out / "phantom"), "run": str(out / "run"), "pictures": [str(file) for file in pictures]}
-    return known | places | {"seconds": round(seconds, 1)}
-
-
-def _lines(figures: DemoFigures, out: Path, seconds: float) -> list[str]:
-    f, run, pictures = figures, out / "run", out / "pictures"
-    return [
-        f"{f.tracked} of {f.frames} frames tracked over a true path of {f.path_mm:.1f} mm, in {seconds:.0f} s",
-        f"position error (ATE RMSE): {f.ate_sim3_mm:.2f} mm after Sim(3) with scale {f.scale:.3f}, "
-        f"{f.ate_origin_mm:.2f} mm with only the first poses aligned",
-        f"rotation since frame 1, unaligned: off by {f.rotation_mean_deg:.2f} deg, {f.rotation_max_deg:.2f} at most",
-        f"mesh to true surface, after Sim(3): mean {f.mesh_accuracy_mm:.2f} mm, half within "
-        f"{f.mesh_median_mm:.2f} mm; true surface to mesh: mean {f.mesh_completeness_mm:.2f} mm",
-        f"depth, each frame scaled by its median: AbsRel {f.depth_abs_rel:.3f}, before MAPIS {f.raw_depth_abs_rel:.3f}",
+def _lines(figures: dict[str, float], out: Path, seconds: float) -> list[str]:
+    run, pictures = out / "run", out / "pictures"
+    lines = (
+        f"{{tracked}} of {{frames}} frames tracked over a true path of {{path_mm:.1f}} mm, in {seconds:.0f} s",
+        "position error (ATE RMSE): {ate_sim3_mm:.2f} mm after Sim(3) with scale {scale:.3f}, "
+        "{ate_origin_mm:.2f} mm with only the first poses aligned",
+        "rotation error since frame 1, unaligned: mean {rotation_mean_deg:.2f} deg, largest {rotation_max_deg:.2f} deg",
+        "mesh to true surface, after Sim(3): mean {mesh_accuracy_mm:.2f} mm, half within {mesh_median_mm:.2f} mm; "
+        "true surface to mesh: mean {mesh_completeness_mm:.2f} mm",
+        "depth, each frame scaled by its median: AbsRel {depth_abs_rel:.3f}, before MAPIS {raw_depth_abs_rel:.3f}",
+    )
+    return [line.format(**figures) for line in lines] + [
         f"mesh: {run / 'mesh.ply'} and mesh.glb; truth: {out / 'phantom' / 'mesh_truth.ply'}",
         f"trajectory: {run / 'trajectory.tum'}; truth: {out / 'phantom' / 'pose.txt'}",
         f"pictures: {pictures / 'trajectory.png'} (estimate green, truth red), mesh.png, depth.png",

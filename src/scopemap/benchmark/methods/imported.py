@@ -4,37 +4,39 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from scopemap.benchmark.methods.method import Task, Timing
 from scopemap.benchmark.plan import MethodPlan
 from scopemap.errors import InputError, SettingsError
 from scopemap.evaluation.poses import associate
+from scopemap.io.sequence import Sequence
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory, write_tum
 
 
 class ImportedTrajectory:
-    """Reads the file of a sequence and seed; frames without a pose in it are lost.
+    """Reads the file of a sequence and seed, as `plan.files` names it; frames without a pose in it are lost.
 
     Raises `InputError` where the file is missing or none of its poses matches a frame.
     """
 
-    def __init__(self, plan: MethodPlan, data: Path | None) -> None:
+    def __init__(self, plan: MethodPlan, data: Path | None, name: str, seed: int) -> None:
         if data is None:
             raise SettingsError(f"method '{plan.name}': give --data, the folder of the imported trajectories")
-        self._plan, self._data = plan, data
+        self._plan, self._file = plan, data / plan.files.format(sequence=name, seed=seed)
 
-    def run(self, task: Task, out: Path) -> Timing:
+    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Write the trajectory as a run's folder; its time is unknown."""
-        file = self._data / self._plan.files.format(sequence=task.name, seed=task.seed)
+        file = self._file
         read = read_trajectory(file, unit=self._plan.unit, kind=self._plan.kind)
-        frames = [(frame.index, frame.time_s, frame.name) for frame in task.sequence.frames()]
+        frames = [(frame.index, frame.time_s, frame.name) for frame in sequence.frames()]
         poses = on_frames(read, np.array([f[0] for f in frames]), np.array([f[1] for f in frames]))
         if not poses.tracked.any():
-            raise InputError(f"{file}: none of its {len(read)} poses belongs to a frame of {task.name}")
+            raise InputError(f"{file}: none of its {len(read)} poses belongs to a frame of {sequence.path}")
         out.mkdir(parents=True, exist_ok=True)
         write_tum(out / "trajectory.tum", poses)
         with (out / "frames.csv").open("w", newline="", encoding="utf-8") as table:
@@ -42,9 +44,9 @@ class ImportedTrajectory:
             writer.writerow(["index", "time_s", "name", "status"])
             for (index, time_s, name), status in zip(frames, poses.status.tolist(), strict=True):
                 writer.writerow([index, f"{time_s:.6f}", name, status])
-        facts = {"input": str(task.sequence.path), "imported": str(file), "convention": read.source}
+        facts = {"input": str(sequence.path), "imported": str(file), "convention": read.source}
         (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-        return Timing()
+        return {}
 
 
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:

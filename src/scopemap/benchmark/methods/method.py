@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,44 +15,17 @@ from scopemap.runner import reconstruct
 from scopemap.tracking import FrameTracker
 
 
-@dataclass(frozen=True)
-class Task:
-    """The input of a method: all methods get the same frames, camera, masks and depth.
-
-    Attributes
-    ----------
-    sequence : rectified frames; a method reads `frames()`, never the truth.
-    settings : dotted names to values, shared by all methods: depth and its anchor, masks, fusion.
-    seed : for methods that are random. name : of the sequence.
-    """
-
-    sequence: Sequence
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    name: str = ""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How long a method took; NaN where it was not measured (an imported trajectory).
-
-    Attributes
-    ----------
-    ms_per_frame : wall time from the first finished frame to the last, per frame, without start-up.
-    track_ms_per_frame : time of the tracking thread alone, see `PipelineMethod`.
-    seconds : by stage; stages in different threads overlap.
-    """
-
-    ms_per_frame: float = math.nan
-    track_ms_per_frame: float = math.nan
-    seconds: Mapping[str, float] = field(default_factory=dict)
-
-
 class Method(Protocol):
-    """Turns a task into a run's folder, which the same code then scores for all methods."""
+    """Turns a sequence into a run's folder, which the same code then scores for all methods."""
 
-    def run(self, task: Task, out: Path) -> Timing:
-        """Write at least trajectory.tum, frames.csv and provenance.json to `out`; raises any error of the method."""
+    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
+        """Write at least trajectory.tum, frames.csv and provenance.json to `out` and return the times.
+
+        All methods get the same `sequence` of frames, whose truth they must not read, and the same `settings` (dotted
+        names): depth and its anchor, masks, fusion. Times are "ms_per_frame", from the first finished frame to the last
+        without start-up, "track_ms_per_frame" and "seconds_STAGE"; none where they are unknown. Raises any error of the
+        method.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,7 +34,7 @@ class PipelineMethod:
 
     Attributes
     ----------
-    preset, settings : what the method changes of the defaults. The task's settings stand between the two, so that a
+    preset, settings : what the method changes of the defaults. The shared settings stand between the two, so that a
         preset cannot replace the depth that all methods share.
     create_tracker : makes the tracker of a baseline; None: the program's own, exactly as `scopemap run` runs it.
     """
@@ -71,24 +43,24 @@ class PipelineMethod:
     settings: Mapping[str, Any] = field(default_factory=dict)
     create_tracker: Callable[[], FrameTracker] | None = None
 
-    def run(self, task: Task, out: Path) -> Timing:
+    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Reconstruct into `out`; raises what the pipeline raises.
 
         Times are those of the run's own clock: "tracking" is tracking, depth refinement and the choice of keyframes.
         """
-        config = Config.load(self.preset, settings=dict(task.settings) | dict(self.settings))
+        config = Config.load(self.preset, settings=dict(settings) | dict(self.settings))
         tracker = self.create_tracker() if self.create_tracker is not None else None
         finished: list[float] = []
 
         def note(step: Step) -> None:
             finished.append(time.perf_counter())
 
-        result = reconstruct(task.sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
+        result = reconstruct(sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
         frames, seconds = len(result.records), result.provenance["seconds"]
         # Work after the last frame counts for all frames.
         afterwards = sum(seconds.get(part, 0.0) for part in ("back end", "depth corrected", "fuse"))
-        return Timing(
-            ms_per_frame=1e3 * ((finished[-1] - finished[0]) / max(frames - 1, 1) + afterwards / frames),
-            track_ms_per_frame=1e3 * seconds["track and fuse"] / frames,
-            seconds=seconds,
-        )
+        return {
+            "ms_per_frame": 1e3 * ((finished[-1] - finished[0]) / max(frames - 1, 1) + afterwards / frames),
+            "track_ms_per_frame": 1e3 * seconds["track and fuse"] / frames,
+            **{f"seconds_{stage.replace(' ', '_')}": value for stage, value in seconds.items()},
+        }

@@ -34,10 +34,13 @@ BASELINES: dict[str, Callable[[], FrameTracker]] = {
 """Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
 
 
-def create_method(plan: MethodPlan, data: Path | None) -> Method:
-    """Return the method of a plan; `data` is the folder of imported trajectories. `SettingsError` if unknown."""
+def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed: int = 0) -> Method:
+    """Return the method of a plan; raises `SettingsError` for an unknown one.
+
+    data : folder of imported trajectories. sequence, seed : which of them, by the name of the sequence.
+    """
     if plan.use == "import":
-        return ImportedTrajectory(plan, data)
+        return ImportedTrajectory(plan, data, sequence, seed)
     if plan.use == "scopemap":
         return PipelineMethod(plan.preset, plan.settings)
     if plan.use not in BASELINES:
