@@ -108,7 +108,7 @@ def test_an_earlier_phantom_is_used_again_but_not_another_one(demo: Demonstratio
     before = (out / "phantom" / "mesh_truth.ply").stat().st_mtime_ns
     assert not demonstration.render(out, TINY)
     assert (out / "phantom" / "mesh_truth.ply").stat().st_mtime_ns == before
-    small = replace(TINY, frames=2)
+    small = replace(TINY, frames=2, width=64, height=48)
     assert demonstration.render(tmp_path, small)
     (tmp_path / "phantom" / "mesh_truth.ply").unlink()  # as if it had been stopped half-way
     assert demonstration.render(tmp_path, small)
@@ -128,10 +128,14 @@ def test_an_earlier_run_is_kept_unless_told(demo: Demonstration, out: Path, tmp_
         demonstration.prepare_out(tmp_path / "taken", overwrite=True)
 
 
-def _command(*arguments: object) -> int | str | None:
+def _command(*arguments: object, done: Demonstration | None = None) -> int | str | None:
+    """The exit code of `scopemap demo`; with `done`, nothing is reconstructed and drawn again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["scopemap", "demo", *map(str, arguments)])
         patch.setattr(demonstration, "PHANTOM", TINY)
+        if done is not None:
+            patch.setattr(demonstration, "run_on_phantom", lambda *_: done)
+            patch.setattr(demonstration, "draw", lambda _, folder: [folder / "trajectory.png"])
         with pytest.raises(SystemExit) as caught:
             main()
     return caught.value.code
@@ -144,19 +148,19 @@ def test_the_command(demo: Demonstration, out: Path, capsys: pytest.CaptureFixtu
     options = ("--overwrite", "--set", "tracking.keyframe_every=3")
     assert _command("--out", out, *options) == 0
     said = capsys.readouterr()
-    assert f"8 of {TINY.frames} frames tracked" in said.out
-    for place in ("mesh.ply", "mesh_truth.ply", "trajectory.tum", "pose.txt", "trajectory.png"):
-        assert place in said.out
+    assert f"{TINY.frames} of {TINY.frames} frames tracked" in said.out
+    for file in ("mesh.ply", "mesh_truth.ply", "trajectory.tum", "pose.txt", "trajectory.png"):
+        assert file in said.out
     assert "using the earlier phantom" in said.err
 
-    assert _command("--out", out, *options, "--json") == 0
+    assert _command("--out", out, *options, "--json", done=demo) == 0
     said = capsys.readouterr()
     summary = json.loads(said.out)
     assert said.err == ""
-    assert {"frames", "path_mm", "scale", "mesh_accuracy_mm", "raw_depth_abs_rel"} < set(summary)
+    assert {"frames", "path_mm", "scale", "mesh_accuracy_mm", "raw_depth_abs_rel", "seconds"} < set(summary)
     assert summary["tracked"] == TINY.frames
     assert all(Path(file).is_file() for file in summary["pictures"])
 
-    assert _command("--out", out, *options, "--quiet") == 0
+    assert _command("--out", out, *options, "--quiet", done=demo) == 0
     said = capsys.readouterr()
     assert said.out == said.err == ""

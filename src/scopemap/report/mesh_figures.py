@@ -5,9 +5,10 @@ Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SIDE_PX = 480
 _SUBPIXEL_BITS = 4
@@ -72,14 +76,10 @@ def draw_mesh(
     views = {} if T_world_view is None else {"from the camera": inside_view(T_world_view)}
     views |= outside_views(framed, T_world_view)
     meshes = {"": mesh} | ({} if reference_mesh is None else {"truth, ": reference_mesh})
-    figure = new_figure(4.0 * len(views), 4.6 * len(meshes))
-    grid = figure.subplots(len(meshes), len(views), squeeze=False)
-    for row, (prefix, drawn) in zip(grid, meshes.items(), strict=True):
-        for axes, (title, view) in zip(row, views.items(), strict=True):
-            axes.imshow(render_mesh(drawn, view))
-            axes.set_axis_off()
-            axes.set_title(prefix + title)
-    figure.savefig(file)
+    rows = [
+        {prefix + title: render_mesh(drawn, view) for title, view in views.items()} for prefix, drawn in meshes.items()
+    ]
+    _picture_grid(rows, 4.0, 4.6).savefig(file)
 
 
 def draw_reconstruction(
@@ -100,18 +100,26 @@ def draw_reconstruction(
     everywhere = np.concatenate([positions for _, positions in paths.values()])
     views = {} if T_world_view is None else {"from behind the start": view_from_behind(T_world_view, everywhere)}
     views |= outside_views(mesh, T_world_view, everywhere)
-    figure = new_figure(4.6 * len(views), 5.2)
-    for axes, (title, view) in zip(figure.subplots(1, len(views), squeeze=False)[0], views.items(), strict=True):
-        picture = render_mesh(mesh, view)
+    pictures = {title: render_mesh(mesh, view) for title, view in views.items()}
+    for title, view in views.items():
         for name, (colour, positions) in paths.items():
-            draw_path(picture, view, positions, colour, thickness_px=widths_px[name])
-        axes.imshow(_cropped(picture))
-        axes.set_axis_off()
-        axes.set_title(title)
+            draw_path(pictures[title], view, positions, colour, thickness_px=widths_px[name])
+    figure = _picture_grid([{title: _cropped(picture) for title, picture in pictures.items()}], 4.6, 5.2)
     for name, (colour, _) in reversed(paths.items()):
         figure.axes[0].plot([], [], color=colour, linewidth=widths_px[name], label=name)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title="dot: start")
     figure.savefig(file)
+
+
+def _picture_grid(rows: Sequence[Mapping[str, np.ndarray]], width_in: float, height_in: float) -> Figure:
+    """Return a figure of pictures with their titles, each of this size in inches."""
+    figure = new_figure(width_in * len(rows[0]), height_in * len(rows))
+    for axes, pictures in zip(figure.subplots(len(rows), len(rows[0]), squeeze=False), rows, strict=True):
+        for place, (title, picture) in zip(axes, pictures.items(), strict=True):
+            place.imshow(picture)
+            place.set_axis_off()
+            place.set_title(title)
+    return figure
 
 
 def _paths(estimate_mm: np.ndarray, reference_mm: np.ndarray | None) -> dict[str, tuple[str, np.ndarray]]:

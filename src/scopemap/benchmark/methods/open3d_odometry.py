@@ -71,9 +71,7 @@ class _RgbdAligner:
         success, T, information = self._odometry.compute_rgbd_odometry(
             current.data, reference.data, camera, np.eye(4), self._term, option(depth_max=_DEPTH_MAX_UNITS)
         )
-        if not success:
-            raise _NoMotion("Open3D found no solution")
-        if not np.trace(information) > 0:
+        if not success or not np.trace(information) > 0:
             raise _NoMotion("Open3D found no pixels that correspond")
         if np.array_equal(T, np.eye(4)) and not np.array_equal(current.frame.rgb, reference.frame.rgb):
             raise _NoMotion(_SINGULAR)
