@@ -36,22 +36,11 @@ TRACKED = {"mapping.method": "none"}
 # One part each taken away or replaced: of what tracks and makes depth consistent, measured without the back end, which
 # would hide most of it ...
 FRONT_END: dict[str, dict[str, Any]] = {
-    "no corners": {"tracking.corner_depth_share": 0.0},
-    "flow never overrules": {"tracking.flow_contradiction": 0.0},
-    "no early keyframes": {"tracking.keyframe_agreement": 0.0},
-    "no distance to the frame's depth": {"tracking.depth_share": 0.0},
-    "uncertainty of depth not used to track": {"tracking.depth_sigma_share": 1e6},
+    "no corners": {"tracking.advanced.corner_depth_sigma": 0.0},
+    "no early keyframes": {"tracking.advanced.min_keyframe_agreement": 0.0},
     "keyframe every 2": {"tracking.keyframe_every": 2},
     "keyframe every 5": {"tracking.keyframe_every": 5},
     "keyframe every 20": {"tracking.keyframe_every": 20},
-    "grey values only": {"tracking.channels": "grey"},
-    "normalised values only": {"tracking.channels": "normalised"},
-    "no lamp": {"tracking.lamp_gamma": 0.0},
-    "no gain and bias": {"tracking.gain_bias": False},
-    "neither lamp nor gain and bias": {"tracking.lamp_gamma": 0.0, "tracking.gain_bias": False},
-    "no SO(3) stage": {"tracking.rotation_first": False},
-    "Gauss-Newton": {"tracking.solver": "gauss-newton"},
-    "full resolution": {"tracking.finest_level": 0},
     "no frame scale": {"mapis.advanced.frame_scale": "none"},
     "no blending": {"mapis.paper.blend": "none"},
     "constant blend": {"mapis.paper.blend": "constant"},
@@ -61,12 +50,23 @@ FRONT_END: dict[str, dict[str, Any]] = {
     "WEMA, s = 1": {"smoothing.method": "wema", "smoothing.dynamic": False},
     "no flow": {"networks.flow": "none"},
 }
+# ... of photometric alignment, where it is used: measured depth ...
+PHOTOMETRIC: dict[str, dict[str, Any]] = {
+    "no distance to the frame's depth": {"tracking.advanced.depth_weight": 0.0},
+    "grey values only": {"tracking.paper.channels": "grey"},
+    "no lamp": {"tracking.paper.lamp_gamma": 0.0},
+    "no gain and bias": {"tracking.paper.gain_bias": False},
+    "neither lamp nor gain and bias": {"tracking.paper.lamp_gamma": 0.0, "tracking.paper.gain_bias": False},
+    "no SO(3) stage": {"tracking.paper.rotation_first": False},
+    "Gauss-Newton": {"tracking.paper.solver": "gauss-newton"},
+    "full resolution": {"tracking.advanced.finest_level": 0},
+}
 # ... and of the back end, with all of the front end.
 BACK_END: dict[str, dict[str, Any]] = {
     "no loops": {"mapping.loop_landmarks": 0},
     "links to the keyframe before only": {"mapping.gaps": (1,)},
     "depth of keyframes hardly adjusted": {"mapping.scale_sigma": 1e-3},
-    "back end, but no corners while tracking": {"tracking.corner_depth_share": 0.0},
+    "back end, but no corners while tracking": {"tracking.advanced.corner_depth_sigma": 0.0},
 }
 
 
@@ -158,13 +158,10 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
         for name, changes in ({"default": {}} | BACK_END).items():
             yield Run(f"{name}: {where}", source, "sim3", light | changes)
         for name, changes in ({"as tracked": {}} | FRONT_END).items():
-            if "sigma" not in str(changes) or not settings:  # files say nothing of their uncertainty
-                yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes)
+            yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes)
     exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE | LIGHT
-    for name, changes in ({"as tracked": {}} | FRONT_END).items():
-        # True depth is left as it is, and tracked by without corners and flow.
-        if not any(key.startswith(("mapis", "networks")) or "corner" in key or "flow" in key for key in changes):
-            yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
+    for name, changes in ({"as tracked": {}} | PHOTOMETRIC).items():
+        yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
 
 
 def row(run: Run, out: Path | None) -> str:

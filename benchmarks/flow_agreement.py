@@ -17,12 +17,12 @@ import numpy as np
 
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
+from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.estimators import create_estimators
-from scopemap.geometry.se3 import inverse
-from scopemap.geometry.warp import carried_points
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence
 from scopemap.pipeline import Pipeline, Step
-from scopemap.tracking.flow_pose import flow_error_px
+from scopemap.tracking.track import FrameTracker
 
 LEAST_SHARE = 0.1
 LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
@@ -34,32 +34,42 @@ class Agreement(NamedTuple):
     moved_px: float
     off_px: float
     compared: int
-    by_flow: int
     lost: int
     frames: int
 
 
-def measure(path: Path, frames: int, config: Config) -> Agreement:
+def measure(path: Path, frames: int, config: Config, tracker: FrameTracker | None = None) -> Agreement:
     """Track a sequence and compare its poses with the flow."""
     sequence = open_sequence(path, frames=slice(0, frames))
-    pipeline = Pipeline(config, create_estimators(config, sequence))
-    moved, off, steps = [], [], []
+    pipeline = Pipeline(config, create_estimators(config, sequence), tracker=tracker)
+    moved, off, lost = [], [], []
     last: Step | None = None
     for frame in sequence.frames():
         percept = pipeline.perceive(frame)
         step = pipeline.step(percept)
         if last is not None and percept.link is not None and "lost" not in (step.track.status, last.track.status):
-            link, camera = percept.link, frame.camera
-            seen = carried_points(last.refined.depth_mm, link.to_previous, link.consistent, camera)
-            if seen.share >= LEAST_SHARE:
+            points_mm, pixels = observed(last, percept.link)
+            if len(pixels) >= LEAST_SHARE * frame.valid.size:
                 T_current_last = inverse(step.track.T_world_camera) @ last.track.T_world_camera
-                moved.append(flow_error_px(seen, camera, np.eye(4)))
-                off.append(flow_error_px(seen, camera, T_current_last))
+                for errors, T in ((moved, np.eye(4)), (off, T_current_last)):
+                    projected = frame.camera.project(transform(T, points_mm))
+                    errors.append(float(np.median(np.linalg.norm(projected - pixels, axis=1))))
         last = step
-        steps.append(step.track)
-    counts = (sum(track.reason == "flow decided" for track in steps), sum(track.status == "lost" for track in steps))
+        lost.append(step.track.status == "lost")
     medians = (float(np.median(values)) if values else float("nan") for values in (moved, off))
-    return Agreement(*medians, len(off), *counts, len(steps))
+    return Agreement(*medians, len(off), sum(lost), len(lost))
+
+
+def observed(last: Step, link: DenseCorrespondence) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) of the last frame, mm, and the pixels (N, 2) of the current frame where flow finds them."""
+    rows, columns = np.nonzero(link.consistent)
+    pixels = np.column_stack([columns, rows])
+    there = pixels + link.to_previous[rows, columns]
+    camera, depth_mm = last.frame.camera, last.refined.depth_mm
+    nearest = np.clip(np.rint(there), 0, [camera.width - 1, camera.height - 1]).astype(int)
+    found_mm = depth_mm[nearest[:, 1], nearest[:, 0]]
+    known = np.isfinite(found_mm)
+    return camera.unproject(there[known]) * found_mm[known, None], pixels[known]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -74,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     found = measure(options.input, options.frames, config)
     print(
         f"{options.input.name}: tissue moves by {found.moved_px:.1f} px a frame, poses are {found.off_px:.2f} px from "
-        f"that ({found.compared} pairs); of {found.frames} frames flow decided {found.by_flow}, {found.lost} were lost"
+        f"that ({found.compared} pairs); of {found.frames} frames {found.lost} were lost"
     )
 
 

@@ -24,7 +24,7 @@ from scopemap.cameras.rectification import Rectifier
 from scopemap.depth.files import depth_files
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.frame import Frame
-from scopemap.tracking import FrameTracker
+from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.trajectory import Trajectory
 
 CAMERA = PinholeCamera(200.58, 200.47, 167.0, 136.7, 337, 270)

@@ -12,7 +12,7 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
-from scopemap.flow.corners import corners, sampled_at
+from scopemap.flow.corners import detect_corners, sample_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
@@ -107,7 +107,7 @@ def test_corners_are_found_where_there_are_some_and_only_on_usable_tissue() -> N
     valid[:, 200:] = False
     depth_mm = np.full((180, 240), 50.0, np.float32)
     depth_mm[150:] = np.nan
-    places = corners(Frame(0, 0.0, rgb, CAMERA, valid, depth_mm), 16)
+    places = detect_corners(Frame(0, 0.0, rgb, CAMERA, valid, depth_mm), 16)
     for x, y in ((41.5, 41.5), (137.5, 101.5)):
         assert np.abs(places - [x, y]).max(1).min() <= 3
     assert places[:, 0].max() < 200
@@ -129,7 +129,7 @@ def test_keyframes_without_a_single_corner_are_no_harm() -> None:
 def test_more_points_than_opencv_takes_columns_are_sampled() -> None:
     flow = np.random.default_rng(0).normal(size=(180, 240, 2)).astype(np.float32)
     pixel = np.tile([[3.0, 5.0], [10.0, 20.0], [-5.0, 2.0]], (12000, 1))
-    found = sampled_at(flow, pixel)
+    found = sample_flow(flow, pixel)
     np.testing.assert_allclose(found[:2], [flow[5, 3], flow[20, 10]], atol=1e-5)
     assert np.isnan(found[2]).all()
     assert found.shape == (36000, 2)

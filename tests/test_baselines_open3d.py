@@ -22,7 +22,7 @@ from scopemap.evaluation.poses import evaluate_poses
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.runner import reconstruct
-from scopemap.tracking import FrameTracker, Track
+from scopemap.tracking.track import FrameTracker, Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLOUR, CLOUDS = list(RGBD_METHODS), list(ICP_METHODS)

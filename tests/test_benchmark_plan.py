@@ -124,7 +124,11 @@ def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "ours"', 'name = "ours"\nsettings = { "tracking.hubber" = 2 }', "did you mean 'tracking.huber'"),
+        (
+            'name = "ours"',
+            'name = "ours"\nsettings = { "tracking.hubber" = 2 }',
+            "did you mean 'tracking.advanced.huber'",
+        ),
         ('name = "ours"', 'name = "theirs"', "two methods have the name 'theirs'"),
         ('name = "ours"', 'name = "ours"\nuse = "import"', "belong together"),
         ('scene = "tube"', 'scene = "nose"', "scene"),

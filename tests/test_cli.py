@@ -144,11 +144,12 @@ def test_frames_is_a_slice(scopemap: Say, images: Path, tmp_path: Path, text: st
 
 def test_options_reach_the_settings_and_win_over_a_file(scopemap: Say, images: Path, tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[tracking]\nhuber = 2.5\nkeyframe_every = 3\n[networks]\nflow = 'dis'\n")
-    arguments = ("--config", tmp_path / "s.toml", "--set", "tracking.huber=1.5", "--flow", "none", "--device", "cpu")
+    options = ("--set", "tracking.advanced.huber=1.5", "--flow", "none", "--device", "cpu")
+    arguments = ("--config", tmp_path / "s.toml", *options)
     said = scopemap("run", images, "--out", tmp_path / "out", "--size", "80x64", "--fov", "90", *arguments, "--json")
     assert said.code == 0, said.err
     written = (tmp_path / "out" / "config.toml").read_text()
-    for line in ("tracking.huber = 1.5", "tracking.keyframe_every = 3", 'networks.flow = "none"', '"cpu"'):
+    for line in ("tracking.advanced.huber = 1.5", "tracking.keyframe_every = 3", 'networks.flow = "none"', '"cpu"'):
         assert line in written
     camera = said.json["camera"]
     assert (camera["width"], camera["height"], camera["fx"]) == (80, 64, pytest.approx(40.0))
@@ -281,9 +282,9 @@ def test_bad_input_is_one_line(
 @pytest.mark.parametrize(
     ("arguments", "pattern"),
     [
-        (("--set", "tracking.hubber=2"), "unknown setting 'tracking.hubber': did you mean 'tracking.huber'"),
-        (("--set", "tracking.huber"), "expected KEY=VALUE"),
-        (("--set", "tracking.huber=-1"), r"'tracking\.huber'.*greater than 0.*got -1"),
+        (("--set", "tracking.hubber=2"), "unknown setting 'tracking.hubber': did you mean 'tracking.advanced.huber'"),
+        (("--set", "tracking"), "expected KEY=VALUE"),
+        (("--set", "tracking.advanced.huber=-1"), r"'tracking\.advanced\.huber'.*greater than 0.*got -1"),
         (("--frames", "3"), "expected START:STOP"),
         (("--frames", "0:9:0"), "step must be positive"),
         (("--frames", "50:60"), "0 frame.* two are needed"),

@@ -42,14 +42,18 @@ def _write(tmp_path: Path, text: str) -> Path:
 
 def test_precedence(tmp_path: Path) -> None:
     file = _write(tmp_path, "[tracking]\nhuber = 2.5\nkeyframe_every = 7\n[smoothing]\nmethod = 'none'\n")
-    names = {"tracking.huber": 3.5}
+    names = {"tracking.advanced.huber": 3.5}
     assert Config.load().tracking.keyframe_every == 10
     assert Config.load("paper").tracking.keyframe_every == 2
     assert Config.load("paper", file).tracking.keyframe_every == 7
     assert Config.load("paper", file).smoothing.method == "none"
-    assert Config.load("paper", file).tracking.huber == 2.5
+    assert Config.load("paper", file).tracking.advanced.huber == 2.5
     loaded = Config.load("paper", file, names)
-    assert (loaded.tracking.huber, loaded.tracking.keyframe_every, loaded.mapis.paper.order) == (3.5, 7, "refine-first")
+    assert (loaded.tracking.advanced.huber, loaded.tracking.keyframe_every, loaded.mapis.paper.order) == (
+        3.5,
+        7,
+        "refine-first",
+    )
     assert loaded.preset == "paper"
 
 
@@ -100,8 +104,8 @@ def test_an_unknown_key_like_nothing_is_still_refused() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "what"),
     [
-        ("tracking.huber", 0, "greater than 0"),
-        ("tracking.huber", "wide", "valid number"),
+        ("tracking.advanced.huber", 0, "greater than 0"),
+        ("tracking.advanced.huber", "wide", "valid number"),
         ("mapis.paper.blend", "mixed", "'exponential'"),
         ("mask.advanced.dark_level", 300, "less than or equal to 255"),
         ("depth.near_far_mm", [1, 2, 3], "at most 2"),
@@ -116,8 +120,8 @@ def test_an_impossible_value_is_refused_by_name(key: str, value: object, what: s
 
 def test_several_faults_are_told_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
-        Config.load(settings={"tracking.huber": -1, "fusion.voxel_mm": 0})
-    assert all(key in str(caught.value) for key in ("tracking.huber", "fusion.voxel_mm", "got -1"))
+        Config.load(settings={"tracking.advanced.huber": -1, "fusion.voxel_mm": 0})
+    assert all(key in str(caught.value) for key in ("tracking.advanced.huber", "fusion.voxel_mm", "got -1"))
 
 
 def test_smoothing_weights_that_sum_to_one_are_taken() -> None:
@@ -141,13 +145,15 @@ def test_an_unreadable_file_is_refused(tmp_path: Path, content: bytes) -> None:
 
 
 def test_values_may_be_text() -> None:
-    config = Config.load(settings={"tracking.huber": "2.5", "fusion.enabled": "false", "tracking.levels": "3"})
-    assert (config.tracking.huber, config.fusion.enabled, config.tracking.levels) == (2.5, False, 3)
+    config = Config.load(
+        settings={"tracking.advanced.huber": "2.5", "fusion.enabled": "false", "tracking.advanced.levels": "3"}
+    )
+    assert (config.tracking.advanced.huber, config.fusion.enabled, config.tracking.advanced.levels) == (2.5, False, 3)
 
 
 def test_settings_are_frozen() -> None:
     with pytest.raises(ValueError, match="frozen"):
-        Config().tracking.huber = 3.0  # type: ignore[misc]
+        Config().tracking.advanced.huber = 3.0  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -165,20 +171,20 @@ numbers = st.floats(1e-9, 1e9, allow_nan=False, allow_infinity=False)
 @given(numbers, st.booleans(), st.none() | st.tuples(numbers, numbers), texts)
 def test_toml_round_trip(huber: float, fused: bool, near_far: Range, folder: str) -> None:
     given = {
-        "tracking.huber": huber,
+        "tracking.advanced.huber": huber,
         "fusion.enabled": fused,
         "depth.near_far_mm": near_far,
         "depth.backend": f"files:{folder}",
     }
     config = Config.load(settings=given)
     tree = tomllib.loads(config.toml())
-    assert tree["tracking"]["huber"] == huber
+    assert tree["tracking"]["advanced"]["huber"] == huber
     assert tree["depth"]["backend"] == f"files:{folder}"
     assert Config.model_validate(tree) == config
 
 
 def test_a_runs_file_repeats_the_run_without_naming_its_preset(tmp_path: Path) -> None:
-    config = Config.load("paper", settings={"tracking.huber": 3.0})
+    config = Config.load("paper", settings={"tracking.advanced.huber": 3.0})
     assert Config.load(file=_write(tmp_path, config.toml())) == config
 
 
@@ -188,7 +194,7 @@ def test_a_preset_named_in_a_file_is_applied(tmp_path: Path) -> None:
 
 def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> None:
     file = _write(tmp_path, 'preset = "paper"\n[tracking]\nhuber = 2.5\n')
-    realtime = Config.load("realtime", settings={"tracking.huber": 2.5})
+    realtime = Config.load("realtime", settings={"tracking.advanced.huber": 2.5})
     assert Config.load(settings={"preset": "paper"}) == Config.load("paper")
     assert Config.load("realtime", file) == realtime
     assert Config.load("default", file, {"preset": "realtime"}) == realtime
@@ -204,7 +210,7 @@ def test_any_text_goes_through_a_file(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "nan", "inf"])
-@pytest.mark.parametrize("key", ["tracking.huber", "fusion.voxel_mm"])
+@pytest.mark.parametrize("key", ["tracking.advanced.huber", "fusion.voxel_mm"])
 def test_what_is_no_number_is_refused(key: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"'{key}'.*finite number"):
         Config.load(settings={key: value})

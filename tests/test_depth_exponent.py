@@ -298,7 +298,7 @@ def test_an_impossible_exponent_is_refused(value: object) -> None:
 
 
 def test_the_fit_takes_the_place_of_the_word_and_of_nothing_else() -> None:
-    given = {"tracking.huber": 2.0, "depth.advanced.shading_exponent": 0.5}
+    given = {"tracking.advanced.huber": 2.0, "depth.advanced.shading_exponent": 0.5}
     config = Config.load(settings={"depth.exponent": "fit", **given})
     found = sequence_exponent(fits(*[1.25] * 6)).applied(config)
     assert found == Config.load(settings={"depth.exponent": 1.25, **given})

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.tracking import Tracker
 from scopemap.tracking.residuals import Loss, View, depth_residuals, normal_equations
+from scopemap.tracking.tracker import Tracker
 
 CAMERA = PinholeCamera(70.0, 72.0, 39.2, 31.4, 80, 64)
 UNIT_MM = 40.0
@@ -112,12 +113,14 @@ def test_shape_alone_is_tracked_where_depth_is_measured() -> None:
     step = se3_exp(np.array([0.004, -0.006, 0.008, 0.2, -0.15, 0.1]))
     poses = [np.linalg.matrix_power(step, n) for n in range(5)]
     frames = [_bumpy(T, n) for n, T in enumerate(poses)]
-    settings = TrackingSettings(finest_level=0, min_inlier_share=0.0)
+    settings = chosen(TrackingSettings, finest_level=0, min_inlier_share=0.0)
     for found, true in zip(_tracked(frames, settings, measured=True), poses[1:], strict=True):
         error = inverse(true) @ found
         assert np.linalg.norm(error[:3, 3]) < 0.02
         assert np.degrees(rotation_angle_rad(error[:3, :3])) < 0.02
-    blind = _tracked(frames, settings.model_copy(update={"depth_share": 0.0}), measured=True)
+    blind = _tracked(
+        frames, chosen(TrackingSettings, finest_level=0, min_inlier_share=0.0, depth_weight=0.0), measured=True
+    )
     assert np.linalg.norm((inverse(poses[-1]) @ blind[-1])[:3, 3]) > 0.3
 
 
@@ -127,12 +130,12 @@ def test_predicted_depth_of_a_frame_has_no_say_in_its_own_pose() -> None:
     rgb = random.integers(40, 200, (64, 80, 3)).astype(np.uint8)
     frames = [replace(frame, rgb=np.roll(rgb, n, 1)) for n, frame in enumerate(frames)]
     spoilt = [frames[0], replace(frames[1], depth_mm=frames[1].depth_mm * np.float32(1.05))]
-    settings = TrackingSettings(finest_level=0, min_inlier_share=0.0)
+    settings = chosen(TrackingSettings, finest_level=0, min_inlier_share=0.0)
     for measured in (False, True):
         one, other = (_tracked(some, settings, measured=measured)[0] for some in (frames, spoilt))
         assert np.array_equal(one, other) is not measured
 
 
 def test_the_paper_has_no_geometric_residual() -> None:
-    assert Config.load("paper").tracking.depth_share == 0
-    assert Config().tracking.depth_share > 0
+    assert Config.load("paper").tracking.advanced.depth_weight == 0
+    assert Config().tracking.advanced.depth_weight > 0

@@ -1,9 +1,8 @@
-"""How the uncertainty of depth flows: from the estimate through anchor, blend, tracking and fusion, in closed form."""
+"""How the uncertainty of depth flows: from the estimate through anchor, blend and fusion, in closed form."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from tiny_phantom import only_images, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import DepthSettings, FusionSettings, MapisSettings, TrackingSettings
+from scopemap.config import DepthSettings, FusionSettings, MapisSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.correspondence import DenseCorrespondence
@@ -25,13 +24,10 @@ from scopemap.depth.shading import ShadingDepth
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
-from scopemap.geometry.se3 import inverse, se3
+from scopemap.geometry.se3 import se3
 from scopemap.geometry.uncertainty import blended_share, by_variance, depth_trust, faded_share, sigma_share
-from scopemap.phantom.render import prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.pipeline import Estimators, Step
-from scopemap.tracking import Tracker
-from scopemap.tracking.pyramid import build_pyramid
 
 SHAPE = (48, 64)
 CAMERA = PinholeCamera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -41,7 +37,6 @@ SHARE, SHARE_OTHER = (RNG.uniform(0.02, 0.4, SHAPE).astype(np.float32) for _ in 
 DISTANCE = RNG.uniform(0, 1.4, SHAPE).astype(np.float32)
 APPROACH = se3(np.eye(3), np.array([0.0, 0.0, -5.0]))
 SPEC = PhantomSpec(scene="colon", frames=6, width=160, height=128, seed=4)
-TRACKING = TrackingSettings(finest_level=0)
 
 
 # ---- the mathematics
@@ -217,73 +212,6 @@ def test_the_scale_of_a_frame_is_that_of_its_sigma() -> None:
     np.testing.assert_allclose(refined.sigma_mm, SHARE * DEPTH, rtol=1e-4)
 
 
-# ---- tracking
-
-
-@cache
-def _frames() -> tuple[list[Frame], np.ndarray]:
-    phantom, frames = prepare(SPEC), []
-    for index in range(SPEC.frames or 0):
-        rgb, depth_mm = render_frame(phantom, index)
-        valid = np.isfinite(depth_mm) & (rgb.max(-1) > 20) & (rgb.max(-1) < 240)
-        frames.append(Frame(index, index / 30, rgb, SPEC.camera, valid, depth_mm))
-    return frames, inverse(phantom.poses[0]) @ phantom.poses
-
-
-def _tracked(keyframe: Frame, **changes: Any) -> np.ndarray:
-    tracker = Tracker(TRACKING.model_copy(update=changes))
-    tracker.track(keyframe)
-    assert tracker.adopt(replace(keyframe, T_world_camera=np.eye(4)), measured=False)
-    return np.stack([tracker.track(frame).T_world_camera for frame in _frames()[0][1:]])
-
-
-def test_the_pyramid_weighs_pixels_by_their_trust_and_keeps_its_pictures() -> None:
-    frame = _frames()[0][0]
-    share = RNG.uniform(0.02, 0.5, frame.valid.shape).astype(np.float32)
-    doubted = replace(frame, depth_sigma_mm=share * frame.depth_mm)
-    plain, weighed = build_pyramid(frame, TRACKING), build_pyramid(doubted, TRACKING)
-    trust = depth_trust(np.where(frame.valid, frame.depth_mm, np.nan), doubted.depth_sigma_mm, 0.05)
-    np.testing.assert_allclose(weighed[0].weight, frame.valid * trust, rtol=1e-6)
-    quarter = weighed[1].weight[30, 40]
-    block = np.s_[60:62, 80:82]
-    assert frame.valid[block].all()
-    assert quarter == pytest.approx(trust[block].mean(), rel=1e-5)
-    for one, other in zip(plain, weighed, strict=True):
-        np.testing.assert_array_equal(one.channels, other.channels)
-        np.testing.assert_array_equal(one.depth_mm, other.depth_mm)
-        np.testing.assert_array_equal(one.weight > 0, other.weight > 0)
-        assert set(np.unique(one.weight)) <= {0.0, 1.0}
-
-
-def test_tracking_with_sigma_in_proportion_to_depth_is_tracking_without() -> None:
-    frame = _frames()[0][0]
-    plain = _tracked(frame)
-    same = _tracked(replace(frame, depth_sigma_mm=0.2 * frame.depth_mm))
-    np.testing.assert_allclose(same, plain, atol=1e-5)
-    wild = replace(frame, depth_sigma_mm=RNG.uniform(0.1, 30, frame.valid.shape).astype(np.float32))
-    np.testing.assert_allclose(_tracked(wild, depth_sigma_share=1e6), plain, atol=1e-5)
-    assert np.abs(_tracked(wild) - plain).max() > 1e-3
-
-
-def test_pixels_whose_sigma_is_huge_have_no_say_in_tracking() -> None:
-    frame = _frames()[0][0]
-    wrong = np.zeros(frame.valid.shape, bool)
-    wrong[:, :70] = True
-    spoilt = replace(frame, depth_mm=np.where(wrong, 2.5 * frame.depth_mm, frame.depth_mm).astype(np.float32))
-    sigma_mm = np.where(wrong, 1e9, 0.05 * frame.depth_mm).astype(np.float32)
-    truth, without = _frames()[1], replace(frame, valid=frame.valid & ~wrong)
-    errors = {
-        name: np.linalg.norm(_tracked(keyframe)[-1, :3, 3] - truth[-1, :3, 3])
-        for name, keyframe in {
-            "told": replace(spoilt, depth_sigma_mm=sigma_mm),
-            "untold": spoilt,
-            "masked": without,
-        }.items()
-    }
-    assert errors["told"] < 0.3 * errors["untold"]
-    assert errors["told"] < errors["masked"] + 0.05
-
-
 # ---- fusion
 
 
@@ -358,8 +286,7 @@ def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.
     create, runs = create_estimators, {}
     # Shading tells no uncertainty of its own. Equal sigmas change no weight but that of the back end's depth prior.
     light = {"networks.flow": "dis", "networks.perceptual": "structure", "mapping.method": "none"}
-    # Corners doubt all depth alike, and would hide what the photometric weights do.
-    config = Config.load(settings={"depth.backend": "shading", "tracking.corner_depth_share": 0, **light})
+    config = Config.load(settings={"depth.backend": "shading", **light})
     for name, left in {"none": None, "equal": 0.1, "doubted": 1.0}.items():
 
         def telling(config: Config, sequence: Any, left: float | None = left) -> Estimators:
@@ -376,4 +303,4 @@ def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.
     assert np.nanmedian(shares[:, : half - 20]) > 2 * np.nanmedian(shares[:, half + 20 :])
     plain, equal = runs["none"][0].trajectory.T_world_camera, runs["equal"][0].trajectory.T_world_camera
     np.testing.assert_allclose(equal, plain, atol=1e-4)
-    assert np.abs(result.trajectory.T_world_camera - plain).max() > 1e-3
+    assert len(result.mesh.vertices) != len(runs["none"][0].mesh.vertices)

@@ -18,7 +18,7 @@ from scopemap.errors import SettingsError, WeightsError
 from scopemap.flow.consistency import agree, pair_flow
 from scopemap.flow.create import create_flow
 from scopemap.flow.dis import DisFlow
-from scopemap.flow.none import NoFlow
+from scopemap.flow.estimator import NoFlow
 from scopemap.flow.raft import RaftFlow, torchvision_names
 from scopemap.geometry.warp import pull
 

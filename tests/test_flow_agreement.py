@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
-from tiny_phantom import write_tiny
+from tiny_phantom import with_true_depth, write_tiny
 
-from scopemap.tracking import Tracker
+from scopemap.benchmark.methods.standing_still import StandingStill
+from scopemap.tracking.track import FrameTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -22,23 +21,24 @@ def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("agreement") / "phantom", frames=7)
 
 
-def _said(phantom: Path, capsys: pytest.CaptureFixture[str]) -> tuple[float, float]:
+def _measured(phantom: Path, tracker: FrameTracker | None = None) -> flow_agreement.Agreement:
+    fixed = {"mapping__method": "none", "fusion__enabled": False, "depth__files_kind": "depth"}
+    light = {"networks__flow": "dis", "networks__perceptual": "structure"}
+    return flow_agreement.measure(phantom, 7, with_true_depth(phantom, **fixed, **light), tracker)
+
+
+def test_good_poses_agree_with_the_flow(phantom: Path) -> None:
+    found = _measured(phantom)
+    assert (found.compared, found.lost, found.frames) == (6, 0, 7)
+    assert found.off_px < 0.4 < found.moved_px
+
+
+def test_standing_still_errs_by_the_motion_of_the_tissue(phantom: Path) -> None:
+    found = _measured(phantom, StandingStill())
+    assert found.off_px == pytest.approx(found.moved_px)
+
+
+def test_the_result_is_printed(phantom: Path, capsys: pytest.CaptureFixture[str]) -> None:
     depth = ["--set", f"depth.backend=files:{phantom}", "--set", "depth.files_kind=depth"]
-    flow_agreement.main(["--input", str(phantom), *depth, "--set", "tracking.flow_contradiction=0"])
-    words = capsys.readouterr().out.split()
-    assert "(6 pairs);" in " ".join(words)
-    numbers = [float(word) for before, word in pairwise(words) if before in ("by", "are")]
-    return numbers[0], numbers[1]
-
-
-def test_good_poses_agree_with_the_flow(phantom: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    moved_px, off_px = _said(phantom, capsys)
-    assert off_px < 0.4 < moved_px
-
-
-def test_standing_still_is_as_far_off_as_tissue_moves(
-    phantom: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Tracker, "_T_world_camera", staticmethod(lambda keyframe, alignment: np.eye(4)))
-    moved_px, off_px = _said(phantom, capsys)
-    assert off_px == pytest.approx(moved_px, abs=0.06)  # one digit and two are said
+    flow_agreement.main(["--input", str(phantom), "--frames", "3", *depth])
+    assert "(2 pairs); of 3 frames 0 were lost" in capsys.readouterr().out

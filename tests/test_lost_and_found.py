@@ -8,15 +8,17 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
+from chosen_settings import chosen
 from plane_scene import CAMERA
 
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking import Track, Tracker
-from scopemap.tracking.sharpness import Clarity, detail_of
+from scopemap.tracking.sharpness import SharpnessMonitor, sharpness
+from scopemap.tracking.track import Track
+from scopemap.tracking.tracker import Tracker
 
-SETTINGS = TrackingSettings(keyframe_every=3, finest_level=0)
+SETTINGS = chosen(TrackingSettings, keyframe_every=3, finest_level=0)
 # Slowly on, then, unseen, far away and turned.
 NEAR = [plane_scene.pose(at_mm=(1.0 * n, 0.3 * n, 0.0), turn_rad=(0.0, 0.0, 0.005 * n)) for n in range(8)]
 FAR = [plane_scene.pose(at_mm=(27.0 + n, 8.0, 4.0), turn_rad=(0.05, -0.1, 0.3)) for n in range(3)]
@@ -52,12 +54,12 @@ def _off(track: Track, T_world_camera: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("spoil", [_smoked, _blurred])
-def test_veiled_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: ignore[no-untyped-def]
+def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: ignore[no-untyped-def]
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]
     spoilt = [*frames[:4], spoil(frames[4]), spoil(frames[5]), *frames[6:]]
     tracks = _tracked(spoilt)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 3 + ["lost"] * 2 + ["ok"] * 2
-    assert "usual detail" in tracks[4].reason
+    assert "usual sharpness" in tracks[4].reason
     assert not {track.keyframe for track in tracks} & {4, 5}
     turn, way_mm = _off(tracks[-1], NEAR[-1])
     assert turn < np.radians(0.4)
@@ -67,20 +69,20 @@ def test_veiled_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: ig
 def test_the_gate_can_be_opened() -> None:
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]
     frames[4] = _smoked(frames[4])
-    opened = SETTINGS.model_copy(update={"least_detail": 0.0})
-    assert not [track for track in _tracked(frames, opened) if "detail" in track.reason]
+    opened = SETTINGS.model_copy(update={"min_sharpness": 0.0})
+    assert not [track for track in _tracked(frames, opened) if "sharpness" in track.reason]
 
 
 @pytest.mark.parametrize("remembered", [10, 0])
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
     dark = replace(_frame(8, NEAR[-1]), valid=np.zeros_like(plane_scene.EVERYWHERE))
     frames = [*(_frame(n, T) for n, T in enumerate(NEAR)), dark, *(_frame(9 + n, T) for n, T in enumerate(FAR))]
-    tracks = _tracked(frames, SETTINGS.model_copy(update={"remembered_keyframes": remembered}))
+    tracks = _tracked(frames, SETTINGS.model_copy(update={"relocalisation_keyframes": remembered}))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
     if remembered:
         assert tracks[9].status == "ok"
-        assert tracks[9].reason == "found again"
+        assert tracks[9].reason == "relocalised"
         assert turn < np.radians(0.5)
         assert way_mm < 0.5
         assert [track.status for track in tracks[10:]] == ["ok", "ok"]
@@ -89,14 +91,14 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
         assert tracks[9].status == "lost" or way_mm > 2
 
 
-def test_clarity_is_a_share_of_what_was_usual() -> None:
+def test_relative_sharpness_is_a_share_of_the_recent_median() -> None:
     frame = _frame(0, NEAR[0])
 
     def after_itself(other: Frame) -> float:
-        clarity = Clarity()
-        assert clarity.against_recent(frame) == 1.0
-        assert clarity.against_recent(frame) == pytest.approx(1.0)
-        return clarity.against_recent(other)
+        monitor = SharpnessMonitor()
+        assert monitor.relative_sharpness(frame) == 1.0
+        assert monitor.relative_sharpness(frame) == pytest.approx(1.0)
+        return monitor.relative_sharpness(other)
 
     assert after_itself(_blurred(frame)) < 0.5
     assert after_itself(_smoked(frame)) < 0.3
@@ -104,19 +106,19 @@ def test_clarity_is_a_share_of_what_was_usual() -> None:
     assert after_itself(replace(frame, rgb=(0.7 * frame.rgb).astype(np.uint8))) == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_is_unclear_for_long_becomes_usual() -> None:
-    sharp, soft, clarity = _frame(0, NEAR[0]), _blurred(_frame(0, NEAR[0])), Clarity()
+def test_what_is_unsharp_for_long_becomes_usual() -> None:
+    sharp, soft, monitor = _frame(0, NEAR[0]), _blurred(_frame(0, NEAR[0])), SharpnessMonitor()
     for _ in range(30):
-        clarity.against_recent(sharp)
-    shares = [clarity.against_recent(soft) for _ in range(30)]
+        monitor.relative_sharpness(sharp)
+    shares = [monitor.relative_sharpness(soft) for _ in range(30)]
     assert shares[9] < 0.6
     assert shares[-1] == pytest.approx(1.0)
 
 
-def test_nothing_usable_shows_no_detail() -> None:
+def test_nothing_usable_is_not_sharp() -> None:
     frame = _frame(0, NEAR[0])
-    assert detail_of(replace(frame, valid=np.zeros_like(frame.valid))) == 0.0
-    assert detail_of(replace(frame, rgb=np.zeros_like(frame.rgb))) == 0.0
+    assert sharpness(replace(frame, valid=np.zeros_like(frame.valid))) == 0.0
+    assert sharpness(replace(frame, rgb=np.zeros_like(frame.rgb))) == 0.0
 
 
 def _elsewhere(index: int, n: int) -> Frame:
@@ -130,14 +132,14 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
     back = [_frame(17 + n, T) for n, T in enumerate(NEAR[:3])]
     tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
-    assert tracks[11].reason == "begins a new map"
+    assert tracks[11].reason == "new map"
     assert [track.map for track in tracks] == [0] * 11 + [1] * 6 + [0] * 3
     assert [track.status for track in tracks[12:]] == ["ok"] * 8
     # The new map's world is its first frame's camera.
     np.testing.assert_array_equal(tracks[11].T_world_camera, np.eye(4))
     np.testing.assert_allclose(np.linalg.norm(tracks[16].T_world_camera[:3, 3]), 5.0, atol=0.3)
     # And the old one is where it was.
-    assert tracks[17].reason == "found again"
+    assert tracks[17].reason == "relocalised"
     turn, way_mm = _off(tracks[17], NEAR[0])
     assert turn < np.radians(0.4)
     assert way_mm < 0.3
@@ -154,7 +156,7 @@ def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
     assert tracks[-1].status == "ok"
 
 
-def test_a_bare_wall_is_said_to_constrain_nothing() -> None:
+def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
     rng = np.random.default_rng(0)
 
     def bare(index: int) -> Frame:
@@ -192,13 +194,13 @@ def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
         [*frames, *nothing, replace(frames[4], index=78)], SETTINGS.model_copy(update={"new_map_after": 1})
     )
     assert max(track.map for track in tracks) > 20
-    assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "found again", 0)
+    assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "relocalised", 0)
     turn, way_mm = _off(tracks[-1], NEAR[4])
     assert turn < np.radians(0.4)
     assert way_mm < 0.3
 
 
-def test_no_world_begins_with_an_unclear_frame() -> None:
+def test_no_map_begins_with_an_unsharp_frame() -> None:
     tracker, frame = Tracker(SETTINGS), _frame(0, NEAR[0])
     assert tracker.track(frame).status == "initial"
     # Not adopted, for want of depth: the next one fixes the world, unless it shows nothing.

@@ -29,7 +29,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
-from scopemap.tracking import Track
+from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FIRST, SECOND, GIVEN_UP = 10, 13, 2

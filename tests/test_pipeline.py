@@ -25,7 +25,8 @@ from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.pipeline import Estimators, Step
-from scopemap.tracking import Track, Tracker
+from scopemap.tracking.track import Track
+from scopemap.tracking.tracker import Tracker
 from scopemap.trajectory.formats.opening import read_trajectory
 
 WITHOUT_NETWORKS = {"networks__flow": "dis", "networks__perceptual": "structure"}

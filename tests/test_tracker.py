@@ -7,19 +7,21 @@ from functools import cache
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.phantom.render import prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.tracking import Tracker
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.rtdl import align
+from scopemap.tracking.tracker import Tracker
 
 SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
 # By what is seen alone: measured depth of the frames would hide what these tests look at.
-SETTINGS = TrackingSettings(finest_level=0, depth_share=0.0)
+PLAIN = {"finest_level": 0, "depth_weight": 0.0}
+SETTINGS = chosen(TrackingSettings, **PLAIN)
 
 
 @cache
@@ -51,7 +53,7 @@ def _track_all(settings: TrackingSettings, frames: list[Frame]) -> list[np.ndarr
 
 def test_alignment_finds_the_true_motion() -> None:
     frames, truth = _sequence()
-    reference = build_pyramid(frames[0], SETTINGS, trust_slope=True)
+    reference = build_pyramid(frames[0], SETTINGS, use_slope=True)
     found = align(reference, build_pyramid(frames[6], SETTINGS), np.eye(4), SETTINGS)
     moved_mm, turned_deg = _errors(inverse(found.motion.T_current_reference), truth[6])
     assert np.linalg.norm(truth[6][:3, 3]) > 1.5  # standing still would not do
@@ -65,11 +67,9 @@ def test_alignment_finds_the_true_motion() -> None:
     "changes",
     [
         {"channels": "grey"},
-        {"channels": "normalised"},
         {"solver": "gauss-newton"},
         {"rotation_first": False},
         {"lamp_gamma": 0.0, "gain_bias": False},
-        {"start": "velocity"},
         {"start": "identity", "keyframe_every": 2},
         {"finest_level": 1},
     ],
@@ -77,11 +77,12 @@ def test_alignment_finds_the_true_motion() -> None:
 def test_every_ablation_tracks_and_changes_the_result(changes: dict[str, object]) -> None:
     frames, truth = _sequence()
     plain = _track_all(SETTINGS, frames)
-    poses = _track_all(SETTINGS.model_copy(update=changes), frames)
+    poses = _track_all(chosen(TrackingSettings, **PLAIN | changes), frames)
     moved_mm, turned_deg = _errors(poses[-1], truth[-1])
     assert moved_mm < 0.6
     assert turned_deg < 1.0
-    assert np.abs(poses[-1] - plain[-1]).max() > 0
+    # A tenth of a micrometre or more: the part is not ignored.
+    assert np.abs(poses[-1] - plain[-1]).max() > 1e-4
 
 
 def test_gain_and_bias_make_up_for_exposure() -> None:
@@ -89,8 +90,8 @@ def test_gain_and_bias_make_up_for_exposure() -> None:
     darker = replace(frames[3], rgb=(0.8 * frames[3].rgb).astype(np.uint8))
     errors = {}
     for gain_bias in (True, False):
-        settings = SETTINGS.model_copy(update={"channels": "grey", "gain_bias": gain_bias})
-        reference = build_pyramid(frames[0], settings, trust_slope=True)
+        settings = chosen(TrackingSettings, **PLAIN, channels="grey", gain_bias=gain_bias)
+        reference = build_pyramid(frames[0], settings, use_slope=True)
         found = align(reference, build_pyramid(darker, settings), np.eye(4), settings)
         errors[gain_bias] = _errors(inverse(found.motion.T_current_reference), truth[3])[0]
     assert errors[True] < 0.25 * errors[False]
@@ -126,7 +127,7 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
             tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 4 + ["lost"] * 2 + ["ok"] * 5
     assert tracks[5].reason == "only 0% of the image is usable"
-    assert "agree with the keyframe" in tracks[6].reason
+    assert "inlier share" in tracks[6].reason
     np.testing.assert_array_equal(tracks[6].T_world_camera, tracks[4].T_world_camera)
     moved_mm, turned_deg = _errors(tracks[-1].T_world_camera, truth[-1])
     assert moved_mm < 0.3
@@ -135,7 +136,7 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
 
 def test_a_jump_is_not_believed() -> None:
     frames, _ = _sequence()
-    tracker = Tracker(SETTINGS.model_copy(update={"max_step": 1e-4}))
+    tracker = Tracker(chosen(TrackingSettings, **PLAIN, max_step=1e-4))
     first = tracker.track(frames[0])
     tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
     track = tracker.track(frames[4])
@@ -146,7 +147,7 @@ def test_a_jump_is_not_believed() -> None:
 @pytest.mark.parametrize(("share", "wanted"), [(0.7, True), (0.0, False)])
 def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: bool) -> None:
     frames, _ = _sequence()
-    tracker = Tracker(SETTINGS.model_copy(update={"keyframe_agreement": share}))
+    tracker = Tracker(chosen(TrackingSettings, **PLAIN, min_keyframe_agreement=share))
     first = tracker.track(frames[0])
     tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
     tracker.track(frames[1])
@@ -174,7 +175,7 @@ def test_a_keyframe_without_depth_is_refused() -> None:
 
 def test_pyramid_sizes_cameras_and_masks() -> None:
     frames, _ = _sequence()
-    views = build_pyramid(frames[0], TrackingSettings(levels=9, finest_level=1, min_side_px=16))
+    views = build_pyramid(frames[0], chosen(TrackingSettings, levels=9, finest_level=1))
     assert [view.weight.shape for view in views] == [(64, 80), (32, 40), (16, 20)]
     # A ray through a point keeps its direction at every level: x = (u - cx) / fx.
     for view in views:
@@ -200,7 +201,7 @@ def test_slope_of_a_plane_is_its_normal() -> None:
     plane = np.array([0.004, -0.002, 0.03])  # plane . X = 1
     depth_mm = (1.0 / (camera.rays @ plane)).astype(np.float32)
     whole = replace(frames[0], depth_mm=depth_mm, valid=np.ones_like(frames[0].valid))
-    view = build_pyramid(whole, SETTINGS, trust_slope=True)[0]
+    view = build_pyramid(whole, SETTINGS, use_slope=True)[0]
     np.testing.assert_allclose(view.slope[20:-20, 20:-20], np.broadcast_to(plane[:2], (88, 120, 2)), atol=1e-5)
 
 
@@ -219,8 +220,8 @@ def test_lamp_explains_the_dimming_of_a_facing_wall() -> None:
         depth = np.full(grey.shape, distance_mm, np.float32)
         return Frame(0, 0.0, rgb, camera, np.ones(grey.shape, bool), depth)
 
-    settings = TrackingSettings(finest_level=0, channels="grey")
-    near, far = (build_pyramid(wall(d), settings, trust_slope=True)[0] for d in (30.0, 36.0))
+    settings = chosen(TrackingSettings, finest_level=0, channels="grey")
+    near, far = (build_pyramid(wall(d), settings, use_slope=True)[0] for d in (30.0, 36.0))
     back = se3_exp(np.array([0, 0, 0, 0, 0, 6.0]))
     sizes = {}
     for gamma in (0.0, 0.35):

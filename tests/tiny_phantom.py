@@ -24,7 +24,7 @@ def write_tiny(folder: Path, events: str = "", frames: int = FRAMES) -> Path:
 
 
 def with_true_depth(folder: Path, preset: str = "default", **changes: object) -> Config:
-    """Settings that take the depth of `folder`; `tracking__huber=2` is tracking.huber=2."""
+    """Settings that take the depth of `folder`; `tracking__keyframe_every=2` is tracking.keyframe_every=2."""
     given = {key.replace("__", "."): value for key, value in changes.items()}
     return Config.load(preset, settings={"depth.backend": f"files:{folder}", **given})  # type: ignore[arg-type]
 

@@ -21,27 +21,6 @@ TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "pre
 
 
 @dataclass(frozen=True)
-class Correspondences2D3D:
-    """Points of an earlier frame, and the pixels of the current frame where optical flow observes them.
-
-    Attributes
-    ----------
-    points_mm : (N, 3) float64, in the camera of the earlier frame. pixels : (N, 2) float64 x, y in the current frame.
-    share : observed share of what could be observed: of the current frame's pixels, for corners of the keyframe's.
-    host : number of the earlier frame, -1: the previous one.
-    """
-
-    points_mm: np.ndarray
-    pixels: np.ndarray
-    share: float
-    host: int = -1
-
-    def __post_init__(self) -> None:
-        check_shape("Correspondences2D3D.points_mm", self.points_mm, (None, 3))
-        check_shape("Correspondences2D3D.pixels", self.pixels, (len(self.points_mm), 2))
-
-
-@dataclass(frozen=True)
 class Frame:
     """One rectified image of the sequence with the results of the stages so far.
 
@@ -56,8 +35,6 @@ class Frame:
     T_world_camera : (4, 4) float64, takes a point in the camera to the world; None until tracked.
     name : the file's own name, or "".
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: not estimated.
-    flow_correspondences : points of the previous frame in this one, by flow; None where there are none.
-    keyframe_correspondences : the keyframe's corners in this frame, by flow; None where there are none.
     """
 
     index: int
@@ -69,8 +46,6 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
-    flow_correspondences: Correspondences2D3D | None = None
-    keyframe_correspondences: Correspondences2D3D | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

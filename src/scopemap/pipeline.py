@@ -89,7 +89,6 @@ class Pipeline:
         self._smooth = create_smoother(config.smoothing)
         self._mapper = Mapper(config.mapping, estimators.keyframe_flow)
         self._last_track: Track | None = None
-        self._last_frame: Frame | None = None
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the previous frame."""
@@ -107,7 +106,7 @@ class Pipeline:
         """Track a frame, refine its depth, make it a keyframe where one is due, store or fuse it."""
         refine_first = self.config.mapis.paper.order == "refine-first"
         refined = self._refine(percept, None) if refine_first else None
-        track, last = self._tracker.track(self._with_correspondences(percept)), self._last_track
+        track, last = self._tracker.track(percept.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
         refined = refined or self._refine(percept, motion_between(last, track))
@@ -119,7 +118,7 @@ class Pipeline:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
         self._mapper.observe(track)
         self.fusion.put(frame)
-        self._last_track, self._last_frame = track, None if track.status == "lost" else frame
+        self._last_track = track
         return Step(frame, track, np.asarray(percept.frame.depth_mm), refined)
 
     def submaps(self) -> tuple[list[Submap], list[str]]:
@@ -130,10 +129,6 @@ class Pipeline:
         """Yield the stored frames of a submap with corrected pose and depth, to be fused by `fusion.fuse`."""
         for frame in self.fusion.store.frames(submap.frames):
             yield corrected_frame(frame, submap.correction)
-
-    def _with_correspondences(self, percept: Percept) -> Frame:
-        points = self._matcher.observed_points(percept.link, self._last_frame)
-        return replace(percept.frame, flow_correspondences=points)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
         raw = percept.frame

@@ -28,7 +28,7 @@ from scopemap.fusion.mesh import save_mesh
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step
-from scopemap.tracking import Track
+from scopemap.tracking.track import Track
 from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01

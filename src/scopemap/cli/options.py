@@ -15,7 +15,7 @@ Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
 SetPairs = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.huber=2.")
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.keyframe_every=5.")
 ]
 
 
@@ -49,7 +49,9 @@ def parse_settings(pairs: list[str]) -> dict[str, Any]:
     for pair in pairs:
         key, found, value = pair.partition("=")
         if not found:
-            raise SettingsError(f"cannot read the setting '{pair}': expected KEY=VALUE such as tracking.huber=2")
+            raise SettingsError(
+                f"cannot read the setting '{pair}': expected KEY=VALUE such as tracking.keyframe_every=5"
+            )
         try:
             settings[key] = json.loads(value)
         except json.JSONDecodeError:

@@ -28,14 +28,24 @@ from scopemap.errors import SettingsError
 
 Preset = Literal["paper", "default", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
-RENAMED: dict[str, str] = {}
+RENAMED = {
+    "tracking.corner_depth_share": "tracking.advanced.corner_depth_sigma",
+    "tracking.depth_share": "tracking.advanced.depth_weight",
+    "tracking.keyframe_agreement": "tracking.advanced.min_keyframe_agreement",
+    "tracking.least_detail": "tracking.min_sharpness",
+    "tracking.remembered_keyframes": "tracking.relocalisation_keyframes",
+}
 """Settings of earlier versions by their present name, with the group's new name on both sides. A setting that only
 moved within its stage (to `advanced` or `paper`) needs no entry."""
 REMOVED = {
     *("mask.border_px", "mask.bright_level", "mask.highlight_grow_px", "mask.highlight_ratio"),
     "networks.flow_iterations",
+    *("tracking.depth_sigma_share", "tracking.doubtful_inlier_share", "tracking.flow_contradiction"),
+    *("tracking.flow_least_share", "tracking.grey_share", "tracking.least_depth_sigma", "tracking.least_landmarks"),
+    *("tracking.min_side_px", "tracking.normalise_sigma_px", "tracking.radius"),
 }
-"""Settings of earlier versions that are constants now: a file may still name them, the command line may not."""
+"""Settings of earlier versions that are constants now or that nothing reads: a file may still name them, the command
+line may not."""
 
 
 class Config(Settings):

@@ -10,8 +10,8 @@ from scopemap.config import MapisSettings
 from scopemap.depth.estimate import PerceptualDistance
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Correspondences2D3D, Frame
-from scopemap.geometry.warp import carried_points, pull
+from scopemap.frame import Frame
+from scopemap.geometry.warp import pull
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,3 @@ class DenseMatcher:
         values = np.full_like(distance.map, distance.score) if self._settings.paper.perceptual_score else distance.map
         consistent = flow.consistent & seen & frame.valid
         return DenseCorrespondence(flow.to_previous, consistent, values, float(frame.valid.mean()))
-
-    def observed_points(self, link: DenseCorrespondence | None, previous: Frame | None) -> Correspondences2D3D | None:
-        """Return points of the previous frame, which has depth, with their pixels in the current one; None without."""
-        if link is None or previous is None or previous.depth_mm is None or self._flow.name == "none":
-            return None
-        return carried_points(previous.depth_mm, link.to_previous, link.consistent, previous.camera)

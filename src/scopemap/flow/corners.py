@@ -1,29 +1,84 @@
-"""Corners of a frame, and where flow finds them in another: few points, but such as hold on to the tissue itself.
+"""Corners of a frame, matched in other frames by optical flow.
 
-Shading moves with the lamp and pulls flow along where tissue has no texture; corners stay where they are.
+Shading moves with the lamp and biases flow on tissue without texture; corners stay on the tissue.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
+from scopemap.errors import check_shape
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 
 _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
+_CELL_PX = 12
+_CONSISTENCY_PX = 1.0
 
 
-def corners(frame: Frame, cell_px: int) -> np.ndarray:
-    """Return pixels (n, 2) int x, y: the most corner-like one with depth of each cell of `cell_px` x `cell_px`.
+@dataclass(frozen=True)
+class Correspondences2D3D:
+    """Points of a reference frame, and the pixels of the current frame where optical flow observes them.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64, in the camera of the reference. pixels : (N, 2) float64 x, y in the current frame.
+    coverage : share of the reference's corners that were matched, 0..1. reference : index of the reference frame.
+    """
+
+    points_mm: np.ndarray
+    pixels: np.ndarray
+    coverage: float
+    reference: int
+
+    def __post_init__(self) -> None:
+        check_shape("Correspondences2D3D.points_mm", self.points_mm, (None, 3))
+        check_shape("Correspondences2D3D.pixels", self.pixels, (len(self.points_mm), 2))
+
+
+class KeyframeMatcher:
+    """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow."""
+
+    def __init__(self, flow: FlowEstimator) -> None:
+        self._flow = flow
+        self._keyframe: Frame | None = None
+        self._corners = np.zeros((0, 2), dtype=int)
+        self._points_mm = np.zeros((0, 3))
+
+    def set_keyframe(self, keyframe: Frame | None) -> None:
+        """Detect the corners of a frame with depth, which replace those of the last one; None: there are none."""
+        self._keyframe = keyframe
+        if keyframe is None:
+            return
+        assert keyframe.depth_mm is not None
+        self._corners = detect_corners(keyframe, _CELL_PX)
+        depth_mm = keyframe.depth_mm[self._corners[:, 1], self._corners[:, 0]]
+        rays = keyframe.camera.unproject(self._corners.astype(np.float64))
+        self._points_mm = (rays * depth_mm[:, None]).astype(np.float64)
+
+    def match(self, frame: Frame) -> Correspondences2D3D | None:
+        """Return the corners of the keyframe that are matched in a frame; None where the keyframe has none."""
+        if self._keyframe is None or not len(self._corners):
+            return None
+        flows = self._flow.estimate_both(self._keyframe.rgb, frame.rgb)
+        matched, pixels = match_corners(self._corners, flows, frame.valid, _CONSISTENCY_PX)
+        coverage = len(matched) / len(self._corners)
+        return Correspondences2D3D(self._points_mm[matched], pixels, coverage, self._keyframe.index)
+
+
+def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
+    """Return pixels (n, 2) int x, y: the strongest corner with depth of each cell of `cell_px` x `cell_px`.
 
     The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every whole cell with
-    usable tissue gives one, however weak, unless it is quite flat: where corners are few, edges and shades are better
-    than nothing.
+    usable tissue gives one unless it is constant: where corners are few, edges and shades are better than nothing.
     """
     assert frame.depth_mm is not None
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    # On brightness relative to its surround: far tissue is dark, not featureless.
+    # On brightness relative to its surround: distant tissue is dark, not featureless.
     level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
     usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
@@ -35,34 +90,34 @@ def corners(frame: Frame, cell_px: int) -> np.ndarray:
     cells = cells.transpose(0, 2, 1, 3).reshape(-1, cell_px * cell_px)
     best = cells.argmax(1)
     row, column = np.divmod(np.arange(len(cells)), width // cell_px)
-    places = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
-    return places[cells.max(1) > 0]
+    pixels = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
+    return pixels[cells.max(1) > 0]
 
 
-def followed(
-    places: np.ndarray, flows: tuple[np.ndarray, np.ndarray], valid: np.ndarray, consistency_px: float
+def match_corners(
+    corners: np.ndarray, flows: tuple[np.ndarray, np.ndarray], valid: np.ndarray, consistency_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which corners (m,) int are found in another frame, and where, (m, 2) float64 px.
+    """Return which corners (m,) int are matched in another frame, and their pixels (m, 2) float64 there.
 
-    places : (n, 2) int x, y. flows : (H, W, 2) px to the other frame, and back. valid : (H, W) bool, its usable pixels.
-    consistency_px : largest distance between a corner and where there and back again leads.
+    corners : (n, 2) int x, y. flows : (H, W, 2) px to the other frame, and back. valid : (H, W) bool, its usable
+    pixels. consistency_px : largest forward-backward error.
     """
-    start = places.astype(np.float32)
-    pixel = start + flows[0][places[:, 1], places[:, 0]]
-    returned = pixel + sampled_at(flows[1], pixel)
+    start = corners.astype(np.float32)
+    pixel = start + flows[0][corners[:, 1], corners[:, 0]]
+    returned = pixel + sample_flow(flows[1], pixel)
     height, width = valid.shape
     nearest = np.clip(np.rint(pixel).astype(int), 0, [width - 1, height - 1])
     inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(1)
     good = inside & valid[nearest[:, 1], nearest[:, 0]]
     good &= np.linalg.norm(returned - start, axis=1) <= consistency_px
-    number = np.flatnonzero(good)
-    return number, pixel[number].astype(np.float64)
+    matched = np.flatnonzero(good)
+    return matched, pixel[matched].astype(np.float64)
 
 
-def sampled_at(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside.
 
-    Not OpenCV's remap, which refuses none and very many.
+    Not OpenCV's remap, which refuses no points and very many.
     """
     height, width = flow.shape[:2]
     inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)

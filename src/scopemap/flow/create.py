@@ -2,8 +2,7 @@
 
 from scopemap.errors import SettingsError
 from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowEstimator
-from scopemap.flow.none import NoFlow
+from scopemap.flow.estimator import FlowEstimator, NoFlow
 from scopemap.flow.raft import CHECKPOINTS, RaftFlow
 from scopemap.io import weights
 
@@ -13,8 +12,8 @@ FLOWS = ("auto", "raft-small", "raft-large", "dis", "none")
 def create_flow(name: str, device: str = "auto") -> FlowEstimator:
     """Return the estimator `name` (one of `FLOWS`); device matters to RAFT only.
 
-    "auto" is RAFT small where its weights are at hand, else DIS. Raises `SettingsError` for an unknown name and
-    `WeightsError` where RAFT is named and its weights are not at hand.
+    "auto" is RAFT small where its weights are present, else DIS. Raises `SettingsError` for an unknown name and
+    `WeightsError` where RAFT is named and its weights are missing.
     """
     if name == "auto":
         name = "raft-small" if weights.is_present(*CHECKPOINTS["small"]) else "dis"

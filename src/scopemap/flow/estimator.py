@@ -23,3 +23,17 @@ class FlowEstimator(Protocol):
     def provenance(self) -> dict[str, str]:
         """Return what the result depends on, as text: names, versions, hashes."""
         ...
+
+
+class NoFlow(FlowEstimator):
+    """Zero flow everywhere: the previous image is taken as it is."""
+
+    name = "none"
+
+    def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
+        """Return (H, W, 2) float32 zeros."""
+        return np.zeros((*rgb_from.shape[:2], 2), np.float32)
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name."""
+        return {"flow": self.name}

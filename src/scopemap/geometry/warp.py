@@ -7,9 +7,6 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
-from scopemap.frame import Correspondences2D3D
-
-_MOST_POINTS = 1500
 
 
 def pull(image_previous: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
@@ -61,26 +58,6 @@ def moved_depth(
     y = rays[..., 1] + to_previous[..., 1] / np.float32(camera.fy)
     moved = depth_previous_mm * (slope[0] * x + slope[1] * y + slope[2]) + np.float32(T_current_previous[2, 3])
     return np.where(moved > 0, moved, np.float32(np.nan))
-
-
-def carried_points(
-    depth_previous_mm: np.ndarray, to_previous: np.ndarray, consistent: np.ndarray, camera: PinholeCamera
-) -> Correspondences2D3D:
-    """Return points of the previous frame and the pixels of the current one where flow finds them, on a grid.
-
-    depth_previous_mm : (H, W) float32 on the previous grid, NaN = unknown. to_previous : (H, W, 2) float32 px.
-    consistent : (H, W) bool, where the flow can be trusted. camera : of both frames.
-    """
-    check_shape("depth_previous_mm", depth_previous_mm, (camera.height, camera.width))
-    step = max(1, int(np.sqrt(consistent.sum() / _MOST_POINTS)))
-    rows, columns = (step * axis for axis in np.nonzero(consistent[::step, ::step]))
-    there = np.column_stack([columns, rows]) + to_previous[rows, columns]
-    nearest = np.clip(np.rint(there), 0, [camera.width - 1, camera.height - 1]).astype(int)
-    depth_mm = depth_previous_mm[nearest[:, 1], nearest[:, 0]]
-    known = np.isfinite(depth_mm)
-    points_mm = camera.unproject(there[known]) * depth_mm[known, None]
-    pixels = np.column_stack([columns, rows])[known].astype(np.float64)
-    return Correspondences2D3D(points_mm.astype(np.float64), pixels, step**2 * len(pixels) / consistent.size)
 
 
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant
 from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, mean_difference
 from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, FieldOfView, Masker, is_lit, specular
-from scopemap.tracking.sharpness import detail_of
+from scopemap.tracking.sharpness import sharpness
 
 SMALL_PX = 320
 """Longer side of the small copies."""
@@ -100,7 +100,7 @@ class FrameInspector:
             time_s=masked.time_s,
             blank=bool(is_constant(small) or lit_share < _LEAST_LIT),
             brightness=sum(cv2.mean(small, mask)[:3]) / 3,
-            detail=detail_of(masked),
+            detail=sharpness(masked),
             change=self._change(rgb, small),
             motion=self._motion(small),
             redness=means[0] / max(means[1], means[2], 1.0),

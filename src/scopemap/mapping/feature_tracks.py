@@ -11,7 +11,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow.corners import corners, followed
+from scopemap.flow.corners import detect_corners, match_corners
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
@@ -55,7 +55,7 @@ class Linker:
     def add(self, keyframe: Frame, map_number: int = 0) -> None:
         """Take a keyframe with depth: choose its points, find them in earlier keyframes, and theirs in it."""
         assert keyframe.depth_mm is not None
-        places = corners(keyframe, self.settings.cell_px)
+        places = detect_corners(keyframe, self.settings.cell_px)
         rows, columns = places[:, 1], places[:, 0]
         self._camera = keyframe.camera
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
@@ -119,6 +119,6 @@ class Linker:
 
     def _see(self, host: _Keyframe, other: _Keyframe, forth: np.ndarray, back: np.ndarray) -> None:
         """Note where points of `host` are seen in `other`, where the way back ends where it began."""
-        number, pixel = followed(host.places, (forth, back), other.valid, self.settings.consistency_px)
+        number, pixel = match_corners(host.places, (forth, back), other.valid, self.settings.consistency_px)
         keyframe = np.full(len(number), other.number)
         self._sightings.append(_Sighting(host.first + number, keyframe, pixel))

@@ -14,7 +14,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.pose_interpolation import Correction, TrackedPose
-from scopemap.tracking import Track
+from scopemap.tracking.track import Track
 
 LEAST_FRAMES = 10
 """Tracked frames that a submap needs to be a result beside the largest."""

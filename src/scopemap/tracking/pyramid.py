@@ -11,51 +11,49 @@ from numba import njit
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
-from scopemap.geometry.uncertainty import depth_trust
 from scopemap.tracking.residuals import View
 
 _GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
 _SLOPE_SIGMA_PX = 1.5
+_NORMALISE_SIGMA_PX = 2.0
+_MIN_SIDE_PX = 16
 _NOISE_LEVEL = 2.0  # grey levels of local deviation below which an area counts as flat
 
 
-def build_pyramid(frame: Frame, settings: TrackingSettings, *, trust_slope: bool = False) -> list[View]:
+def build_pyramid(
+    frame: Frame, settings: TrackingSettings, *, use_slope: bool = False, levels: int | None = None
+) -> list[View]:
     """Return the levels from `finest_level` (first) to the coarsest (last), each half the size of the one before.
 
-    `trust_slope` says that the depth is good enough for tangent planes; predicted depth is not (its slopes follow the
-    paint of the tissue), and every point then counts as lying on a plane parallel to the image.
-
-    The weights are 1 where a pixel is usable, times how far its depth can be trusted by `frame.depth_sigma_mm`
-    (`depth_trust`, 1 where nothing is said).
-
-    Levels whose short side would fall below `min_side_px` are left out; the finest is always there. A frame without
-    depth gives views that can only be tracked, not tracked against.
+    use_slope : take tangent planes from the depth; only for measured depth, since slopes of predicted depth follow the
+    colour of the tissue. Else every plane is parallel to the image. levels : number of levels; None: down to a short
+    side of 16 px. A frame without depth gives views that can be aligned to a reference, but cannot be one.
     """
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = frame.valid.astype(np.float32)
     depth = np.full(grey.shape, np.nan, np.float32)
     if frame.depth_mm is not None:
         depth = np.where(frame.valid, frame.depth_mm, np.float32(np.nan))
-    trust = depth_trust(depth, frame.depth_sigma_mm, settings.depth_sigma_share)
+    finest = min(settings.advanced.finest_level, settings.advanced.levels - 1)
+    count = settings.advanced.levels if levels is None else finest + levels
     camera = frame.camera
     views: list[View] = []
-    for level in range(settings.levels):
+    for level in range(count):
         if level > 0:
             width, height = camera.width // 2, camera.height // 2
-            if views and min(width, height) < settings.min_side_px:
+            if views and min(width, height) < _MIN_SIDE_PX:
                 break
             # An odd last row or column has no partner: without it, pixels, depth and camera halve alike.
             camera = replace(camera, width=2 * width, height=2 * height)
-            grey, weight, depth, trust = (p[: 2 * height, : 2 * width] for p in (grey, weight, depth, trust))
-            trust, _ = _halve_image(trust, weight, (width, height))
+            grey, weight, depth = (p[: 2 * height, : 2 * width] for p in (grey, weight, depth))
             grey, weight = _halve_image(grey, weight, (width, height))
             depth, camera = _halve_depth(depth), camera.resized(width, height)
-        if level >= min(settings.finest_level, settings.levels - 1):
-            slope = _slope(depth, camera) if trust_slope else np.zeros((*depth.shape, 2), np.float32)
+        if level >= finest:
+            slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
             views.append(
                 View(
-                    _channels(grey, weight, settings),
-                    weight * trust,
+                    _channels(grey, weight),
+                    weight,
                     depth,
                     slope,
                     np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
@@ -76,9 +74,9 @@ def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     return np.nan_to_num(np.stack([camera.fx * along_x, camera.fy * along_y], -1)).astype(np.float32)
 
 
-def _channels(grey: np.ndarray, weight: np.ndarray, settings: TrackingSettings) -> np.ndarray:
+def _channels(grey: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Grey values and locally normalised grey values, (2, H, W) float32."""
-    return np.stack([grey / _GREY_UNIT, _normalised(grey, weight, settings.normalise_sigma_px)]).astype(np.float32)
+    return np.stack([grey / _GREY_UNIT, _normalised(grey, weight)]).astype(np.float32)
 
 
 def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +87,7 @@ def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) ->
 
 @njit(cache=True, nogil=True)
 def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
-    """Mean of the known depths among four pixels that lie on the nearest of their surfaces (within 5 %)."""
+    """Mean of the known depths of four pixels on the nearest of their surfaces (within 5 %)."""
     h, w = depth_mm.shape[0] // 2, depth_mm.shape[1] // 2
     out = np.full((h, w), np.nan, np.float32)
     for row in range(h):
@@ -109,10 +107,10 @@ def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
     return out
 
 
-def _normalised(grey: np.ndarray, weight: np.ndarray, sigma_px: float) -> np.ndarray:
+def _normalised(grey: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Grey values minus their local mean, over their local deviation, both over usable pixels only."""
-    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), 1e-6)
-    mean = cv2.GaussianBlur(grey * weight, (0, 0), sigma_px) / share
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), _NORMALISE_SIGMA_PX), 1e-6)
+    mean = cv2.GaussianBlur(grey * weight, (0, 0), _NORMALISE_SIGMA_PX) / share
     high_pass = (grey - mean) * weight
-    variance = cv2.GaussianBlur(high_pass * high_pass, (0, 0), sigma_px) / share
+    variance = cv2.GaussianBlur(high_pass * high_pass, (0, 0), _NORMALISE_SIGMA_PX) / share
     return high_pass / np.sqrt(variance + _NOISE_LEVEL**2)

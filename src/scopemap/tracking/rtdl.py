@@ -19,6 +19,9 @@ from scopemap.tracking.residuals import PARAMETERS, Loss, View, depth_residuals,
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
 _INLIER = 0.5
 _LEAST_SIGMA = 1e-3  # keeps flat images from dividing by zero
+_MIN_DEPTH_SIGMA = 1e-3  # of the distance to measured depth, share of the keyframe's mean depth
+_GREY_SHARE = 0.3  # weight of the grey channel against the normalised one
+_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth
 
 
 class Motion(NamedTuple):
@@ -30,16 +33,17 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the alignment of two frames ended.
+    """Relative pose of two frames, and how well it fits their images.
 
     Attributes
     ----------
-    motion : the best motion found. residual : robust standard deviation of the residuals at the finest level, of the
-    normalised channel whatever was minimised, so in local deviations of the grey value.
+    motion : relative pose and brightness. residual : robust standard deviation of the normalised channel's residuals
+    at the finest level, in local deviations of the grey value.
     inlier_share : share of the used pixels whose residual is below half a local deviation. correlation : -1..1, of
-    both frames' normalised channel over these pixels; near 0 where there is nothing but noise, however well that fits.
-    texture : root mean square of that channel in the reference, 1 where tissue shows itself everywhere.
+    both frames' normalised channel over these pixels; near 0 for noise, however well that fits.
+    texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
+    is_supported : whether matched corners confirm the motion.
     """
 
     motion: Motion
@@ -49,48 +53,49 @@ class Alignment:
     texture: float
     overlap: float
     iterations: int
+    is_supported: bool = False
+
+    @property
+    def agreement(self) -> float:
+        """Share of the reference's usable pixels that are inliers, by which alignments are compared."""
+        return self.inlier_share * self.overlap
 
 
-def align(
-    reference: list[View], current: list[View], start: np.ndarray, settings: TrackingSettings, *, down_to: int = 0
-) -> Alignment:
-    """Align two pyramids (finest level first), starting from the motion `start` (4, 4).
-
-    `down_to` leaves out so many of the finest levels, which cost most of the time; judged is at the finest one anyhow.
-    """
-    motion, iterations = Motion(start, np.array([1.0, 0.0])), 0
+def align(reference: list[View], current: list[View], T_start: np.ndarray, settings: TrackingSettings) -> Alignment:
+    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4)."""
+    motion, iterations = Motion(T_start, np.array([1.0, 0.0])), 0
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
-    for level in reversed(range(min(down_to, len(reference) - 1), len(reference))):
-        rotation_only = settings.rotation_first and level == len(reference) - 1 and len(reference) > 1
+    for level in reversed(range(len(reference))):
+        rotation_only = settings.paper.rotation_first and level == len(reference) - 1 and len(reference) > 1
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps
-    # Inverting by transposing doubles a deviation from a rotation each time round: cut it off at every frame.
+    # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
-    return judged(reference, current, motion, settings, iterations)
+    return judge(reference, current, motion, settings, iterations)
 
 
-def judged(
+def judge(
     reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings, iterations: int = 0
 ) -> Alignment:
-    """Return what two pyramids say of a motion, as it is."""
+    """Return how well a motion aligns two pyramids at their finest level; the other levels are not read."""
     residuals = _residuals(reference[0], current[0], motion, settings)
     compared = np.isfinite(residuals[-1])
-    used, shown = residuals[-1][compared], reference[0].channels[-1][compared]
+    used, expected = residuals[-1][compared], reference[0].channels[-1][compared]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
     sigma = robust_sigma(used, _LEAST_SIGMA)
     if not used.size:
         return Alignment(motion, sigma, 0.0, 0.0, 0.0, 0.0, iterations)
-    inliers, found = float(np.mean(np.abs(used) < _INLIER)), shown + used
-    power = float(np.sqrt(np.mean(shown**2) * np.mean(found**2)))
-    correlation = float(np.mean(shown * found)) / max(power, 1e-9)
-    texture = float(np.sqrt(np.mean(shown**2)))
+    inliers, observed = float(np.mean(np.abs(used) < _INLIER)), expected + used
+    power = float(np.sqrt(np.mean(expected**2) * np.mean(observed**2)))
+    correlation = float(np.mean(expected * observed)) / max(power, 1e-9)
+    texture = float(np.sqrt(np.mean(expected**2)))
     return Alignment(motion, sigma, inliers, correlation, texture, used.size / max(usable, 1), iterations)
 
 
 def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
-    share = {"grey": (1.0, 0.0), "normalised": (0.0, 1.0), "both": (settings.grey_share, 1.0)}[settings.channels]
-    return Loss(sigma, settings.huber, np.array(share), _LIT, settings.lamp_gamma)
+    share = (1.0, 0.0) if settings.paper.channels == "grey" else (_GREY_SHARE, 1.0)
+    return Loss(sigma, settings.advanced.huber, np.array(share), _LIT, settings.paper.lamp_gamma)
 
 
 def _residuals(reference: View, current: View, motion: Motion, settings: TrackingSettings) -> np.ndarray:
@@ -103,15 +108,17 @@ def _align_level(
 ) -> tuple[Motion, int]:
     start = _residuals(reference, current, motion, settings)
     loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _LEAST_SIGMA) for r in start]), settings)
-    if settings.depth_share > 0 and np.isfinite(current.depth_mm).any():
+    if settings.advanced.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
         gaps = gaps[np.isfinite(gaps)]
         if gaps.size:
-            sigma = robust_sigma(gaps, settings.least_depth_sigma)
-            loss = loss._replace(depth_sigma=sigma, depth_share=settings.depth_share)
+            sigma = robust_sigma(gaps, _MIN_DEPTH_SIGMA)
+            loss = loss._replace(depth_sigma=sigma, depth_share=settings.advanced.depth_weight)
     least_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
-        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
+        [0, 1, 2]
+        + ([] if rotation_only else [3, 4, 5])
+        + ([6, 7] if settings.paper.gain_bias and loss.share[0] > 0 else [])
     )
 
     def linearise(state: Motion) -> DenseModel:
@@ -126,6 +133,7 @@ def _align_level(
         full[3:6] *= unit_mm
         return Motion(se3_exp(full[:6]) @ state.T_current_reference, state.affine + full[6:])
 
-    options = Options(settings.radius, settings.max_iterations, gauss_newton=settings.solver == "gauss-newton")
+    takes_full_steps = settings.paper.solver == "gauss-newton"
+    options = Options(_RADIUS, settings.advanced.max_iterations, gauss_newton=takes_full_steps)
     solution = minimise(Problem(linearise, retract), motion, options)
     return solution.state, solution.iterations

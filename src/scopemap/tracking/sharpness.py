@@ -1,4 +1,4 @@
-"""How clear a frame is against those before it: blur, smoke and fluid on the lens take its detail away."""
+"""Sharpness of a frame against the recent frames: blur, smoke and fluid on the lens reduce it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations
 _FRAMES = 30
 
 
-class Clarity:
-    """Compares the detail of frames, in order, with the median of the 30 that came before.
+class SharpnessMonitor:
+    """Compares the sharpness of frames, in order, with the median of the last 30.
 
-    Unclear frames count among those 30, too: a camera that has moved up to a bare wall is soon at home there.
+    Unsharp frames count among those 30, too, so that a camera that approached a bare wall is soon usual again.
     """
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=_FRAMES)
 
-    def against_recent(self, frame: Frame) -> float:
-        """Return the frame's detail as a share of what was usual before it; 1 for the first."""
-        detail = detail_of(frame)
-        usual = float(np.median(self._recent)) if self._recent else detail
-        self._recent.append(detail)
-        return detail / usual if usual > 0 else 1.0
+    def relative_sharpness(self, frame: Frame) -> float:
+        """Return the frame's sharpness as a share of the median before it; 1 for the first."""
+        value = sharpness(frame)
+        usual = float(np.median(self._recent)) if self._recent else value
+        self._recent.append(value)
+        return value / usual if usual > 0 else 1.0
 
 
-def detail_of(frame: Frame) -> float:
-    """Return how much grey values differ from their surround, as a share of their brightness, over usable pixels."""
+def sharpness(frame: Frame) -> float:
+    """Return the mean local contrast over usable pixels, as a share of their brightness."""
     grey, valid = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), frame.valid.astype(np.float32)
     fine, coarse = (_blurred(grey, valid, share * grey.shape[1]) for share in (_FINE, _COARSE))
     brightness = float((coarse * valid).sum())

@@ -16,32 +16,35 @@ only where the image or its overlap with the keyframe is nearly empty, or the re
 
 from __future__ import annotations
 
-from scopemap.config import TrackingSettings
-from scopemap.tracking import FrameTracker, Tracker
+from scopemap.config.tracking import TrackingAdvanced, TrackingPaper, TrackingSettings
+from scopemap.tracking.track import FrameTracker
+from scopemap.tracking.tracker import Tracker
 
 SETTINGS = TrackingSettings(
     keyframe_every=2,
-    keyframe_agreement=0.0,
-    levels=2,
-    finest_level=0,
-    rotation_first=True,
-    solver="gauss-newton",
-    max_iterations=30,
-    huber=1.345,
-    channels="grey",
-    lamp_gamma=0.0,
-    gain_bias=False,
-    depth_sigma_share=1e9,  # all depth counts alike
-    depth_share=0.0,
-    flow_contradiction=0.0,
-    corner_depth_share=0.0,
-    least_detail=0.0,
-    remembered_keyframes=0,
+    min_sharpness=0.0,
+    relocalisation_keyframes=0,
     new_map_after=0,
-    start="identity",
-    min_inlier_share=0.0,
-    min_correlation=-1.0,
-    max_step=1e9,  # never reached
+    advanced=TrackingAdvanced(
+        corner_depth_sigma=0.0,
+        min_keyframe_agreement=0.0,
+        levels=2,
+        finest_level=0,
+        max_iterations=30,
+        huber=1.345,
+        depth_weight=0.0,
+        min_inlier_share=0.0,
+        min_correlation=-1.0,
+        max_step=1e9,  # never reached
+    ),
+    paper=TrackingPaper(
+        solver="gauss-newton",
+        rotation_first=True,
+        start="identity",
+        channels="grey",
+        lamp_gamma=0.0,
+        gain_bias=False,
+    ),
 )
 """What is left of our tracker; all other settings are without effect on it or say when an image is empty."""
 

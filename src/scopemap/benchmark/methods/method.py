@@ -12,7 +12,7 @@ from scopemap.config import Config, Preset
 from scopemap.io.sequence import Sequence
 from scopemap.pipeline import Step
 from scopemap.runner import reconstruct
-from scopemap.tracking import FrameTracker
+from scopemap.tracking.track import FrameTracker
 
 
 class Method(Protocol):

@@ -20,7 +20,7 @@ import numpy as np
 
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
-from scopemap.tracking import Track
+from scopemap.tracking.track import Track
 
 UNIT_MM = 100.0
 """Length of one Open3D unit, mm."""

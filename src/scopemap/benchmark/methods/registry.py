@@ -13,7 +13,7 @@ from scopemap.benchmark.methods.open3d_odometry import Open3dTracker
 from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.benchmark.plan import MethodPlan
 from scopemap.errors import SettingsError
-from scopemap.tracking import FrameTracker
+from scopemap.tracking.track import FrameTracker
 
 # Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
 PLAIN = {

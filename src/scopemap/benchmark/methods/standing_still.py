@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.frame import Frame
-from scopemap.tracking import Track
+from scopemap.tracking.track import Track
 
 _MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
 from scopemap.config import Config
-from scopemap.flow.corners import corners, followed
+from scopemap.flow.corners import detect_corners, match_corners
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame, is_constant
 from scopemap.io.sequence import Sequence
@@ -81,10 +81,12 @@ def _window(frames: list[Frame], flow: DisFlow) -> Window | None:
     host, camera = frames[0], frames[0].camera
     if is_constant(host.rgb):
         return None
-    places = corners(replace(host, depth_mm=np.ones_like(host.valid, dtype=np.float32)), _CELL_PX)
+    places = detect_corners(replace(host, depth_mm=np.ones_like(host.valid, dtype=np.float32)), _CELL_PX)
     seen: list[np.ndarray] = []
     for partner in frames[1:] if len(places) else []:
-        number, pixels = followed(places, flow.estimate_both(host.rgb, partner.rgb), partner.valid, _CONSISTENCY_PX)
+        number, pixels = match_corners(
+            places, flow.estimate_both(host.rgb, partner.rgb), partner.valid, _CONSISTENCY_PX
+        )
         if len(number) < _LEAST_SHARE * len(places):
             break
         seen.append(np.full(places.shape, np.nan))

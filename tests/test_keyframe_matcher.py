@@ -1,0 +1,113 @@
+"""Corners of a keyframe in later frames, on a textured plane with exact truth, and what the tracker makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import plane_scene
+import pytest
+from chosen_settings import chosen
+from plane_scene import CAMERA
+
+from scopemap.config import TrackingSettings
+from scopemap.flow.corners import KeyframeMatcher
+from scopemap.flow.dis import DisFlow
+from scopemap.flow.estimator import FlowEstimator, NoFlow
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse
+from scopemap.tracking.track import Track
+from scopemap.tracking.tracker import Tracker
+
+HERE = plane_scene.pose()
+THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
+
+
+def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
+    view = plane_scene.see(T_world_camera)
+    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
+
+
+def test_corners_are_matched_where_the_plane_projects() -> None:
+    matcher = KeyframeMatcher(DisFlow())
+    assert matcher.match(_frame(1, THERE)) is None
+    matcher.set_keyframe(_frame(4, HERE))
+    found = matcher.match(_frame(5, THERE))
+    assert found is not None
+    assert found.reference == 4
+    assert 0.8 < found.coverage <= 1
+    T = inverse(THERE) @ HERE
+    errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
+    assert np.median(np.linalg.norm(errors, axis=1)) < 0.25
+    matcher.set_keyframe(None)
+    assert matcher.match(_frame(5, THERE)) is None
+
+
+def test_corners_of_masked_or_unknown_tissue_are_not_matched() -> None:
+    matcher, frame = KeyframeMatcher(DisFlow()), _frame(0, HERE)
+    half = plane_scene.EVERYWHERE.copy()
+    half[:, 120:] = False
+    matcher.set_keyframe(frame)
+    found = matcher.match(replace(_frame(1, HERE), valid=half))
+    assert found is not None
+    assert found.pixels[:, 0].max() < 120.5
+    matcher.set_keyframe(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
+    assert matcher.match(_frame(1, THERE)) is None
+
+
+class _Shifted(DisFlow):
+    """DIS flow with a bias along x, px, that both directions share, so that they stay consistent."""
+
+    def __init__(self, bias_px: float) -> None:
+        super().__init__()
+        self._bias_px = np.float32([bias_px, 0])
+
+    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        forth, back = super().estimate_both(rgb_a, rgb_b)
+        return forth + self._bias_px, back - self._bias_px
+
+
+def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
+    tracker = Tracker(chosen(TrackingSettings, finest_level=0, **changes), flow)
+    tracker.track(_frame(0, HERE))
+    assert tracker.adopt(_frame(0, HERE), measured=measured)
+    return tracker.track(_frame(1, THERE))
+
+
+def test_the_pose_is_the_corners_and_no_alignment_is_needed() -> None:
+    track = _tracked(DisFlow())
+    assert (track.status, track.iterations) == ("ok", 0)
+    assert np.linalg.norm((inverse(THERE) @ track.T_world_camera)[:3, 3]) < 0.1
+    assert track.correlation > 0.8
+    # Half a pixel at 50 mm.
+    moved_mm = _tracked(_Shifted(0.5)).T_world_camera[0, 3] - track.T_world_camera[0, 3]
+    assert moved_mm == pytest.approx(-0.5 * plane_scene.PLANE_MM / CAMERA.fx, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("flow", "measured", "changes"),
+    [(None, False, {}), (NoFlow(), False, {}), (DisFlow(), True, {}), (DisFlow(), False, {"corner_depth_sigma": 0.0})],
+)
+def test_without_corners_the_image_is_aligned(flow: FlowEstimator, measured: bool, changes: dict[str, object]) -> None:
+    track = _tracked(flow, measured=measured, **changes)
+    assert track.status == "ok"
+    assert track.iterations > 0
+    assert np.linalg.norm((inverse(THERE) @ track.T_world_camera)[:3, 3]) < 0.3
+
+
+def test_corners_that_the_image_contradicts_are_rejected() -> None:
+    wrong = _tracked(_Shifted(30.0))
+    assert (wrong.status, wrong.iterations > 0) == ("ok", True)
+    assert np.linalg.norm((inverse(THERE) @ wrong.T_world_camera)[:3, 3]) < 0.3
+
+
+def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
+    """Without a window of the image most corners have no match, although the frame is tracked."""
+    narrow = plane_scene.EVERYWHERE.copy()
+    narrow[:, 64:] = False
+    for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
+        tracker = Tracker(chosen(TrackingSettings, finest_level=0, min_keyframe_agreement=0.0), DisFlow())
+        tracker.track(_frame(0, HERE))
+        tracker.adopt(_frame(0, HERE), measured=False)
+        assert tracker.track(replace(_frame(1, THERE), valid=valid)).status == "ok"
+        assert tracker.wants_keyframe() == wanted
