@@ -1,0 +1,58 @@
+"""The walk: the files that a frame visits from the command line to the mesh, traced in a small default run."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+
+from tiny_phantom import write_tiny
+
+import scopemap
+from scopemap import Config, open_sequence, reconstruct
+from scopemap.frame import Frame
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = Path(scopemap.__file__).parent
+MOST_WALK_FILES = 22
+
+
+def _carries_frame(value: object) -> bool:
+    if isinstance(value, Frame):
+        return True
+    fields = getattr(type(value), "__dataclass_fields__", ())
+    return any(isinstance(getattr(value, name, None), Frame) for name in fields)
+
+
+def _walk(folder: Path) -> set[str]:
+    """The files in which some function received or returned a frame, or what carries one, during a default run."""
+    files: set[str] = set()
+
+    def note(call: FrameType, event: str, argument: object) -> None:
+        code = call.f_code
+        if event not in ("call", "return") or not code.co_filename.startswith(str(SOURCE)):
+            return
+        names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+        values = [argument] if event == "return" else [call.f_locals.get(name) for name in names]
+        if any(_carries_frame(value) for value in values):
+            files.add(Path(code.co_filename).relative_to(SOURCE).as_posix())
+
+    sequence = open_sequence(write_tiny(folder / "phantom", frames=6))
+    settings = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
+    threading.setprofile(note)
+    sys.setprofile(note)
+    try:
+        reconstruct(sequence, Config.load(settings=settings), out=folder / "out")
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)  # type: ignore[arg-type]
+    return files | {"cli/run.py", "runner.py"}
+
+
+def test_a_frame_visits_few_files_and_the_architecture_names_them(tmp_path: Path) -> None:
+    walk = _walk(tmp_path)
+    assert {"pipeline.py", "masking/masker.py", "tracking/tracker.py", "fusion/volume.py"} <= walk
+    assert len(walk) <= MOST_WALK_FILES, "\n".join(sorted(walk))
+    section = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").partition("## The walk")[2].partition("\n## ")[0]
+    assert [file for file in sorted(walk) if section and file not in section] == []
