@@ -19,7 +19,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, Correction, TrackedPose
 from scopemap.mapping.backend import _Keyframe, _neighbours, _of
-from scopemap.mapping.bundle_adjustment import Points, Solution
+from scopemap.mapping.bundle_adjustment import Points, Solution, State
 from scopemap.mapping.depth_correction import DepthGrid
 from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop
@@ -83,9 +83,11 @@ def test_points_are_seen_where_the_plane_says() -> None:
         for other in {0, 1, 2} - {host}:
             some = (hosts == host) & (sightings.keyframe == other)
             number = sightings.point[some]
-            in_host = np.exp(points.log_depth[number])[:, None] * points.rays[number]
+            in_host = np.exp(points.log_depth[number])[:, None] * np.column_stack(
+                [points.pixel[number] / CAMERA.fx, np.ones(len(number))]
+            )
             T = inverse(POSES[other]) @ POSES[host]
-            truth = CAMERA.project(in_host @ T[:3, :3].T + T[:3, 3])
+            truth = CAMERA.project(in_host @ T[:3, :3].T + T[:3, 3]) - [CAMERA.cx, CAMERA.cy]
             away = np.linalg.norm(truth - sightings.pixel[some], axis=1)
             assert some.sum() > 80
             assert np.median(away) < 0.25
@@ -234,9 +236,10 @@ def test_the_way_and_the_depth_of_a_joined_map_are_taken_in_the_common_world() -
 @pytest.mark.parametrize(("sure", "refused"), [(3, False), (30, True)])
 def test_few_points_that_ask_for_another_depth_are_what_moves_by_itself(sure: int, refused: bool) -> None:
     count, known = 100, np.arange(100) < sure
-    points = Points(np.zeros(count, int), np.ones((count, 3)), np.zeros(count), np.full(count, 0.1))
+    points = Points(np.zeros(count, int), np.ones((count, 2)), np.zeros(count), np.full(count, 0.1))
     sigma = np.where(known, 0.01, np.inf)
-    found = Solution(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), sigma, 0.2, 1)
+    state = State(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), np.zeros(2), 0.2)
+    found = Solution(state, sigma, 1)
     assert bool(Backend(MappingSettings(), DisFlow())._doubt(points, found)) == refused
 
 

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
-from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Sightings, adjust
+from scopemap.mapping.bundle_adjustment import Observations, Points, Priors, Problem, adjust
 
-INTRINSICS = np.array([150.0, 152.0, 80.0, 64.0])
+FOCAL_PX = 150.0
 KEYFRAMES, PER_KEYFRAME = 6, 80
 LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
 
 
-def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Sightings]:
+def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Observations]:
     """True poses (camera from world), points with true depth, and where they are truly seen."""
     twists = [np.append(rng.normal(0, 0.02, 3), [1.5 * k, 0.6 * np.sin(k), 0.8 * k]) for k in range(KEYFRAMES)]
     T = np.stack([inverse(se3_exp(twist)) for twist in twists])
     T = T @ inverse(T[0])
-    pixels = rng.uniform([10, 10], [150, 118], (KEYFRAMES * PER_KEYFRAME, 2))
-    rays = np.column_stack([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(len(pixels))])
+    pixels = rng.uniform([-70, -54], [70, 54], (KEYFRAMES * PER_KEYFRAME, 2))
+    rays = np.column_stack([pixels / FOCAL_PX, np.ones(len(pixels))])
     host = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME)
     depth_mm = rng.uniform(25, 60, len(host))
     seen = []
@@ -29,10 +29,10 @@ def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Sightings]:
         for t in (h - 2, h - 1, h + 1, h + 2):
             if 0 <= t < KEYFRAMES:
                 x = transform(T[t] @ inverse(T[h]), depth * ray)
-                seen.append((p, t, *(INTRINSICS[:2] * x[:2] / x[2] + INTRINSICS[2:])))
+                seen.append((p, t, *(FOCAL_PX * x[:2] / x[2])))
     table = np.array(seen)
-    sightings = Sightings(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
-    return T, Points(host, rays, np.log(depth_mm), np.full(len(host), 0.1)), sightings
+    sightings = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return T, Points(host, pixels, np.log(depth_mm), np.full(len(host), 0.1)), sightings
 
 
 def _tracked(T: np.ndarray, rng: np.random.Generator, turn: float = 0.02, way: float = 0.8) -> np.ndarray:
@@ -49,11 +49,13 @@ def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 def test_exact_sightings_and_depths_give_back_exact_poses() -> None:
     rng = np.random.default_rng(0)
     T, points, sightings = _world(rng)
-    found = adjust(Problem(INTRINSICS, _tracked(T, rng), points, sightings, Priors(turn_rad=10, way_share=10), LINE))
-    turn, way = _pose_errors(found.T_camera_world, T)
+    found = adjust(
+        Problem(_tracked(T, rng), points, sightings, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX)
+    )
+    turn, way = _pose_errors(found.state.T_camera_world, T)
     assert turn < 1e-4
     assert way < 1e-2
-    assert np.abs(found.log_depth - points.log_depth).max() < 1e-3
+    assert np.abs(found.state.log_depth - points.log_depth).max() < 1e-3
     assert found.sigma_px == pytest.approx(0.1)  # its floor
 
 
@@ -65,16 +67,16 @@ def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
     )
     found = adjust(
         Problem(
-            INTRINSICS,
             _tracked(T, rng),
             wrong,
             sightings,
-            Priors(scale=0.3, turn_rad=10, way_share=10),
+            Priors(scale=0.3, rotation_rad=10, translation_share=10),
             LINE,
+            FOCAL_PX,
         )
     )
-    assert found.log_scale[3] - np.delete(found.log_scale, 3).mean() == pytest.approx(0.2, abs=0.02)
-    assert _pose_errors(found.T_camera_world, T)[0] < 2e-3
+    assert found.state.log_scale[3] - np.delete(found.state.log_scale, 3).mean() == pytest.approx(0.2, abs=0.02)
+    assert _pose_errors(found.state.T_camera_world, T)[0] < 2e-3
 
 
 def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
@@ -85,8 +87,8 @@ def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
     pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
     tracked = _tracked(T, rng)
     noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
-    found = adjust(Problem(INTRINSICS, tracked, noisy, replace(sightings, pixel=pixel), Priors(), LINE))
-    turn, way = _pose_errors(found.T_camera_world, T)
+    found = adjust(Problem(tracked, noisy, replace(sightings, pixel=pixel), Priors(), LINE, FOCAL_PX))
+    turn, way = _pose_errors(found.state.T_camera_world, T)
     turn_before, way_before = _pose_errors(tracked, T)
     assert turn < 0.2 * turn_before
     assert way < 0.3 * way_before
@@ -96,9 +98,9 @@ def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
 def test_without_sightings_nothing_changes() -> None:
     rng = np.random.default_rng(3)
     T, points, _ = _world(rng)
-    nothing = Sightings(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    found = adjust(Problem(INTRINSICS, T, points, nothing, Priors(), LINE))
-    np.testing.assert_array_equal(found.T_camera_world, T)
+    nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    found = adjust(Problem(T, points, nothing, Priors(), LINE, FOCAL_PX))
+    np.testing.assert_array_equal(found.state.T_camera_world, T)
     assert found.iterations == 0
 
 
@@ -107,25 +109,25 @@ def test_where_no_sighting_says_anything_the_tracked_motion_stays() -> None:
     T, points, sightings = _world(rng)
     # Nobody sees anything of the last two keyframes, nor they of others.
     known = (sightings.keyframe < 4) & (points.host[sightings.point] < 4)
-    some = Sightings(sightings.point[known], sightings.keyframe[known], sightings.pixel[known])
+    some = Observations(sightings.point[known], sightings.keyframe[known], sightings.pixel[known])
     tracked = _tracked(T, rng)
-    found = adjust(Problem(INTRINSICS, tracked, points, some, Priors(), LINE)).T_camera_world
+    found = adjust(Problem(tracked, points, some, Priors(), LINE, FOCAL_PX)).state.T_camera_world
     np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
     np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
 
 
 def test_how_certain_a_depth_is_follows_from_the_way_between_its_views() -> None:
     rng = np.random.default_rng(8)
-    pixels, depth_mm, way_mm = rng.uniform([10, 10], [150, 118], (50, 2)), rng.uniform(25, 60, 50), 4.0
-    rays = np.column_stack([(pixels - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(50)])
+    pixels, depth_mm, way_mm = rng.uniform([-70, -54], [70, 54], (50, 2)), rng.uniform(25, 60, 50), 4.0
+    rays = np.column_stack([pixels / FOCAL_PX, np.ones(50)])
     T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, -way_mm, 0, 0]))])
     moved = depth_mm[:, None] * rays - [way_mm, 0, 0]
-    seen = INTRINSICS[:2] * moved[:, :2] / moved[:, 2:] + INTRINSICS[2:]
+    seen = FOCAL_PX * moved[:, :2] / moved[:, 2:]
     # The last point is seen by nobody else.
-    points = Points(np.zeros(50, int), rays, np.log(depth_mm), np.full(50, 0.1))
+    points = Points(np.zeros(50, int), pixels, np.log(depth_mm), np.full(50, 0.1))
     found = adjust(
-        Problem(INTRINSICS, T, points, Sightings(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1])
+        Problem(T, points, Observations(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1], FOCAL_PX)
     )
     # A pixel moves by fx way / depth, and the floor of a pixel's deviation is 0.1.
-    np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (INTRINSICS[0] * way_mm), rtol=0.02)
+    np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (FOCAL_PX * way_mm), rtol=0.02)
     assert np.isinf(found.log_depth_sigma[49])

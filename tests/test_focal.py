@@ -91,7 +91,7 @@ def test_a_lens_that_bends_does_not_change_the_focal_length(fov_deg: float) -> N
     fit = adjusted(_window(fov_deg, bend=0.25), ASSUMED_PX)
     assert abs(_error(fit, fov_deg)) < 0.02
     assert fit is not None
-    assert fit.bend == pytest.approx(0.25, abs=0.02)
+    assert fit.distortion == pytest.approx(0.25, abs=0.02)
 
 
 def test_pixels_need_not_be_square() -> None:

@@ -155,7 +155,7 @@ def test_loops_that_lead_astray_are_done_without(monkeypatch: pytest.MonkeyPatch
     def failing(problem: Problem) -> Solution:
         starts.append(problem.start)
         found = adjust(problem)
-        return found if problem.start is None else replace(found, sigma_px=9.9)
+        return found if problem.start is None else replace(found, state=found.state._replace(sigma_px=9.9))
 
     monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
     correction = backend.adjust()

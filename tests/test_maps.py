@@ -235,7 +235,7 @@ def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.Monkey
 
     def failing(problem: Problem) -> Solution:
         found = adjust(problem)
-        return replace(found, sigma_px=9.9) if len(problem.T_camera_world) > 5 else found
+        return replace(found, state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
 
     monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
     correction = backend.adjust()

@@ -90,11 +90,13 @@ class DenseModel(NamedTuple):
 class Problem(Generic[State]):
     """What is minimised, on whatever group its states are.
 
-    `linearise` gives the model around a state; `retract` moves a state by a step (n,).
+    `linearise` gives the model around a state; `retract` moves a state by a step (n,). `accept`, if given, changes a
+    state that was stepped to, such as the scale of its robust kernel, after which the cost is another one.
     """
 
     linearise: Callable[[State], Model]
     retract: Callable[[State, np.ndarray], State]
+    accept: Callable[[State], State] | None = None
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,9 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
         if ahead.cost < model.cost:
             small = model.cost - ahead.cost < options.min_decrease * model.cost
             state, model = candidate, ahead
+            if problem.accept is not None:
+                state = problem.accept(candidate)
+                model = problem.linearise(state)
             if small:
                 return Solution(state, model.cost, iteration, True)
     return Solution(state, model.cost, options.max_iterations, False)

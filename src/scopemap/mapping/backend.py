@@ -18,7 +18,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Solution, adjust, errors_px
+from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Solution, State, adjust, errors_px
 from scopemap.mapping.depth_correction import DepthGrid, fit_grid
 from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop, LoopFinder
@@ -159,15 +159,16 @@ class Backend:
         points, sightings = self._linker.collected(chosen)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         priors = Priors(settings.scale_sigma, math.radians(settings.turn_sigma_deg), settings.way_sigma_share)
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        pairs, start, loops = _neighbours(own), None, 0
+        pairs, loops = _neighbours(own), 0
+        problem = Problem(inverse(T_world_camera), points, sightings, priors, pairs, camera.fx)
         if said := _of(self._loops, chosen, log_unit):
             depth_mm = float(np.exp(np.median(points.log_depth)))
             graph = spread_loops(T_world_camera, pairs, said, depth_mm)
-            start, loops = (inverse(graph.T_world_camera), graph.log_scale), graph.believed
-        problem = Problem(intrinsics, inverse(T_world_camera), points, sightings, priors, pairs, start)
+            loops, log_depth = graph.believed, points.log_depth + graph.log_scale[points.host]
+            start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
+            problem = replace(problem, start=start)
         found = adjust(problem)
-        if start is not None and self._doubt(points, found):
+        if problem.start is not None and self._doubt(points, found):
             # Loops may be what is wrong.
             found, loops = adjust(replace(problem, start=None)), 0
         map_of = np.array([keyframe.tracked.map for keyframe in own])
@@ -184,11 +185,11 @@ class Backend:
         assert camera is not None
         if doubt := self._doubt(points, found):
             return unchanged(index, found.sigma_px, doubt)
-        T_world_world = inverse(found.T_camera_world) @ problem.T_camera_world
+        T_world_world = inverse(found.state.T_camera_world) @ problem.T_camera_world
         grids = self._grids(camera, points, found) if self.settings.depth_step_sigma > 0 else ()
         depth_mm = float(np.exp(np.median(points.log_depth))) if len(points.log_depth) else 1.0
         return Correction(
-            index, T_world_world, found.log_scale, found.sigma_px, loops=loops, grids=grids, depth_mm=depth_mm
+            index, T_world_world, found.state.log_scale, found.sigma_px, loops=loops, grids=grids, depth_mm=depth_mm
         )
 
     def _doubt(self, points: Points, found: Solution) -> str:
@@ -207,9 +208,9 @@ class Backend:
     def _grids(self, camera: PinholeCamera, points: Points, found: Solution) -> tuple[DepthGrid, ...]:
         """Fit what each keyframe's depth lacks beside its scale, by its adjusted points."""
         error = _depth_change(points, found)
-        pixels = points.rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        pixels = points.pixel * [1.0, camera.fy / camera.fx] + [camera.cx, camera.cy]
         places = (pixels + 0.5) / [camera.width, camera.height]
-        of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(found.T_camera_world))]
+        of = [slice(*np.searchsorted(points.host, (k, k + 1))) for k in range(len(found.state.T_camera_world))]
         step_sigma = self.settings.depth_step_sigma
         return tuple(
             fit_grid(places[own], points.log_depth[own], error[own], found.log_depth_sigma[own], step_sigma)
@@ -224,7 +225,7 @@ def _sigma_px(off_px: np.ndarray) -> float:
 
 def _depth_change(points: Points, found: Solution) -> np.ndarray:
     """What each point (P,) adds to ln of its estimated depth, beside its keyframe's scale."""
-    return found.log_depth - points.log_depth - found.log_scale[points.host]
+    return found.state.log_depth - points.log_depth - found.state.log_scale[points.host]
 
 
 def _neighbours(keyframes: Sequence[_Keyframe]) -> np.ndarray:

@@ -1,34 +1,39 @@
-"""Bundle adjustment of keyframes: poses, one depth scale each, and the depth of every point that others see again.
+"""Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the lens.
 
-A point p lies on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera it is
-seen in another keyframe t at project(T_t T_h^-1 exp(u_p) ray_p), which is compared with where optical flow saw it:
+A point p is on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera it is
+observed in another keyframe t at project(T_t T_h^-1 exp(u_p) ray_p):
 
-    sum of rho(|seen - flow| / s)  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)  +  sum of (a_k / sigma_a)^2
-    +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
+    sum of rho(|projected - observed| / s) + sum of rho((u_p - ln depth_p - a_h) / sigma_p) + sum of (a_k / sigma_a)^2
+    +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted  +  sum of ((lens - expected) / sigma_lens)^2
 
-The second sum holds points to the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these
-factors to 1; the last holds a keyframe j to what the tracker said of it, from keyframe i, where nothing else does. rho
-is Cauchy's, so tissue that moves on its own fades out. Levenberg-Marquardt; points are eliminated one by one (Schur
-complement), host by host, since all points of a host touch the same few keyframes. Triggs et al., "Bundle Adjustment -
-A Modern Synthesis", 2000.
+rho is Cauchy's kernel and s the robust standard deviation of the reprojection errors. The second sum holds points to
+the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these factors to 1; the fourth holds a
+keyframe j to its tracked motion from keyframe i; the last is for an unknown lens: ln of the focal length f and the
+distortion b, by which a straight lens sees x (1 + b |x|^2 / w^2) where this one sees x, w half the image width. Dog-leg
+with Schur complement: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from scopemap.geometry.least_squares import robust_sigma_2d
+from scopemap.geometry import least_squares
+from scopemap.geometry.least_squares import cauchy, minimise, robust_sigma_2d
+from scopemap.geometry.schur import CameraBlock, PointBlock, SchurModel
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 
 _OWN = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
-_CAUCHY = 2.0  # residuals of that many standard deviations count half
-_LEAST_SIGMA_PX = 0.1
-_LEAST_Z = 1e-3
+_CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
+_BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
+_LEAST_Z, _LEAST_SLOPE = 1e-3, 0.1
+_UNDISTORTION_STEPS = 6
+_FARTHEST = 10.0  # half widths, beyond which Newton's method would diverge
+_INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 
 
 @dataclass(frozen=True)
@@ -37,19 +42,20 @@ class Points:
 
     Attributes
     ----------
-    host : (P,) int, number of the keyframe whose pixel they are. rays : (P, 3), z = 1. log_depth : (P,) ln of the
-    estimated depth, mm. sigma : (P,) its standard deviation, so the relative error of the depth.
+    host : (P,) int, number of the keyframe whose pixel they are. pixel : (P, 2) from the principal point, px, y times
+    fx / fy. log_depth : (P,) ln of the estimated depth, mm. sigma : (P,) its standard deviation, so the relative error
+    of the depth.
     """
 
     host: np.ndarray
-    rays: np.ndarray
+    pixel: np.ndarray
     log_depth: np.ndarray
     sigma: np.ndarray
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """N places where points are seen again, sorted by point: point (N,) int, keyframe (N,) int, pixel (N, 2)."""
+class Observations:
+    """N observations, sorted by point: point (N,) int, keyframe (N,) int, pixel (N, 2) as in `Points`."""
 
     point: np.ndarray
     keyframe: np.ndarray
@@ -58,32 +64,66 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Priors:
-    """How much is believed beforehand, as standard deviations.
+    """Standard deviations of what is known beforehand.
 
-    scale : of ln of a keyframe's depth scale. turn_rad, way_share : of the tracked motion between neighbouring
-    keyframes, rad and share of the mean depth.
+    scale : of ln of a keyframe's depth scale, 0 holds it. rotation_rad, translation_share : of the tracked motion
+    between neighbouring keyframes, rad and share of the typical depth.
     """
 
     scale: float = 0.1
-    turn_rad: float = 0.05
-    way_share: float = 0.1
+    rotation_rad: float = 0.05
+    translation_share: float = 0.1
+
+
+@dataclass(frozen=True)
+class UnknownLens:
+    """Prior of a lens: half_width_px of the image, standard deviations (2,) of ln f and of b; b is expected to be 0."""
+
+    half_width_px: float
+    sigma: np.ndarray
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is adjusted: intrinsics (4,) fx, fy, cx, cy, px; T_camera_world (K, 4, 4) as tracked; the rest as named.
+    """What is adjusted.
 
-    neighbours : (C, 2) int, pairs of keyframes whose motion from the first to the second was tracked. start : poses
-    T_camera_world (K, 4, 4) and ln of the depth scales (K,) to begin from; None: from what was tracked.
+    Attributes
+    ----------
+    T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
+    keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
+    to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
     """
 
-    intrinsics: np.ndarray
     T_camera_world: np.ndarray
     points: Points
-    sightings: Sightings
+    observations: Observations
     priors: Priors
     neighbours: np.ndarray
-    start: tuple[np.ndarray, np.ndarray] | None = None
+    focal_px: float
+    start: State | None = None
+    lens: UnknownLens | None = None
+    least_sigma_px: float = 0.1
+
+    @property
+    def unit_mm(self) -> float:
+        """Typical depth, the unit of translations."""
+        return float(np.exp(np.median(self.points.log_depth)))
+
+    @property
+    def tracked(self) -> State:
+        """The state as tracked."""
+        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0])
+        return State(self.T_camera_world, np.zeros(count), self.points.log_depth, lens)
+
+
+class State(NamedTuple):
+    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,), lens (2,): ln f and b."""
+
+    T_camera_world: np.ndarray
+    log_scale: np.ndarray
+    log_depth: np.ndarray
+    lens: np.ndarray
+    sigma_px: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -92,237 +132,257 @@ class Solution:
 
     Attributes
     ----------
-    T_camera_world : (K, 4, 4), the first as it was. log_scale : (K,) ln of each keyframe's depth scale.
-    log_depth : (P,). log_depth_sigma : (P,) its standard deviation by the sightings alone, keyframes held; infinite
-    where nothing sees a point again. sigma_px : robust standard deviation of the sightings, px. iterations : accepted
-    and refused.
+    state : the first keyframe's pose as it was; sigma_px : robust standard deviation of the reprojection errors.
+    log_depth_sigma : (P,) standard deviation of ln depth by the observations alone, keyframes held; infinite where no
+    other keyframe observes a point. iterations : accepted and rejected.
     """
 
-    T_camera_world: np.ndarray
-    log_scale: np.ndarray
-    log_depth: np.ndarray
+    state: State
     log_depth_sigma: np.ndarray
-    sigma_px: float
     iterations: int
 
-
-class _State(NamedTuple):
-    T: np.ndarray
-    scale: np.ndarray
-    u: np.ndarray
-
-
-class _System(NamedTuple):
-    """Reduced system of the keyframes, and what is needed to get back to the points."""
-
-    matrix: sparse.csc_matrix
-    rhs: np.ndarray
-    couplings: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]  # points, columns, E / h, g / h
+    @property
+    def sigma_px(self) -> float:
+        """Robust standard deviation of the reprojection errors, px; NaN without observations."""
+        return self.state.sigma_px
 
 
-def adjust(problem: Problem, *, most_iterations: int = 20, least_gain: float = 1e-3) -> Solution:
-    """Return the solution that the search finds from the start; without sightings everything stays as it was tracked.
+def adjust(problem: Problem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> Solution:
+    """Return the solution that the search finds from the start; without observations everything stays as tracked.
 
-    A step is taken where it lowers the cost at the scale of residuals before it; that scale is then estimated anew.
+    The scale of the reprojection errors is estimated anew after every accepted step: which are outliers is judged as
+    the fit gets better.
     """
-    count = len(problem.T_camera_world)
-    state = _State(problem.T_camera_world.copy(), np.zeros(count), problem.points.log_depth.copy())
-    if not len(problem.sightings.point) or count < 2:
-        return Solution(state.T, state.scale, state.u, np.full(len(state.u), np.inf), float("nan"), 0)
-    if problem.start is not None:
-        T, scale = problem.start
-        state = _State(T.copy(), scale.copy(), state.u + scale[problem.points.host])
-    damping, iterations = 1e-4, 0
-    sigma = _sigma_px(problem, state)
-    cost = _cost(problem, state, sigma)
-    while iterations < most_iterations:
-        iterations += 1
-        candidate = _moved(problem, state, _linearised(problem, state, sigma, damping))
-        ahead = _cost(problem, candidate, sigma)
-        if not ahead < cost:
-            damping *= 10
-            if damping > 1e6:
-                break
-            continue
-        gain = 1 - ahead / cost
-        state, damping = candidate, max(damping / 10, 1e-9)
-        # What counts as an outlier is judged anew as the fit gets better.
-        sigma = _sigma_px(problem, state)
-        cost = _cost(problem, state, sigma)
-        if gain < least_gain:
-            break
-    T = np.stack([orthonormalised(pose) for pose in state.T])
-    return Solution(T, state.scale, state.u, _log_depth_sigma(problem, state, sigma), sigma, iterations)
+    start = problem.tracked if problem.start is None else problem.start
+    if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
+        return Solution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
+
+    def rescaled(state: State) -> State:
+        reprojection = _reproject(problem, state)
+        lengths = np.linalg.norm(reprojection.error[reprojection.ahead], axis=1)
+        return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
+
+    options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
+    search = least_squares.Problem(partial(linearised, problem), partial(_retract, problem), rescaled)
+    found = minimise(search, rescaled(start), options)
+    state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
+    return Solution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
 def errors_px(problem: Problem, found: Solution) -> np.ndarray:
-    """Return how far points are seen from where the solution says (N,), px; infinite behind a camera."""
-    if not len(problem.sightings.point):
+    """Return the lengths of the reprojection errors (N,), px; infinite behind a camera."""
+    if not len(problem.observations.point):
         return np.zeros(0)
-    error, ahead = _errors(problem, _seen(problem, _State(found.T_camera_world, found.log_scale, found.log_depth))[0])
-    return np.where(ahead, np.linalg.norm(error, axis=1), np.inf)
+    reprojection = _reproject(problem, found.state)
+    return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 
-def _seen(problem: Problem, state: _State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points in the keyframes that see them and in their hosts, (N, 3) each, and the turn between, (N, 3, 3)."""
-    points, sightings = problem.points, problem.sightings
-    host = points.host[sightings.point]
-    in_host = np.exp(state.u)[sightings.point, None] * points.rays[sightings.point]
-    pairs, which = np.unique(host * len(state.T) + sightings.keyframe, return_inverse=True)
-    between = np.stack([state.T[pair % len(state.T)] @ inverse(state.T[pair // len(state.T)]) for pair in pairs])
-    turn = between[which, :3, :3]
-    return np.einsum("nij,nj->ni", turn, in_host) + between[which, :3, 3], in_host, turn
+class _Reprojection(NamedTuple):
+    error: np.ndarray  # (N, 2) px, 0 behind the camera
+    ahead: np.ndarray  # (N,) bool
+    point: np.ndarray  # (N, 3) in the observing camera
+    in_host: np.ndarray  # (N, 3) in the host's
+    R: np.ndarray  # (N, 3, 3) from the host to the observing camera
+    straight: np.ndarray  # (N, 2) px, through a lens without distortion
 
 
-def _errors(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Difference (N, 2) px of where points are seen and where flow saw them, and whether (N,) they can be seen."""
-    fx, fy, cx, cy = problem.intrinsics
+def _reproject(problem: Problem, state: State) -> _Reprojection:
+    points, observations, T = problem.points, problem.observations, state.T_camera_world
+    focal, host = np.exp(state.lens[0]), points.host[observations.point]
+    rays = np.column_stack([_undistorted(problem, points.pixel, state.lens[1]) / focal, np.ones(len(points.host))])
+    in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
+    pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
+    between = np.stack([T[pair % len(T)] @ inverse(T[pair // len(T)]) for pair in pairs])
+    R = between[which, :3, :3]
+    seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
-    z = np.where(ahead, seen[:, 2], 1.0)
-    pixel = np.stack([fx * seen[:, 0] / z + cx, fy * seen[:, 1] / z + cy], 1)
-    return np.where(ahead[:, None], pixel - problem.sightings.pixel, 0.0), ahead
+    straight = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
+    pixel = _distorted(problem, straight, state.lens[1])
+    error = np.where(ahead[:, None], pixel - observations.pixel, 0.0)
+    return _Reprojection(error, ahead, seen, in_host, R, straight)
 
 
-def _sigma_px(problem: Problem, state: _State) -> float:
-    error, ahead = _errors(problem, _seen(problem, state)[0])
-    return robust_sigma_2d(np.linalg.norm(error[ahead], axis=1), _LEAST_SIGMA_PX)
+def _square(problem: Problem, pixel: np.ndarray) -> np.ndarray:
+    """Squared distance (n, 1) from the principal point in half widths; 0 where the lens is known."""
+    if problem.lens is None:
+        return np.zeros((len(pixel), 1))
+    square: np.ndarray = (pixel**2).sum(1, keepdims=True) / problem.lens.half_width_px**2
+    return square
 
 
-def _cauchy(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cost and weight of squared residuals in units of their variance."""
-    ratio = square / _CAUCHY**2
-    return 0.5 * _CAUCHY**2 * np.log1p(ratio), 1 / (1 + ratio)
+def _undistorted(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
+    undistorted: np.ndarray = pixel * (1 + b * _square(problem, pixel))
+    return undistorted
 
 
-def _cost(problem: Problem, state: _State, sigma: float) -> float:
-    error, ahead = _errors(problem, _seen(problem, state)[0])
+def _distorted(problem: Problem, straight: np.ndarray, b: float) -> np.ndarray:
+    """Return the pixels (n, 2) that `_undistorted` takes to `straight`, by Newton's method on the radius."""
+    if problem.lens is None or b == 0:
+        return straight
+    radius = wanted = np.minimum(np.sqrt(_square(problem, straight)), _FARTHEST)
+    for _ in range(_UNDISTORTION_STEPS):
+        slope = np.maximum(1 + 3 * b * radius**2, _LEAST_SLOPE)
+        radius = np.clip(radius - (radius * (1 + b * radius**2) - wanted) / slope, 0, _FARTHEST)
+    return np.where(wanted > 0, radius / np.maximum(wanted, 1e-12), 1.0) * straight
+
+
+def _weights(state: State, seen: _Reprojection) -> np.ndarray:
+    return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, _CAUCHY)[1], 0) / state.sigma_px**2
+
+
+def linearised(problem: Problem, state: State) -> SchurModel:
+    """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
+    count, lens = len(state.T_camera_world), 0 if problem.lens is None else 2
+    seen = _reproject(problem, state)
+    chain = _chain(problem, state)
+    held = [6 + _OWN * np.arange(count)] if problem.priors.scale == 0 else []
+    free = np.setdiff1d(np.arange(_OWN * count + lens), np.concatenate([np.arange(6), *held]))
+
+    def build() -> tuple[list[PointBlock], list[CameraBlock]]:
+        parts = _Rows(seen.error, _weights(state, seen), *_jacobians(problem, state, seen))
+        hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
+        return hosts, _camera_blocks(problem, state, chain)
+
+    return SchurModel(_cost(problem, state, seen, chain), build, free, _OWN * count + lens, len(state.log_depth))
+
+
+def _cost(problem: Problem, state: State, seen: _Reprojection, chain: list[_Link]) -> float:
     points, priors = problem.points, problem.priors
-    # A point behind a camera has no residual: it costs as much as one ten standard deviations off.
-    square = np.where(ahead, (error**2).sum(1) / sigma**2, 100.0)
-    depth = (state.u - points.log_depth - state.scale[points.host]) / points.sigma
-    chain = sum(float(e @ (weight * e)) for *_, e, weight in _chain(problem, state))
-    return float(_cauchy(square)[0].sum() + _cauchy(depth**2)[0].sum() + 0.5 * chain) + 0.5 * float(
-        ((state.scale / priors.scale) ** 2).sum()
-    )
+    square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
+    depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
+    cost = cauchy(square, _CAUCHY)[0].sum() + cauchy(depth**2, _CAUCHY)[0].sum()
+    cost += 0.5 * sum(float(link.error @ (link.information * link.error)) for link in chain)
+    if priors.scale > 0:
+        cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
+    if problem.lens is not None:
+        cost += 0.5 * (((state.lens - problem.tracked.lens) / problem.lens.sigma) ** 2).sum()
+    return float(cost)
 
 
-def _chain(problem: Problem, state: _State) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
-    """For each pair of neighbours: their numbers, how far the motion between is from the tracked one, weights."""
-    priors, tracked = problem.priors, problem.T_camera_world
-    depth_mm = float(np.exp(np.median(problem.points.log_depth)))
-    weight = np.repeat([priors.turn_rad, priors.way_share * depth_mm], 3) ** -2.0
+class _Link(NamedTuple):
+    i: int
+    j: int
+    error: np.ndarray  # (6,) twist
+    information: np.ndarray  # (6,)
+
+
+def _chain(problem: Problem, state: State) -> list[_Link]:
+    """Deviations from the tracked motion between neighbours."""
+    priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
+    information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
     return [
-        (i, j, se3_log(state.T[j] @ inverse(state.T[i]) @ tracked[i] @ inverse(tracked[j])), weight)
+        _Link(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
         for i, j in problem.neighbours
     ]
 
 
-def _linearised(problem: Problem, state: _State, sigma: float, damping: float) -> _System:
-    """Return the reduced system around a state; `sigma` px scales the sightings' errors, `damping` is Marquardt's."""
-    count = len(state.T)
-    seen, in_host, turn = _seen(problem, state)
-    error, ahead = _errors(problem, seen)
-    weight = np.where(ahead, _cauchy((error**2).sum(1) / sigma**2)[1], 0.0) / sigma**2
-    by_twists = _jacobians(problem.intrinsics, seen, in_host, turn, ahead)
-    blocks: list[tuple[np.ndarray, np.ndarray]] = []
-    rhs = np.zeros(_OWN * count)
-    couplings = []
-    for host in range(count):
-        sums = _host_sums(problem, state, host, (error, weight, *by_twists))
-        h = sums.h * (1 + damping)
-        shrunk = sums.E / h[:, None]
-        blocks.append((sums.own, sums.A - sums.E.T @ shrunk))
-        rhs[sums.own] -= sums.b - shrunk.T @ sums.g
-        couplings.append((sums.points, sums.own, shrunk, sums.g / h))
-    for i, j, off, information in _chain(problem, state):
+def _camera_blocks(problem: Problem, state: State, chain: list[_Link]) -> list[CameraBlock]:
+    T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
+    for i, j, error, information in chain:
         own = np.append(_OWN * i + np.arange(6), _OWN * j + np.arange(6))
-        J = np.hstack([-_adjoint(state.T[j] @ inverse(state.T[i])), np.eye(6)])
-        blocks.append((own, J.T @ (information[:, None] * J)))
-        rhs[own] -= J.T @ (information * off)
-    scales, information = _OWN * np.arange(count) + 6, problem.priors.scale**-2.0
-    blocks += [(scales[k : k + 1], np.full((1, 1), information)) for k in range(count)]
-    rhs[scales] -= information * state.scale
-    rows, columns = (np.concatenate([way(own, len(own)) for own, _ in blocks]) for way in (np.repeat, np.tile))
-    values = np.concatenate([block.ravel() for _, block in blocks])
-    matrix = sparse.coo_matrix((values, (rows, columns)), shape=(_OWN * count,) * 2).tocsc()
-    return _System(matrix + sparse.diags(damping * matrix.diagonal()), rhs, couplings)
+        J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
+        blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
+    if problem.priors.scale > 0:
+        information = np.full(len(T), problem.priors.scale**-2.0)
+        blocks.append(CameraBlock(6 + _OWN * np.arange(len(T)), np.diag(information), information * state.log_scale))
+    if problem.lens is not None:
+        information, own = problem.lens.sigma**-2.0, _OWN * len(T) + np.arange(2)
+        blocks.append(CameraBlock(own, np.diag(information), information * (state.lens - problem.tracked.lens)))
+    return blocks
 
 
-class _HostSums(NamedTuple):
-    """The normal equations of one host's points before they are eliminated.
+class _Rows(NamedTuple):
+    """What is summed over observations: derivatives by the observing camera, the host, ln depth and the lens."""
 
-    own : (m,) numbers of the keyframes' unknowns that its points touch; A : (m, m) and b : (m,) theirs. points : (n,)
-    numbers; h, g : (n,) their own second and first derivative. E : (n, m) both.
-    """
-
-    own: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
-    points: np.ndarray
-    h: np.ndarray
-    g: np.ndarray
-    E: np.ndarray
+    error: np.ndarray  # (N, 2)
+    weight: np.ndarray  # (N,)
+    by_camera: np.ndarray  # (N, 2, 6)
+    by_host: np.ndarray  # (N, 2, 6)
+    by_depth: np.ndarray  # (N, 2)
+    by_lens: np.ndarray  # (N, 2, 2), or (N, 2, 0)
 
 
-def _host_sums(problem: Problem, state: _State, host: int, parts: tuple[np.ndarray, ...]) -> _HostSums:
-    """Sum over the points of one host; `parts` are errors, weights and derivatives of all sightings."""
-    points, sightings = problem.points, problem.sightings
+def _host_block(problem: Problem, state: State, host: int, parts: _Rows) -> PointBlock:
+    """Return the normal equations of the points of one host."""
+    points, observations = problem.points, problem.observations
     here = slice(*np.searchsorted(points.host, (host, host + 1)))
-    some = slice(*np.searchsorted(sightings.point, (here.start, here.stop)))
-    error, weight, by_seeing, by_host, by_depth = (part[some] for part in parts)
-    keyframes = np.union1d(sightings.keyframe[some], host)
+    some = slice(*np.searchsorted(observations.point, (here.start, here.stop)))
+    error, weight, by_camera, by_host, by_depth, by_lens = (part[some] for part in parts)
+    keyframes = np.union1d(observations.keyframe[some], host)
     size, count, at = len(error), here.stop - here.start, int(np.searchsorted(keyframes, host))
     J: np.ndarray = np.zeros((size, 2, len(keyframes), _OWN))
-    J[np.arange(size), :, np.searchsorted(keyframes, sightings.keyframe[some]), :6] = by_seeing
+    J[np.arange(size), :, np.searchsorted(keyframes, observations.keyframe[some]), :6] = by_camera
     J[:, :, at, :6] += by_host
-    J = J.reshape(size, 2, _OWN * len(keyframes))
-    rows, information = J.reshape(2 * size, J.shape[-1]), np.repeat(weight, 2)
-    A, b = rows.T @ (information[:, None] * rows), rows.T @ (information * error.ravel())
-    number = sightings.point[some] - here.start
+    J = np.concatenate([J.reshape(size, 2, _OWN * len(keyframes)), by_lens], -1)
+    rows = J.reshape(2 * size, J.shape[-1])
+    A = rows.T @ (np.repeat(weight, 2)[:, None] * rows)
+    number = observations.point[some] - here.start
     h, g = (np.bincount(number, weight * (by_depth * by).sum(1), count) for by in (by_depth, error))
-    E = np.zeros((count, len(rows.T)))
-    np.add.at(E, number, weight[:, None] * np.einsum("nj,njk->nk", by_depth, J))
-    # The points' hold on their estimated depth, up to the host's scale.
-    off = state.u[here] - points.log_depth[here] - state.scale[host]
-    hold = _cauchy((off / points.sigma[here]) ** 2)[1] / points.sigma[here] ** 2
-    scale = _OWN * at + 6
-    h, g = h + hold, g + hold * off
-    E[:, scale] -= hold
-    A[scale, scale] += hold.sum()
-    b[scale] -= (hold * off).sum()
-    own = (_OWN * keyframes[:, None] + np.arange(_OWN)).ravel()
-    return _HostSums(own, A, b, np.arange(here.start, here.stop), h, g, E)
+    place = (np.repeat(number, 2), np.arange(2 * size))
+    E, scores = (
+        sparse.csr_matrix(((weight[:, None] * by).ravel(), place), shape=(count, 2 * size)) @ rows
+        for by in (by_depth, error)
+    )
+    # The prior of the estimated depth, up to the host's scale.
+    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], _OWN * at + 6
+    held = cauchy((off / points.sigma[here]) ** 2, _CAUCHY)[1] / points.sigma[here] ** 2
+    E[:, column] -= held
+    A[column, column] += held.sum()
+    scores[:, column] -= held * off
+    columns = (_OWN * keyframes[:, None] + np.arange(_OWN)).ravel()
+    columns = np.append(columns, _OWN * len(state.T_camera_world) + np.arange(by_lens.shape[2]))
+    return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
 
 
-def _log_depth_sigma(problem: Problem, state: _State, sigma: float) -> np.ndarray:
-    """Standard deviation of each point's ln depth (P,) by where it is seen again, all keyframes held."""
-    seen, in_host, turn = _seen(problem, state)
-    error, ahead = _errors(problem, seen)
-    weight = np.where(ahead, _cauchy((error**2).sum(1) / sigma**2)[1], 0.0) / sigma**2
-    by_depth = _jacobians(problem.intrinsics, seen, in_host, turn, ahead)[2]
-    information = np.bincount(problem.sightings.point, weight * (by_depth**2).sum(1), len(state.u))
+def _log_depth_sigma(problem: Problem, state: State) -> np.ndarray:
+    seen = _reproject(problem, state)
+    by_depth = _jacobians(problem, state, seen)[2]
+    information = _weights(state, seen) * (by_depth**2).sum(1)
     with np.errstate(divide="ignore"):
-        return 1 / np.sqrt(information)
+        return 1 / np.sqrt(np.bincount(problem.observations.point, information, len(state.log_depth)))
 
 
 def _jacobians(
-    intrinsics: np.ndarray, seen: np.ndarray, in_host: np.ndarray, turn: np.ndarray, ahead: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of pixels by twists of the seeing keyframe and of the host, (N, 2, 6), and by ln depth, (N, 2)."""
-    fx, fy = intrinsics[:2]
-    z = np.where(ahead, seen[:, 2], 1.0)
-    project = np.zeros((len(seen), 2, 3))
-    project[:, 0, 0], project[:, 1, 1] = fx / z, fy / z
-    project[:, 0, 2], project[:, 1, 2] = -fx * seen[:, 0] / z**2, -fy * seen[:, 1] / z**2
-    by_host = project @ turn
-    by_depth = np.einsum("nij,nj->ni", by_host, in_host)
-    return _by_twist(project, seen), -_by_twist(by_host, in_host), by_depth
+    problem: Problem, state: State, seen: _Reprojection
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of pixels as in `_Rows`; translations are in units of the typical depth."""
+    focal, b = np.exp(state.lens[0]), state.lens[1]
+    z = np.where(seen.ahead, seen.point[:, 2], 1.0)
+    by_point = np.zeros((len(z), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = focal / z
+    by_point[:, :, 2] = -seen.straight / z[:, None]
+    by_lens = np.zeros((len(z), 2, 0))
+    if problem.lens is not None:
+        pixel = seen.error + problem.observations.pixel
+        by_straight = _by_straight(problem, pixel, b)
+        by_point = by_straight @ by_point
+        in_host = problem.points.pixel[problem.observations.point]
+        by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
+        by_focal = by_straight @ seen.straight[..., None]
+        by_focal -= by_corner @ _undistorted(problem, in_host, b)[..., None]
+        by_b = by_corner @ (in_host * _square(problem, in_host))[..., None]
+        by_b -= by_straight @ (pixel * _square(problem, pixel))[..., None]
+        by_lens = np.concatenate([by_focal, by_b], -1)
+    by_host = by_point @ seen.R
+    by_depth = np.einsum("nij,nj->ni", by_host, seen.in_host)
+    unit_mm = problem.unit_mm
+    return _by_twist(by_point, seen.point, unit_mm), -_by_twist(by_host, seen.in_host, unit_mm), by_depth, by_lens
 
 
-def _by_twist(by_point: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _by_straight(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
+    """Derivative (n, 2, 2) of `_distorted` where it leads to `pixel`: the inverse of that of `_undistorted`."""
+    assert problem.lens is not None
+    square = _square(problem, pixel)[..., None]
+    factor = np.maximum(1 + b * square, _LEAST_SLOPE)
+    outer = 2 * b * pixel[:, :, None] * pixel[:, None, :] / problem.lens.half_width_px**2
+    by_straight: np.ndarray = (np.eye(2) - outer / np.maximum(factor + 2 * b * square, _LEAST_SLOPE)) / factor
+    return by_straight
+
+
+def _by_twist(by_point: np.ndarray, points: np.ndarray, unit_mm: float) -> np.ndarray:
     """Derivative (N, 2, 6) by a twist (rotation, translation) of points (N, 3), from that by the points (N, 2, 3)."""
     # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
-    return np.concatenate([np.cross(points[:, None], by_point), by_point], -1)
+    return np.concatenate([np.cross(points[:, None], by_point), unit_mm * by_point], -1)
 
 
 def _adjoint(T: np.ndarray) -> np.ndarray:
@@ -333,14 +393,13 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
-def _moved(problem: Problem, state: _State, system: _System) -> _State:
-    """Return the state after the step that the system asks for; the first keyframe stays."""
-    free = np.setdiff1d(np.arange(len(system.rhs)), np.arange(6))
-    step = np.zeros(len(system.rhs))
-    step[free] = splu(system.matrix[free][:, free].tocsc()).solve(system.rhs[free])
-    own = step.reshape(-1, _OWN)
-    u = state.u.copy()
-    for points, columns, shrunk, gradient in system.couplings:
-        u[points] -= gradient + shrunk @ step[columns]
-    T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(own[:, :6], state.T, strict=True)])
-    return _State(T, state.scale + own[:, 6], u)
+def _retract(problem: Problem, state: State, step: np.ndarray) -> State:
+    """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
+    count = _OWN * len(state.T_camera_world)
+    own = step[:count].reshape(-1, _OWN)
+    twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
+    T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
+    lens = state.lens if problem.lens is None else state.lens + step[count : count + 2]
+    by_points = step[len(step) - len(state.log_depth) :]
+    log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
+    return State(T, state.log_scale + own[:, 6], log_depth, lens, state.sigma_px)

@@ -15,7 +15,7 @@ from scopemap.flow.corners import detect_corners, match_corners
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
-from scopemap.mapping.bundle_adjustment import Points, Sightings
+from scopemap.mapping.bundle_adjustment import Observations, Points
 from scopemap.mapping.loop_closure import Loop
 
 
@@ -81,7 +81,7 @@ class Linker:
             number = first + np.arange(known.sum())
             self._sightings.append(_Sighting(number, np.full(len(number), other), pixels[known]))
 
-    def collected(self, keyframes: Collection[int] | None = None) -> tuple[Points, Sightings]:
+    def collected(self, keyframes: Collection[int] | None = None) -> tuple[Points, Observations]:
         """Return all points so far, sorted by host, and all sightings of them, sorted by point.
 
         keyframes : numbers, increasing, of those that count, and by whose place here they are then called; None: all.
@@ -98,19 +98,25 @@ class Linker:
         place[by_host] = np.arange(len(by_host))
         order = np.argsort(place[point], kind="stable")
         order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
-        sorted_points = Points(host[by_host], points.rays[by_host], points.log_depth[by_host], points.sigma[by_host])
-        return sorted_points, Sightings(place[point][order], keyframe[order], pixel[order])
+        sorted_points = Points(host[by_host], points.pixel[by_host], points.log_depth[by_host], points.sigma[by_host])
+        return sorted_points, Observations(place[point][order], keyframe[order], self._centred(pixel[order]))
 
     def _host(self, keyframe: int, places: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:
         """Add points at pixels (n, 2) of a keyframe, of depth uncertain by `share`; return the first one's number."""
-        camera, first = self._camera, self._count
-        assert camera is not None
-        x, y = np.asarray(places, dtype=np.float64).reshape(-1, 2).T
-        rays = np.column_stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(len(x))])
+        first = self._count
+        pixel = self._centred(places)
         sigma = np.hypot(share, self.settings.depth_share)
-        self._points.append(Points(np.full(len(x), keyframe), rays, log_depth, sigma))
-        self._count += len(x)
+        self._points.append(Points(np.full(len(pixel), keyframe), pixel, log_depth, sigma))
+        self._count += len(pixel)
         return first
+
+    def _centred(self, pixel: np.ndarray) -> np.ndarray:
+        """Return pixels (n, 2) from the principal point, y times fx / fy."""
+        camera = self._camera
+        if camera is None:
+            return pixel
+        centred: np.ndarray = (pixel - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
+        return centred
 
     def _link(self, past: _Keyframe, new: _Keyframe) -> None:
         to_new, to_past = self._flow.estimate_both(past.rgb, new.rgb)

@@ -74,7 +74,9 @@ def focal_from_motion(sequence: Sequence, config: Config) -> FocalEstimate:
 
 
 def _at_width(fit: WindowFit, scale: float) -> WindowFit:
-    return WindowFit(fit.log_focal + math.log(scale), fit.deviation, fit.residual_px * scale, fit.tilt_deg, fit.bend)
+    return WindowFit(
+        fit.log_focal + math.log(scale), fit.deviation, fit.residual_px * scale, fit.tilt_deg, fit.distortion
+    )
 
 
 def together(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:
@@ -94,7 +96,7 @@ def together(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:
     fov_deg = 2 * math.degrees(math.atan(width_px / 2 / focal_px))
     plausible = FOV_RANGE_DEG[0] <= fov_deg <= FOV_RANGE_DEG[1]
     reason = "" if plausible else f"a horizontal field of view of {fov_deg:.0f} deg is no endoscope's"
-    bend = float(np.median([fit.bend for fit in told]))
+    bend = float(np.median([fit.distortion for fit in told]))
     return FocalEstimate(focal_px, share, fov_deg, len(told), bend, reason)
 
 
