@@ -19,10 +19,11 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, Correction, TrackedPose
 from scopemap.mapping.backend import _Keyframe, _neighbours, _of
-from scopemap.mapping.bundle_adjustment import Points, Solution, State
+from scopemap.mapping.bundle_adjustment import Solution
 from scopemap.mapping.depth_correction import DepthGrid
 from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop
+from scopemap.mapping.reprojection import Points, State
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)

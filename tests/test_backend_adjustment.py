@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
-from scopemap.mapping.bundle_adjustment import Observations, Points, Priors, Problem, adjust
+from scopemap.mapping.bundle_adjustment import adjust
+from scopemap.mapping.reprojection import Observations, Points, Priors, Problem
 
 FOCAL_PX = 150.0
 KEYFRAMES, PER_KEYFRAME = 6, 80

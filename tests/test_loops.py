@@ -15,9 +15,10 @@ from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend
-from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
+from scopemap.mapping.bundle_adjustment import Solution, adjust
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.pose_graph import spread_loops
+from scopemap.mapping.reprojection import Problem
 
 # Out to the side and back again.
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]

@@ -24,7 +24,8 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, Correction, Mapper, TrackedPose
-from scopemap.mapping.bundle_adjustment import Problem, Solution, adjust
+from scopemap.mapping.bundle_adjustment import Solution, adjust
+from scopemap.mapping.reprojection import Problem
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom

@@ -74,31 +74,31 @@ class SchurModel:
         free[self.free] = own[self.free]
         return np.concatenate([free, points])
 
-    def gauss_newton_step(self, damping: float = 0.0) -> np.ndarray:
-        """Return the step (cameras + points,) to the minimum; `damping` is Marquardt's, relative to the diagonal."""
-        matrix, rhs = self.reduced(damping)
+    def gauss_newton_step(self) -> np.ndarray:
+        """Return the step (cameras + points,) to the minimum."""
+        matrix, rhs = self.reduced()
         free, step = self.free, np.zeros(self.cameras + self.points)
         step[free] = splu(matrix[free][:, free].tocsc()).solve(rhs[free])
         for block in self.blocks[0]:
             points = slice(self.cameras + block.points.start, self.cameras + block.points.stop)
-            step[points] = -(block.g + block.E @ step[block.columns]) / (block.h * (1 + damping))
+            step[points] = -(block.g + block.E @ step[block.columns]) / block.h
         return step
 
-    def reduced(self, damping: float = 0.0) -> tuple[sparse.csc_matrix, np.ndarray]:
+    def reduced(self) -> tuple[sparse.csc_matrix, np.ndarray]:
         """Return the matrix of the camera unknowns without the points, and the right-hand side (cameras,)."""
         rhs = np.zeros(self.cameras)
         parts = [(prior.columns, prior.A) for prior in self.blocks[1]]
         for prior in self.blocks[1]:
             rhs[prior.columns] -= prior.b
         for block in self.blocks[0]:
-            shrunk = block.E / (block.h * (1 + damping))[:, None]
+            shrunk = block.E / block.h[:, None]
             parts.append((block.columns, block.A - block.E.T @ shrunk))
             rhs[block.columns] -= block.scores.sum(0) - shrunk.T @ block.g
         rows = np.concatenate([np.repeat(columns, len(columns)) for columns, _ in parts])
         columns = np.concatenate([np.tile(columns, len(columns)) for columns, _ in parts])
         values = np.concatenate([A.ravel() for _, A in parts])
         matrix = sparse.coo_matrix((values, (rows, columns)), shape=(self.cameras,) * 2).tocsc()
-        return matrix + sparse.diags((damping + _RIDGE) * matrix.diagonal()), rhs
+        return matrix + sparse.diags(_RIDGE * matrix.diagonal()), rhs
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""

@@ -18,13 +18,14 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import Points, Priors, Problem, Solution, State, adjust, errors_px
+from scopemap.mapping.bundle_adjustment import Solution, adjust, errors_px
 from scopemap.mapping.depth_correction import DepthGrid, fit_grid
 from scopemap.mapping.feature_tracks import Linker
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.map_merging import join_maps
 from scopemap.mapping.pose_graph import spread_loops
 from scopemap.mapping.pose_interpolation import Correction, TrackedPose, unchanged
+from scopemap.mapping.reprojection import Points, Priors, Problem, State
 
 # Points whose depth is known to a tenth; fewer than that share of all may be what moves by itself.
 _SURE, _LEAST_SURE = 0.1, 0.1

@@ -1,16 +1,14 @@
 """Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the lens.
 
-A point p is on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera it is
-observed in another keyframe t at project(T_t T_h^-1 exp(u_p) ray_p):
+With the notation of `reprojection`:
 
     sum of rho(|projected - observed| / s) + sum of rho((u_p - ln depth_p - a_h) / sigma_p) + sum of (a_k / sigma_a)^2
     +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted  +  sum of ((lens - expected) / sigma_lens)^2
 
 rho is Cauchy's kernel and s the robust standard deviation of the reprojection errors. The second sum holds points to
 the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these factors to 1; the fourth holds a
-keyframe j to its tracked motion from keyframe i; the last is for an unknown lens: ln of the focal length f and the
-distortion b, by which a straight lens sees x (1 + b |x|^2 / w^2) where this one sees x, w half the image width. Dog-leg
-with Schur complement: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
+keyframe j to its tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement:
+Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
 """
 
 from __future__ import annotations
@@ -26,104 +24,12 @@ from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import cauchy, minimise, robust_sigma_2d
 from scopemap.geometry.schur import CameraBlock, PointBlock, SchurModel
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
+from scopemap.mapping.reprojection import Problem, Reprojection, State, jacobians, reproject
 
 _OWN = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
-_LEAST_Z, _LEAST_SLOPE = 1e-3, 0.1
-_UNDISTORTION_STEPS = 6
-_FARTHEST = 10.0  # half widths, beyond which Newton's method would diverge
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
-
-
-@dataclass(frozen=True)
-class Points:
-    """P points, sorted by host.
-
-    Attributes
-    ----------
-    host : (P,) int, number of the keyframe whose pixel they are. pixel : (P, 2) from the principal point, px, y times
-    fx / fy. log_depth : (P,) ln of the estimated depth, mm. sigma : (P,) its standard deviation, so the relative error
-    of the depth.
-    """
-
-    host: np.ndarray
-    pixel: np.ndarray
-    log_depth: np.ndarray
-    sigma: np.ndarray
-
-
-@dataclass(frozen=True)
-class Observations:
-    """N observations, sorted by point: point (N,) int, keyframe (N,) int, pixel (N, 2) as in `Points`."""
-
-    point: np.ndarray
-    keyframe: np.ndarray
-    pixel: np.ndarray
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Standard deviations of what is known beforehand.
-
-    scale : of ln of a keyframe's depth scale, 0 holds it. rotation_rad, translation_share : of the tracked motion
-    between neighbouring keyframes, rad and share of the typical depth.
-    """
-
-    scale: float = 0.1
-    rotation_rad: float = 0.05
-    translation_share: float = 0.1
-
-
-@dataclass(frozen=True)
-class UnknownLens:
-    """Prior of a lens: half_width_px of the image, standard deviations (2,) of ln f and of b; b is expected to be 0."""
-
-    half_width_px: float
-    sigma: np.ndarray
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What is adjusted.
-
-    Attributes
-    ----------
-    T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
-    keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
-    to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
-    """
-
-    T_camera_world: np.ndarray
-    points: Points
-    observations: Observations
-    priors: Priors
-    neighbours: np.ndarray
-    focal_px: float
-    start: State | None = None
-    lens: UnknownLens | None = None
-    least_sigma_px: float = 0.1
-
-    @property
-    def unit_mm(self) -> float:
-        """Typical depth, the unit of translations."""
-        return float(np.exp(np.median(self.points.log_depth)))
-
-    @property
-    def tracked(self) -> State:
-        """The state as tracked."""
-        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0])
-        return State(self.T_camera_world, np.zeros(count), self.points.log_depth, lens)
-
-
-class State(NamedTuple):
-    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,), lens (2,): ln f and b."""
-
-    T_camera_world: np.ndarray
-    log_scale: np.ndarray
-    log_depth: np.ndarray
-    lens: np.ndarray
-    sigma_px: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -158,7 +64,7 @@ def adjust(problem: Problem, *, max_iterations: int = 20, min_decrease: float = 
         return Solution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
     def rescaled(state: State) -> State:
-        reprojection = _reproject(problem, state)
+        reprojection = reproject(problem, state)
         lengths = np.linalg.norm(reprojection.error[reprojection.ahead], axis=1)
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
@@ -173,80 +79,31 @@ def errors_px(problem: Problem, found: Solution) -> np.ndarray:
     """Return the lengths of the reprojection errors (N,), px; infinite behind a camera."""
     if not len(problem.observations.point):
         return np.zeros(0)
-    reprojection = _reproject(problem, found.state)
+    reprojection = reproject(problem, found.state)
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 
-class _Reprojection(NamedTuple):
-    error: np.ndarray  # (N, 2) px, 0 behind the camera
-    ahead: np.ndarray  # (N,) bool
-    point: np.ndarray  # (N, 3) in the observing camera
-    in_host: np.ndarray  # (N, 3) in the host's
-    R: np.ndarray  # (N, 3, 3) from the host to the observing camera
-    straight: np.ndarray  # (N, 2) px, through a lens without distortion
-
-
-def _reproject(problem: Problem, state: State) -> _Reprojection:
-    points, observations, T = problem.points, problem.observations, state.T_camera_world
-    focal, host = np.exp(state.lens[0]), points.host[observations.point]
-    rays = np.column_stack([_undistorted(problem, points.pixel, state.lens[1]) / focal, np.ones(len(points.host))])
-    in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
-    pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
-    between = np.stack([T[pair % len(T)] @ inverse(T[pair // len(T)]) for pair in pairs])
-    R = between[which, :3, :3]
-    seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
-    ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
-    straight = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    pixel = _distorted(problem, straight, state.lens[1])
-    error = np.where(ahead[:, None], pixel - observations.pixel, 0.0)
-    return _Reprojection(error, ahead, seen, in_host, R, straight)
-
-
-def _square(problem: Problem, pixel: np.ndarray) -> np.ndarray:
-    """Squared distance (n, 1) from the principal point in half widths; 0 where the lens is known."""
-    if problem.lens is None:
-        return np.zeros((len(pixel), 1))
-    square: np.ndarray = (pixel**2).sum(1, keepdims=True) / problem.lens.half_width_px**2
-    return square
-
-
-def _undistorted(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
-    undistorted: np.ndarray = pixel * (1 + b * _square(problem, pixel))
-    return undistorted
-
-
-def _distorted(problem: Problem, straight: np.ndarray, b: float) -> np.ndarray:
-    """Return the pixels (n, 2) that `_undistorted` takes to `straight`, by Newton's method on the radius."""
-    if problem.lens is None or b == 0:
-        return straight
-    radius = wanted = np.minimum(np.sqrt(_square(problem, straight)), _FARTHEST)
-    for _ in range(_UNDISTORTION_STEPS):
-        slope = np.maximum(1 + 3 * b * radius**2, _LEAST_SLOPE)
-        radius = np.clip(radius - (radius * (1 + b * radius**2) - wanted) / slope, 0, _FARTHEST)
-    return np.where(wanted > 0, radius / np.maximum(wanted, 1e-12), 1.0) * straight
-
-
-def _weights(state: State, seen: _Reprojection) -> np.ndarray:
+def _weights(state: State, seen: Reprojection) -> np.ndarray:
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, _CAUCHY)[1], 0) / state.sigma_px**2
 
 
 def linearised(problem: Problem, state: State) -> SchurModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
     count, lens = len(state.T_camera_world), 0 if problem.lens is None else 2
-    seen = _reproject(problem, state)
+    seen = reproject(problem, state)
     chain = _chain(problem, state)
     held = [6 + _OWN * np.arange(count)] if problem.priors.scale == 0 else []
     free = np.setdiff1d(np.arange(_OWN * count + lens), np.concatenate([np.arange(6), *held]))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
-        parts = _Rows(seen.error, _weights(state, seen), *_jacobians(problem, state, seen))
+        parts = _Rows(seen.error, _weights(state, seen), *jacobians(problem, state, seen))
         hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
         return hosts, _camera_blocks(problem, state, chain)
 
     return SchurModel(_cost(problem, state, seen, chain), build, free, _OWN * count + lens, len(state.log_depth))
 
 
-def _cost(problem: Problem, state: State, seen: _Reprojection, chain: list[_Link]) -> float:
+def _cost(problem: Problem, state: State, seen: Reprojection, chain: list[_Link]) -> float:
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
@@ -335,54 +192,11 @@ def _host_block(problem: Problem, state: State, host: int, parts: _Rows) -> Poin
 
 
 def _log_depth_sigma(problem: Problem, state: State) -> np.ndarray:
-    seen = _reproject(problem, state)
-    by_depth = _jacobians(problem, state, seen)[2]
+    seen = reproject(problem, state)
+    by_depth = jacobians(problem, state, seen)[2]
     information = _weights(state, seen) * (by_depth**2).sum(1)
     with np.errstate(divide="ignore"):
         return 1 / np.sqrt(np.bincount(problem.observations.point, information, len(state.log_depth)))
-
-
-def _jacobians(
-    problem: Problem, state: State, seen: _Reprojection
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of pixels as in `_Rows`; translations are in units of the typical depth."""
-    focal, b = np.exp(state.lens[0]), state.lens[1]
-    z = np.where(seen.ahead, seen.point[:, 2], 1.0)
-    by_point = np.zeros((len(z), 2, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = focal / z
-    by_point[:, :, 2] = -seen.straight / z[:, None]
-    by_lens = np.zeros((len(z), 2, 0))
-    if problem.lens is not None:
-        pixel = seen.error + problem.observations.pixel
-        by_straight = _by_straight(problem, pixel, b)
-        by_point = by_straight @ by_point
-        in_host = problem.points.pixel[problem.observations.point]
-        by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
-        by_focal = by_straight @ seen.straight[..., None]
-        by_focal -= by_corner @ _undistorted(problem, in_host, b)[..., None]
-        by_b = by_corner @ (in_host * _square(problem, in_host))[..., None]
-        by_b -= by_straight @ (pixel * _square(problem, pixel))[..., None]
-        by_lens = np.concatenate([by_focal, by_b], -1)
-    by_host = by_point @ seen.R
-    by_depth = np.einsum("nij,nj->ni", by_host, seen.in_host)
-    unit_mm = problem.unit_mm
-    return _by_twist(by_point, seen.point, unit_mm), -_by_twist(by_host, seen.in_host, unit_mm), by_depth, by_lens
-
-
-def _by_straight(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
-    """Derivative (n, 2, 2) of `_distorted` where it leads to `pixel`: the inverse of that of `_undistorted`."""
-    assert problem.lens is not None
-    square = _square(problem, pixel)[..., None]
-    factor = np.maximum(1 + b * square, _LEAST_SLOPE)
-    outer = 2 * b * pixel[:, :, None] * pixel[:, None, :] / problem.lens.half_width_px**2
-    by_straight: np.ndarray = (np.eye(2) - outer / np.maximum(factor + 2 * b * square, _LEAST_SLOPE)) / factor
-    return by_straight
-
-
-def _by_twist(by_point: np.ndarray, points: np.ndarray, unit_mm: float) -> np.ndarray:
-    """Derivative (N, 2, 6) by a twist (rotation, translation) of points (N, 3), from that by the points (N, 2, 3)."""
-    # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
-    return np.concatenate([np.cross(points[:, None], by_point), unit_mm * by_point], -1)
 
 
 def _adjoint(T: np.ndarray) -> np.ndarray:

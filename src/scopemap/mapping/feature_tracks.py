@@ -15,8 +15,8 @@ from scopemap.flow.corners import detect_corners, match_corners
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import sigma_share
-from scopemap.mapping.bundle_adjustment import Observations, Points
 from scopemap.mapping.loop_closure import Loop
+from scopemap.mapping.reprojection import Observations, Points
 
 
 @dataclass(frozen=True)
