@@ -26,6 +26,7 @@ from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.io.opening import open_sequence
+from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Pipeline
@@ -73,8 +74,10 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb
-    submap = pipeline.submaps()[0][0]
-    pipeline.fusion.fuse(pipeline.corrected(submap), submap.main_frames)
+    submap = pipeline.mapper.submaps()[0][0]
+    stored = pipeline.fusion.store.frames(submap.frames)
+    frames = (corrected_frame(frame, submap.correction) for frame in stored)
+    pipeline.fusion.fuse(frames, submap.main_frames)
     seldom = ("keyframe", "back end")
     per_frame = {part: 1e3 * float(np.median(t[WARM_UP:])) for part, t in seconds.items() if part not in seldom}
     # What does not happen at every frame is spread over all.

@@ -34,7 +34,7 @@ def test_links_lead_somewhere(document: Path) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_settings_that_are_named_exist(document: Path) -> None:
-    named = re.findall(rf"(?<![\w/.])((?:{'|'.join(sorted(GROUPS))})\.[a-z_]+)(?![\w(/])", document.read_text())
+    named = re.findall(rf"(?<![\w/.])((?:{'|'.join(sorted(GROUPS))})(?:\.[a-z_]+)+)(?![\w(/])", document.read_text())
     files = {f"{group}.{ending}" for group in GROUPS for ending in ("py", "json", "png", "toml")}
     assert set(named) - files <= set(setting_names())
 

@@ -96,9 +96,9 @@ def test_relative_sharpness_is_a_share_of_the_recent_median() -> None:
 
     def after_itself(other: Frame) -> float:
         monitor = SharpnessMonitor()
-        assert monitor.relative_sharpness(frame) == 1.0
-        assert monitor.relative_sharpness(frame) == pytest.approx(1.0)
-        return monitor.relative_sharpness(other)
+        assert monitor.relative_sharpness(frame.rgb, frame.valid) == 1.0
+        assert monitor.relative_sharpness(frame.rgb, frame.valid) == pytest.approx(1.0)
+        return monitor.relative_sharpness(other.rgb, other.valid)
 
     assert after_itself(_blurred(frame)) < 0.5
     assert after_itself(_smoked(frame)) < 0.3
@@ -109,16 +109,16 @@ def test_relative_sharpness_is_a_share_of_the_recent_median() -> None:
 def test_what_is_unsharp_for_long_becomes_usual() -> None:
     sharp, soft, monitor = _frame(0, NEAR[0]), _blurred(_frame(0, NEAR[0])), SharpnessMonitor()
     for _ in range(30):
-        monitor.relative_sharpness(sharp)
-    shares = [monitor.relative_sharpness(soft) for _ in range(30)]
+        monitor.relative_sharpness(sharp.rgb, sharp.valid)
+    shares = [monitor.relative_sharpness(soft.rgb, soft.valid) for _ in range(30)]
     assert shares[9] < 0.6
     assert shares[-1] == pytest.approx(1.0)
 
 
 def test_nothing_usable_is_not_sharp() -> None:
     frame = _frame(0, NEAR[0])
-    assert sharpness(replace(frame, valid=np.zeros_like(frame.valid))) == 0.0
-    assert sharpness(replace(frame, rgb=np.zeros_like(frame.rgb))) == 0.0
+    assert sharpness(frame.rgb, np.zeros_like(frame.valid)) == 0.0
+    assert sharpness(np.zeros_like(frame.rgb), frame.valid) == 0.0
 
 
 def _elsewhere(index: int, n: int) -> Frame:

@@ -3,15 +3,14 @@
     perceive    mask -> raw metric depth -> correspondence with the previous frame
     step        track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS) -> new keyframe
                 -> smooth (WEMA) -> store, or fuse (TSDF)
-    submaps     after the last frame: adjust all keyframes, close loops, merge maps
-    fuse        correct the stored frames of a submap -> fuse (TSDF)
+    mapper.submaps    after the last frame: adjust all keyframes, close loops, merge maps
+    fusion.fuse       fuse the stored frames of a submap, corrected (TSDF)
 
 `perceive` needs no motion, so it may run a frame ahead of `step`. The preset `paper` refines before it tracks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +24,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
-from scopemap.mapping.submaps import Mapper, Submap, corrected_frame
+from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
@@ -87,25 +86,24 @@ class Pipeline:
         self._tracker = tracker or Tracker(tracking, estimators.corner_flow)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self._mapper = Mapper(config.mapping, estimators.keyframe_flow)
+        self.mapper = Mapper(config.mapping, estimators.keyframe_flow)
         self._last_track: Track | None = None
 
     def perceive(self, frame: Frame) -> Percept:
         """Mask a frame, estimate its raw depth and its correspondence with the previous frame."""
-        frame, anchor = self._masker(frame), self.estimators.anchor
+        frame = self._masker(frame)
         # A frame that the tracker refuses must not fix the scale of depth.
         usable = frame.valid.mean() >= self.config.tracking.min_valid_share
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
-        raw = anchor.metric(estimate, shown)
-        link = self._matcher.match(frame, wanted=self._mapis.links(estimate.kind))
+        raw = self.estimators.anchor.metric(estimate, shown)
+        link = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.links(estimate.kind))
         frame = replace(frame, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
-        return Percept(frame, estimate.kind, link, anchor.just_fitted)
+        return Percept(frame, estimate.kind, link, self.estimators.anchor.just_fitted)
 
     def step(self, percept: Percept) -> Step:
         """Track a frame, refine its depth, make it a keyframe where one is due, store or fuse it."""
-        refine_first = self.config.mapis.paper.order == "refine-first"
-        refined = self._refine(percept, None) if refine_first else None
+        refined = self._refine(percept, None) if self.config.mapis.paper.order == "refine-first" else None
         track, last = self._tracker.track(percept.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
@@ -116,19 +114,10 @@ class Pipeline:
             self._reset()
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-        self._mapper.observe(track)
+        self.mapper.observe(track)
         self.fusion.put(frame)
         self._last_track = track
         return Step(frame, track, np.asarray(percept.frame.depth_mm), refined)
-
-    def submaps(self) -> tuple[list[Submap], list[str]]:
-        """Adjust all keyframes after the last frame; return the submaps, most frames first, and warnings."""
-        return self._mapper.submaps()
-
-    def corrected(self, submap: Submap) -> Iterator[Frame]:
-        """Yield the stored frames of a submap with corrected pose and depth, to be fused by `fusion.fuse`."""
-        for frame in self.fusion.store.frames(submap.frames):
-            yield corrected_frame(frame, submap.correction)
 
     def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
         raw = percept.frame
@@ -152,11 +141,10 @@ class Pipeline:
         if track.status == "lost" or not self._tracker.wants_keyframe():
             return track
         keyframe = replace(frame, T_world_camera=track.T_world_camera)
-        # Measured depth that was scaled or blended is not what the next frame measures.
+        # Depth that MAPIS scaled or blended is not what the next frame measures.
         adopted = self._tracker.adopt(keyframe, measured=kind == "measured" and not self._mapis.links(kind))
-        # With measured depth, tracking is better than flow between distant keyframes (BENCHMARK.md).
-        if adopted and kind != "measured":
-            self._mapper.add_keyframe(keyframe, track)
+        if adopted and kind != "measured":  # with measured depth tracking alone is better
+            self.mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not adopted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track

@@ -28,7 +28,7 @@ from scopemap.frame import Frame, is_constant
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
-from scopemap.mapping.submaps import Submap
+from scopemap.mapping.submaps import Submap, corrected_frame
 from scopemap.pipeline import Estimators, Percept, Pipeline, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of
 from scopemap.tracking.track import FrameTracker
@@ -115,7 +115,7 @@ class _Run:
 
     def result(self, notes: list[str]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others."""
-        submaps, warnings = self.clock.timed("back end", self.pipeline.submaps)
+        submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
         results = [self._fused(submap, notes) for submap in submaps]
         for frame in self._frames_of_none(submaps):
             self._written(frame)
@@ -125,7 +125,8 @@ class _Run:
     def _fused(self, submap: Submap, notes: list[str]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
         sequence, pipeline = self.sequence, self.pipeline
-        frames = map(self._written, pipeline.corrected(submap))
+        stored = pipeline.fusion.store.frames(submap.frames)
+        frames = (self._written(corrected_frame(frame, submap.correction)) for frame in stored)
         fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)

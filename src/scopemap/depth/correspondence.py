@@ -10,7 +10,6 @@ from scopemap.config import MapisSettings
 from scopemap.depth.estimate import PerceptualDistance
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame
 from scopemap.geometry.warp import pull
 
 
@@ -32,22 +31,26 @@ class DenseCorrespondence:
 
 
 class DenseMatcher:
-    """Matches masked frames, in order, with the previous one."""
+    """Matches masked images, in order, with the previous one."""
 
     def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
         self._settings, self._flow, self._perceptual = settings, flow, perceptual
-        self._previous: Frame | None = None
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
-    def match(self, frame: Frame, *, wanted: bool = True) -> DenseCorrespondence | None:
-        """Return the correspondence; None for the first frame and where it is not `wanted`."""
-        previous, self._previous = self._previous, frame
+    def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
+        """Return the correspondence of an image (H, W, 3) uint8 with valid pixels (H, W) to the previous one.
+
+        None for the first image and where it is not `wanted`.
+        """
+        previous, self._previous = self._previous, (rgb, valid)
         if previous is None or not wanted:
             return None
-        flow = pair_flow(self._flow, previous.rgb, frame.rgb, self._settings.advanced.consistency_px)
-        # Masked pixels of either frame show no tissue.
-        seen = pull(previous.valid.astype(np.float32), flow.to_previous) > 0.5
-        rgb = pull(previous.rgb, flow.to_previous) if self._settings.paper.compare_warped else previous.rgb
-        distance = self._perceptual.compare(rgb, frame.rgb)
+        rgb_previous, valid_previous = previous
+        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.advanced.consistency_px)
+        # Masked pixels of either image show no tissue.
+        seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
+        compared = pull(rgb_previous, flow.to_previous) if self._settings.paper.compare_warped else rgb_previous
+        distance = self._perceptual.compare(compared, rgb)
         values = np.full_like(distance.map, distance.score) if self._settings.paper.perceptual_score else distance.map
-        consistent = flow.consistent & seen & frame.valid
-        return DenseCorrespondence(flow.to_previous, consistent, values, float(frame.valid.mean()))
+        consistent = flow.consistent & seen & valid
+        return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))

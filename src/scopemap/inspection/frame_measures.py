@@ -100,7 +100,7 @@ class FrameInspector:
             time_s=masked.time_s,
             blank=bool(is_constant(small) or lit_share < _LEAST_LIT),
             brightness=sum(cv2.mean(small, mask)[:3]) / 3,
-            detail=sharpness(masked),
+            detail=sharpness(masked.rgb, masked.valid),
             change=self._change(rgb, small),
             motion=self._motion(small),
             redness=means[0] / max(means[1], means[2], 1.0),

@@ -21,8 +21,7 @@ import numpy as np
 from scipy import sparse
 
 from scopemap.geometry import least_squares
-from scopemap.geometry.least_squares import cauchy, minimise, robust_sigma_2d
-from scopemap.geometry.schur import CameraBlock, PointBlock, SchurModel
+from scopemap.geometry.least_squares import CameraBlock, PointBlock, SchurModel, cauchy, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 from scopemap.mapping.reprojection import Problem, Reprojection, State, jacobians, reproject
 

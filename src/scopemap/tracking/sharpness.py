@@ -7,8 +7,6 @@ from collections import deque
 import cv2
 import numpy as np
 
-from scopemap.frame import Frame
-
 _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
 _FRAMES = 30
 
@@ -22,17 +20,17 @@ class SharpnessMonitor:
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=_FRAMES)
 
-    def relative_sharpness(self, frame: Frame) -> float:
-        """Return the frame's sharpness as a share of the median before it; 1 for the first."""
-        value = sharpness(frame)
+    def relative_sharpness(self, rgb: np.ndarray, valid: np.ndarray) -> float:
+        """Return the sharpness of an image as a share of the median before it; 1 for the first."""
+        value = sharpness(rgb, valid)
         usual = float(np.median(self._recent)) if self._recent else value
         self._recent.append(value)
         return value / usual if usual > 0 else 1.0
 
 
-def sharpness(frame: Frame) -> float:
-    """Return the mean local contrast over usable pixels, as a share of their brightness."""
-    grey, valid = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), frame.valid.astype(np.float32)
+def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:
+    """Return the mean local contrast of an image (H, W, 3) uint8 over valid pixels (H, W), relative to brightness."""
+    grey, valid = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), valid.astype(np.float32)
     fine, coarse = (_blurred(grey, valid, share * grey.shape[1]) for share in (_FINE, _COARSE))
     brightness = float((coarse * valid).sum())
     return float((np.abs(fine - coarse) * valid).sum()) / brightness if brightness > 0 else 0.0

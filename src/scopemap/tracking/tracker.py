@@ -62,7 +62,7 @@ class Tracker:
         if frame.valid.mean() < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
             return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
-        sharpness = self._sharpness.relative_sharpness(frame)
+        sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         self._is_unsharp = sharpness < self.settings.min_sharpness
         unsharp = f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid"
         if self._keyframe is None:
