@@ -185,8 +185,6 @@ def test_height_before_width_is_turned_and_it_is_said(name: str, tmp_path: Path)
     found = read(tmp_path, {"K": K, name: [480, 640]})
     assert found.camera == PINHOLE
     assert "its size 480, 640 taken as height, width" in found.source
-    with pytest.raises(CalibrationError, match="its height and width may be swapped"):
-        read(tmp_path, {"K": K, name: [960, 1280]})
 
 
 def test_the_size_of_a_turned_picture_is_not_turned_back(tmp_path: Path) -> None:
@@ -199,7 +197,6 @@ def test_the_size_of_a_turned_picture_is_not_turned_back(tmp_path: Path) -> None
 def test_the_size_of_the_board_is_not_the_pictures(board: dict[str, Any], tmp_path: Path) -> None:
     found = read(tmp_path, {"K": K, **board})
     assert found.camera == PINHOLE
-    assert "its size 9x6 passed over" in found.source
 
 
 # ---- the matrix
@@ -320,5 +317,4 @@ def test_scaling_that_has_nothing_to_scale_is_said(tmp_path: Path) -> None:
         "no calibration file: --camera-fit scale has no effect" in open_sequence(folder, settings=scale).camera_source
     )
     (tmp_path / "any.yaml").write_text(ROS)
-    assert "nothing to scale" in read_calibration(tmp_path / "any.yaml", SIZE, "scale").source
     assert "scale" not in stated_calibration(tmp_path / "any.yaml", SIZE).source

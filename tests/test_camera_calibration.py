@@ -20,7 +20,6 @@ from scopemap.calibration.targets import (
     Corners,
     Target,
     nearest_px,
-    other_target_seen,
 )
 from scopemap.calibration.views import BoardView, Search, edge_width_px, select_views
 from scopemap.cameras.camera import CameraModel, PinholeCamera
@@ -37,9 +36,7 @@ def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
         grey = picture[..., 0]
         corners = board.find(grey)
         search.looked_at += 1
-        if corners is None:
-            search.without.append(grey)
-        else:
+        if corners is not None:
             width_px = edge_width_px(grey, corners.pixels)
             search.views.append(BoardView(index, f"{index}.png", corners, width_px, corners))
     return search
@@ -220,7 +217,7 @@ def replace_views(search: Search, views: list[BoardView]) -> Search:
 
 
 def test_too_few_views_are_refused(pinhole_search: Search) -> None:
-    few = replace(replace_views(pinhole_search, pinhole_search.views[:2]), looked_at=200, without=[])
+    few = replace(replace_views(pinhole_search, pinhole_search.views[:2]), looked_at=200)
     with pytest.raises(
         InputError, match=r"found in 2 of 200 frames, at least 8 needed: looked for a checkerboard of 9"
     ):
@@ -235,50 +232,6 @@ def test_corners_without_sense_are_refused(pinhole_search: Search) -> None:
     ]
     with pytest.raises((InputError, CalibrationError), match=r"^(calibrating|fitting the camera)"):
         save_calibration(calibrate(replace(pinhole_search, views=noisy), CHECKERBOARD, "pinhole"), Path("no.yaml"))
-
-
-@pytest.fixture(scope="module")
-def one_picture() -> dict[str, np.ndarray]:
-    """A checkerboard and a ChArUco board, each held straight before the camera, grey."""
-    found = {}
-    for name, board in (("checkerboard", CHECKERBOARD), ("charuco", CHARUCO)):
-        pose = np.eye(4)
-        pose[:3, 3] = -15, -10, 45
-        found[name] = Studio(PINHOLE, board).shot(pose)[..., 0]
-    return found
-
-
-@pytest.mark.parametrize(
-    ("shown", "board", "hint"),
-    [
-        ("checkerboard", Checkerboard(10, 7, 3.0), "a checkerboard of 9x6 inner corners is seen: give --board 9x6"),
-        ("checkerboard", CHARUCO, "a checkerboard of 9x6 inner corners is seen: leave out --charuco"),
-        ("charuco", replace(CHARUCO, columns=5, rows=7), "a ChArUco board of 7x5 squares is seen: give --board 7x5"),
-        ("charuco", replace(CHARUCO, columns=9, rows=5), "but not as they are on this board: check --board"),
-        ("charuco", replace(CHARUCO, dictionary="DICT_6X6_250"), "give --dictionary DICT_4X4_50"),
-        ("charuco", CHECKERBOARD, "is it a ChArUco board (--charuco --dictionary DICT_4X4_50)?"),
-    ],
-)
-def test_another_board_is_named(shown: str, board: Target, hint: str, one_picture: dict[str, np.ndarray]) -> None:
-    assert board.find(one_picture[shown]) is None
-    assert hint in other_target_seen(board, [one_picture[shown]])
-    assert other_target_seen(board, [np.full((120, 160), 90, np.uint8)]) == ""
-
-
-def test_texture_is_no_board() -> None:
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    pictures = [texture(np.random.default_rng(seed)) for seed in (3, 10, 11, 13, 15, 21)]
-    assert sum(cv2.findChessboardCornersSBWithMeta(grey, (4, 3), flags)[0] for grey in pictures) > 1
-    assert other_target_seen(CHECKERBOARD, pictures) == ""
-
-
-def texture(rng: np.random.Generator, size: tuple[int, int] = (960, 540)) -> np.ndarray:
-    """Noise at three scales, in which the search for a checkerboard of any size finds the smallest."""
-    picture = np.zeros(size[::-1], np.float32)
-    for share, side in ((0.5, 64), (0.25, 16), (0.25, 4)):
-        coarse = rng.uniform(0, 255, (size[1] // side, size[0] // side)).astype(np.float32)
-        picture += share * cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
-    return picture.clip(0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -327,14 +280,14 @@ def large() -> Studio:
 
 def test_warnings(pinhole: CameraCalibration) -> None:
     fit = pinhole.fit
-    assert warnings_about(fit, 0.8, 1.0) == []
+    assert warnings_about(fit, 0.8) == []
     flat = fit.T_camera_board.copy()
     flat[:, :3, :3] = np.eye(3)
     rough = tuple(100 * residual for residual in fit.residuals_px)
     unsure = fit.deviations | {"fx": 10.0}
     poor = replace(fit, T_camera_board=flat, residuals_px=rough, deviations=unsure)
-    said = "\n".join(warnings_about(poor, 0.3, 1.1))
-    for words in ("in 0 view(s)", "cover 30 %", "px off on the whole", "known to 3.8 % only", "by the input 1.100"):
+    said = "\n".join(warnings_about(poor, 0.3))
+    for words in ("in 0 view(s)", "cover 30 %", "px off on the whole", "known to 3.8 % only"):
         assert words in said
 
 
@@ -342,14 +295,13 @@ def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: CameraCalib
     file = tmp_path / "calibration.yaml"
     file.write_text("the earlier one")
     narrow = replace(pinhole, fit=replace(pinhole.fit, camera=PinholeCamera(9000.0, 9000.0, 160, 120, *SIZE)))
-    with pytest.raises(CalibrationError, match="cannot be used, so none was written"):
+    with pytest.raises(CalibrationError, match="no file was written: the fitted camera does not fit"):
         save_calibration(narrow, file)
     assert [each.read_text() for each in tmp_path.iterdir()] == ["the earlier one"]
 
 
 def test_the_picture(pinhole: CameraCalibration, tmp_path: Path) -> None:
-    frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    draw_calibration(pinhole, frame, tmp_path / "calibration.png")
-    assert Image.open(tmp_path / "calibration.png").size == (1600, 500)
+    draw_calibration(pinhole, tmp_path / "calibration.png")
+    assert Image.open(tmp_path / "calibration.png").size == (1100, 500)
     with pytest.raises(InputError, match="drawing the calibration"):
-        draw_calibration(pinhole, frame, tmp_path / "none" / "calibration.png")
+        draw_calibration(pinhole, tmp_path / "none" / "calibration.png")

@@ -120,8 +120,8 @@ def test_a_board_that_is_not_there(calibrate: Say, frames: Path, tmp_path: Path)
     code, out, err = calibrate(frames, "--board", "10x7", "--square-mm", 3, "--frames", "0:4", "--quiet")
     assert (code, out) == (1, "")
     assert err == (
-        "scopemap: calibrating: the board was found in 0 of 4 frames, at least 8 needed: a checkerboard of 9x6 inner "
-        "corners is seen: give --board 9x6\n"
+        "scopemap: calibrating: the board was found in 0 of 4 frames, at least 8 needed: looked for a checkerboard of "
+        "10x7 inner corners, squares of 3 mm; is it this one, and whole in the picture?\n"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -55,15 +55,13 @@ def images_bin(frames: list[int], name: str = "out{}.png", quaternion: tuple[flo
     return content
 
 
-def write_models(archive: Path, models: dict[int, bytes], clusters: dict[int, int] | None = None) -> None:
-    """Write sub-models; `clusters` says how many names stand in the list of each."""
+def write_models(archive: Path, models: dict[int, bytes]) -> None:
+    """Write sub-models."""
     archive.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as opened:
         for number, content in models.items():
             opened.writestr(f"33/sparse/{number}/images.bin", content)
             opened.writestr(f"33/sparse/{number}/cameras.bin", b"")
-        for number, count in (clusters or {}).items():
-            opened.writestr(f"33/cluster_list/{number}.txt", "".join(f"out{i}.png\n" for i in range(count)))
 
 
 def write_endomapper(root: Path, number: object = 1) -> Path:
@@ -149,9 +147,9 @@ def test_a_calibration_of_another_size_is_rescaled(tmp_path: Path) -> None:
 
 def test_poses_of_the_largest_sub_model(tmp_path: Path) -> None:
     folder = write_endomapper(tmp_path)
-    # By its list the second is the largest, and lies before the third, which is as large; the first has more images.
-    models = {0: images_bin([1, 2, 3, 4, 5]), 4: images_bin([2, 6, 3]), 10: images_bin([1, 2, 3])}
-    write_models(archive_of(folder), models, {0: 2, 4: 3, 10: 3})
+    # The second and the third have most images; the first has the longest file, as it has more points.
+    models = {0: images_bin([90, 91]), 4: images_bin([2, 6, 3]), 10: images_bin([1, 2, 3])}
+    write_models(archive_of(folder), models)
     sequence = open_sequence(folder)
     # out2.png is frame 1; x_camera = R x_world + t, half a turn about z: the centre is -R^T t = (tx, ty, -tz).
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -166,12 +164,6 @@ def test_poses_of_the_largest_sub_model(tmp_path: Path) -> None:
     np.testing.assert_array_equal(reference.indices, [1, 2, 5])
     np.testing.assert_allclose(reference.times_s, [0.02, 0.04, 0.1])
     assert any("sub-model 4, the largest of 3: 3 frames; its scale is arbitrary" in note for note in sequence.notes)
-
-
-def test_without_lists_the_longest_file_is_taken(tmp_path: Path) -> None:
-    folder = write_endomapper(tmp_path)
-    write_models(archive_of(folder), {3: images_bin([1]), 5: images_bin([1, 2, 3])})
-    assert sorted(open_sequence(folder).source.poses) == [0, 1, 2]
 
 
 def test_an_image_that_is_not_posed_has_no_pose(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from scopemap.calibration.intrinsics import (
     with_deviations,
     without_outliers,
 )
-from scopemap.calibration.targets import Target, other_target_seen
+from scopemap.calibration.targets import Target
 from scopemap.calibration.views import BoardView, LeftOut, Search, select_views, views_per_pixel
 from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.formats.writing import write_calibration
@@ -31,8 +31,6 @@ _TILTED_DEG, _TILTED_VIEWS = 15.0, 3
 _LITTLE_COVERED = 0.5
 _LARGE_RMS_PX = 1.0
 _UNSURE_FOCAL = 0.01
-_OTHER_ASPECT = 0.02
-_UNMAPPED = 0.001
 
 
 @dataclass(frozen=True)
@@ -63,11 +61,6 @@ class CameraCalibration:
         """Number of corners of the views that were left out, as they do not fit."""
         return sum(len(view.found) - len(view.corners) for view in self.views)
 
-    @property
-    def example(self) -> BoardView:
-        """The view with most corners found, of these the largest: to be shown."""
-        return max(self.views, key=lambda view: (len(view.found), float(np.prod(np.ptp(view.found.pixels, 0)))))
-
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and texts: px, mm, degrees."""
         fit = self.fit
@@ -92,10 +85,8 @@ class CameraCalibration:
                 }
                 for view, error, tilt, pose in rows
             ],
-            **{
-                name: [{"frame": out.view.index, "name": out.view.name, "reason": out.reason} for out in outs]
-                for name, outs in (("left_out", self.left_out), ("blurred", self.blurred))
-            },
+            "left_out": [out.summary() for out in self.left_out],
+            "blurred": [out.summary() for out in self.blurred],
             "alike": self.alike,
             "stray_corners": self.stray_corners,
             "warnings": self.warnings,
@@ -103,19 +94,18 @@ class CameraCalibration:
 
 
 def calibrate(
-    search: Search, target: Target, model: Literal["pinhole", "fisheye", "auto"] = "auto", pixel_aspect: float = 1.0
+    search: Search, target: Target, model: Literal["pinhole", "fisheye", "auto"] = "auto"
 ) -> CameraCalibration:
     """Return the camera that took the views of `target` found by `search`.
 
     Of the forms of `model` (auto: of both models) the simplest is taken that predicts held-out views about as well as
-    the best. `pixel_aspect` is the input's, width of a pixel over height. Raises `InputError` for fewer than 8 views
-    that differ and agree, `CalibrationError` where no camera explains them.
+    the best. Raises `InputError` for fewer than 8 views that differ and agree, `CalibrationError` where no camera
+    explains them.
     """
     found, size = len(search.views), search.size
     seen = f"the board was found in {found} of {search.looked_at} frames"
     if found < FEWEST_VIEWS:
-        advice = other_target_seen(target, search.without) or f"looked for a {target.described}"
-        raise _too_few(seen, advice)
+        raise _too_few(seen, f"looked for a {target.described}; is it this one, and whole in the picture?")
     selected = select_views(search.views, size)
     if len(selected.views) < FEWEST_VIEWS:
         differ = f"but {len(selected.views)} of these views are sharp and differ"
@@ -127,25 +117,19 @@ def calibrate(
     views.sort(key=lambda view: view.index)
     if len(views) < FEWEST_VIEWS:
         agree = f"{seen}, but only {len(views)} of {len(selected.views)} views agree"
-        worst = f"frame {out[0].view.index}: {out[0].reason}; " if out else ""
-        raise _too_few(agree, f"{worst}is the board flat and the zoom untouched?")
+        raise _too_few(agree, "is the board flat and the zoom untouched?")
     near = {model: fit.camera for model, fit in flexible.items()}
     errors = {form: held_out_error_px(views, size, form, near[form.model]) for form in forms if form.model in near}
     form = choose_form(errors)
     fit = with_deviations(fit_camera(views, size, form, near[form.model]), views)
     covered = float((views_per_pixel(views, size) > 0).mean())
-    warnings = warnings_about(fit, covered, pixel_aspect)
+    warnings = warnings_about(fit, covered)
     return CameraCalibration(fit, views, errors, out, selected.blurred, selected.alike, covered, warnings)
 
 
 def save_calibration(calibration: CameraCalibration, file: Path) -> None:
     """Write the camera to `file`, OpenCV YAML; `CalibrationError`, and no file, where no command would take it."""
-    try:
-        check_plausible(calibration.fit.camera, "the fitted camera")
-    except CalibrationError as error:
-        raise CalibrationError(
-            f"the views lead to a camera that cannot be used, so none was written: {error}"
-        ) from None
+    check_plausible(calibration.fit.camera, "no file was written: the fitted camera")
     write_calibration(calibration.fit.camera, file)
 
 
@@ -154,16 +138,10 @@ def tilts_deg(fit: Fit) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(np.abs(fit.T_camera_board[:, 2, 2]), 0, 1)))
 
 
-def warnings_about(fit: Fit, covered: float, pixel_aspect: float) -> list[str]:
-    """Return the shortcomings of a fit.
-
-    `covered` is the share of the image within targets, `pixel_aspect` the width of a pixel over its height.
-    """
-    central, camera, views = fit.camera.central, fit.camera, len(fit.residuals_px)
-    tilted = int(np.sum(tilts_deg(fit) > _TILTED_DEG))
-    unsure, aspect = fit.deviations["fx"] / central.fx, central.fy / central.fx
-    grid = np.stack(np.meshgrid(np.arange(0, camera.width, 4), np.arange(0, camera.height, 4)), -1)
-    unmapped = float(np.mean(np.isnan(camera.unproject(grid)[..., 2])))
+def warnings_about(fit: Fit, covered: float) -> list[str]:
+    """Return the shortcomings of a fit; `covered` is the share of the image within targets."""
+    views, tilted = len(fit.residuals_px), int(np.sum(tilts_deg(fit) > _TILTED_DEG))
+    unsure = fit.deviations["fx"] / fit.camera.central.fx
     possible = [
         (views < _FEW_VIEWS, f"only {views} views that differ: 15 to 40 are usual"),
         (
@@ -183,15 +161,6 @@ def warnings_about(fit: Fit, covered: float, pixel_aspect: float) -> list[str]:
         (
             unsure > _UNSURE_FOCAL,
             f"the focal length is known to {100 * unsure:.1f} % only: add views with the board tilted",
-        ),
-        (
-            abs(aspect / pixel_aspect - 1) > _OTHER_ASPECT,
-            f"by the fit pixels are {aspect:.3f} times as wide as high, by the input {pixel_aspect:.3f}: are the "
-            "board's squares square, or the picture stretched?",
-        ),
-        (
-            unmapped > _UNMAPPED,
-            f"{100 * unmapped:.1f} % of the picture's pixels are beyond the fitted lens and are left out by it",
         ),
     ]
     return [message for applies, message in possible if applies]

@@ -10,14 +10,13 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from scopemap.calibration.targets import Corners
 from scopemap.calibration.views import BoardView, LeftOut
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
-from scopemap.geometry.least_squares import robust_sigma, robust_sigma_2d
+from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import transform
 
 _TERMS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
@@ -31,8 +30,8 @@ _RESAMPLES = 20
 _FOLDS = 5
 # A form with more coefficients, or the fisheye, has to predict better by this share.
 _WORTH_IT = 0.02
-# A view does not fit whose error exceeds that of the median view, and the spread about it, by so much.
-_OFF, _OFF_SIGMAS, _OFF_PX = 3.0, 6.0, 0.1
+# A view does not fit where no larger share of its corners do.
+_LEAST_AGREEING = 0.5
 _MOST_OUTLIERS = 1 / 3
 # Corners farther off than 5 standard deviations do not fit; by chance so is one in 300,000.
 _STRAY_SIGMAS, _STRAY_PX = 5.0, 0.25
@@ -171,42 +170,22 @@ def without_outliers(
 ) -> tuple[list[BoardView], list[LeftOut]]:
     """Return the views that agree on a camera of `form`, without stray corners, and those that do not: a third at most.
 
-    As long as the error of the worst view is far from what is usual, it is left out, or up to a tenth of its corners
-    where that suffices, and the others are fitted anew. Then corners far from their projection are left out.
+    As long as half of the corners of a view or more are far from their projections, the worst view is left out and the
+    others are fitted anew.
     """
     kept, out = list(views), list[LeftOut]()
-    fit = fit_camera(kept, size, form)
-    for _ in views:
-        error = fit.view_rms_px
-        usual = float(np.median(error))
-        limit = max(_OFF * usual, usual + _OFF_SIGMAS * robust_sigma(error - usual), usual + _OFF_PX)
-        worst = int(np.argmax(error))
-        if not np.isfinite(usual) or error[worst] <= limit or len(out) >= _MOST_OUTLIERS * len(views):
+    while True:
+        fit = fit_camera(kept, size, form)
+        lengths = [_lengths(residual) for residual in fit.residuals_px]
+        limit = max(_STRAY_SIGMAS * robust_sigma_2d(np.concatenate(lengths)), _STRAY_PX)
+        agree = [length <= limit for length in lengths]
+        worst = min(range(len(kept)), key=lambda i: (agree[i].mean() > _LEAST_AGREEING, -fit.view_rms_px[i]))
+        if agree[worst].mean() > _LEAST_AGREEING or len(out) >= _MOST_OUTLIERS * len(views):
             break
-        view, reason = kept.pop(worst), f"it does not fit: {error[worst]:.2f} px off, the others {usual:.2f} px"
-        mended = _without_worst_corners(view, fit.camera, fit.T_camera_board[worst], limit)
-        if mended is None:
-            out.append(LeftOut(view, reason))
-        else:
-            kept.insert(worst, mended)
-        fit = fit_camera(kept, size, form, near=fit.camera)
-    lengths = [_lengths(residual) for residual in fit.residuals_px]
-    limit = max(_STRAY_SIGMAS * robust_sigma_2d(np.concatenate(lengths)), _STRAY_PX)
-    kept = [
-        replace(view, corners=view.corners.where(length <= limit)) for view, length in zip(kept, lengths, strict=True)
-    ]
+        error, usual = fit.view_rms_px[worst], float(np.median(fit.view_rms_px))
+        out.append(LeftOut(kept.pop(worst), f"it does not fit: {error:.2f} px off, the others {usual:.2f} px"))
+    kept = [replace(view, corners=view.corners.where(close)) for view, close in zip(kept, agree, strict=True)]
     return [view for view in kept if len(view.corners) >= _FEWEST_CORNERS], out
-
-
-def _without_worst_corners(view: BoardView, camera: CameraModel, T: np.ndarray, limit_px: float) -> BoardView | None:
-    """Return the view without the corners that keep it from `limit_px`, None where these are more than a tenth."""
-    corners = view.corners
-    for _ in range(len(corners) // 10):
-        length = _lengths(_resected(camera, corners, T))
-        corners = corners.where(np.arange(len(length)) != np.argmax(length))
-        if _rms(_resected(camera, corners, T)) <= limit_px:
-            return replace(view, corners=corners)
-    return None
 
 
 def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, start: PinholeCamera | None) -> Fit | None:
@@ -242,25 +221,18 @@ def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, star
 
 
 def _resected(camera: CameraModel, corners: Corners, T_camera_board: np.ndarray) -> np.ndarray:
-    """Return corners seen minus projected (N, 2), px, for the best pose of the target near the given one.
+    """Return corners seen minus projected (N, 2), px, for the pose of the target refined from the given one.
 
     NaN beyond the field of the lens.
     """
-
-    def residuals(pose: np.ndarray) -> np.ndarray:
-        return corners.pixels - camera.project(corners.board_mm @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])
-
-    start = np.concatenate([cv2.Rodrigues(T_camera_board[:3, :3])[0].ravel(), T_camera_board[:3, 3]])
-    # Beyond the field of the lens the residual is one that no fit prefers.
-    solved = least_squares(
-        lambda pose: np.nan_to_num(residuals(pose), nan=float(camera.width)).ravel(),
-        start,
-        x_scale="jac",
-        method="lm",
-        ftol=1e-6,
-        xtol=1e-6,
-    )
-    return residuals(solved.x)
+    rays = camera.unproject(corners.pixels)
+    seen = np.isfinite(rays).all(axis=1)
+    rotation, translation = cv2.Rodrigues(T_camera_board[:3, :3])[0], T_camera_board[:3, 3].copy()
+    if seen.sum() >= _FEWEST_CORNERS:
+        board, plane = corners.board_mm[seen], rays[seen, :2]
+        rotation, translation = cv2.solvePnPRefineLM(board, plane, np.eye(3), None, rotation, translation)
+    points = corners.board_mm @ cv2.Rodrigues(rotation)[0].T + np.ravel(translation)
+    return corners.pixels - camera.project(points)
 
 
 def _lengths(residual_px: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The picture of a calibration: a view with its corners, all residuals over the image, the error per view."""
+"""The picture of a calibration: all residuals over the image, and the error of each view."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scopemap.calibration.camera_calibration import CameraCalibration
-from scopemap.calibration.views import BoardView, views_per_pixel
+from scopemap.calibration.views import views_per_pixel
 from scopemap.errors import InputError
 from scopemap.report.canvas import headline, new_figure
 
@@ -21,19 +21,14 @@ _LONGER_PERCENT = 95
 _MOST_LABELS = 25
 
 
-def draw_calibration(calibration: CameraCalibration, example: np.ndarray, file: Path) -> None:
-    """Draw how well `calibration` explains its views into `file`, a PNG.
-
-    `example` (h, w, 3) uint8 is the frame of `calibration.example`. Raises `InputError` where the file cannot be
-    written.
-    """
+def draw_calibration(calibration: CameraCalibration, file: Path) -> None:
+    """Draw how well `calibration` explains its views into `file`, a PNG; `InputError` where it cannot be written."""
     # Imported here, so that importing the package stays fast.
     from matplotlib import colormaps
 
     colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(calibration.views)))
-    figure = new_figure(16, 5)
-    picture, residuals, bars = figure.subplots(1, 3, width_ratios=(1, 1.15, 1))
-    _draw_example(picture, calibration.example, example)
+    figure = new_figure(11, 5)
+    residuals, bars = figure.subplots(1, 2, width_ratios=(1.15, 1))
     _draw_residuals(residuals, calibration, colours)
     _draw_errors(bars, calibration, colours)
     central = calibration.fit.camera.central
@@ -46,15 +41,6 @@ def draw_calibration(calibration: CameraCalibration, example: np.ndarray, file: 
         figure.savefig(file)
     except OSError as error:
         raise InputError(f"drawing the calibration into {file}: {error}") from None
-
-
-def _draw_example(axes: Axes, view: BoardView, frame: np.ndarray) -> None:
-    axes.imshow(frame)
-    axes.plot(*view.found.pixels.T, "x", color="#ff3030", markersize=7)
-    axes.plot(*view.corners.pixels.T, "o", color="#00ff55", markersize=8, fillstyle="none")
-    found, used = len(view.found), len(view.corners)
-    axes.set_title(f"frame {view.index}: {found} corners found (crosses), {used} used (circles)", fontsize=10)
-    axes.set_axis_off()
 
 
 def _draw_residuals(axes: Axes, calibration: CameraCalibration, colours: np.ndarray) -> None:

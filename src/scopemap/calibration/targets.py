@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -24,11 +23,6 @@ _SEARCH_SIDE_PX = 800
 _REACH_PX, _REACH_SHARE, _REACH_SQUARES = 8, 1 / 160, 0.4
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-# Texture often passes for a grid of the smallest size, sometimes for a larger one, whose corners are then 0.4 squares
-# and more off a plane; strong distortion moves those of a real one by up to 0.3.
-_SMALLEST_GRID, _OFF_PLANE = (4, 3), 0.3
-_TELLING_MARKERS = 4
-_MOST_IMAGES = 6
 
 
 @dataclass(frozen=True)
@@ -173,56 +167,6 @@ def nearest_px(pixels: np.ndarray) -> float:
     distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
     return float(np.median(distance.min(axis=1)))
-
-
-def other_target_seen(target: Target, images: Sequence[np.ndarray]) -> str:
-    """Return which other target the grey `images` show in which `target` was not found, as advice; "" for none."""
-    images = images[-_MOST_IMAGES:]
-    seen = (search(target, grey) for search in (_other_layout, _other_markers, _other_checkerboard) for grey in images)
-    return next(filter(None, seen), "")
-
-
-def _other_layout(target: Target, grey: np.ndarray) -> str:
-    if not isinstance(target, CharucoBoard):
-        return ""
-    here, swapped = (target.columns, target.rows), (target.rows, target.columns)
-    for (columns, rows), legacy in ((swapped, target.legacy), (here, not target.legacy), (swapped, not target.legacy)):
-        if replace(target, columns=columns, rows=rows, legacy=legacy).find(grey) is not None:
-            how = "--legacy" if legacy else "without --legacy"
-            return f"a ChArUco board of {columns}x{rows} squares is seen: give --board {columns}x{rows}, {how}"
-    return ""
-
-
-def _other_markers(target: Target, grey: np.ndarray) -> str:
-    own = target.dictionary if isinstance(target, CharucoBoard) else ""
-    found = {name: cv2.aruco.ArucoDetector(_markers(name)).detectMarkers(grey)[1] for name in DICTIONARIES}
-    counts = {name: 0 if ids is None else len(ids) for name, ids in found.items()}
-    # Small sets are parts of large ones: of those with as many markers, the target's own, else the smallest.
-    name = max(DICTIONARIES, key=lambda name: (counts[name], name == own, -len(_markers(name).bytesList)))
-    if counts[name] < _TELLING_MARKERS:
-        return ""
-    if name == own:
-        return f"markers of {own} are seen, but not as they are on this board: check --board (squares, not corners)"
-    asked = f"give --dictionary {name}" if own else f"is it a ChArUco board (--charuco --dictionary {name})?"
-    return f"markers of {name} are seen: {asked}"
-
-
-def _other_checkerboard(target: Target, grey: np.ndarray) -> str:
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    found, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, flags)
-    if not found or meta.size <= _SMALLEST_GRID[0] * _SMALLEST_GRID[1]:
-        return ""
-    (rows, columns), pixels = meta.shape[:2], np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-    even = np.mgrid[:columns, :rows].T.reshape(-1, 2).astype(np.float64)
-    H, _ = cv2.findHomography(even, pixels)
-    off = np.inf if H is None else cv2.perspectiveTransform(even[None], H)[0] - pixels
-    if np.sqrt(np.mean(np.sum(np.atleast_2d(off) ** 2, axis=1))) > _OFF_PLANE * nearest_px(pixels):
-        return ""
-    size = f"{max(rows, columns)}x{min(rows, columns)}"
-    if not isinstance(target, Checkerboard):
-        return f"a checkerboard of {size} inner corners is seen: leave out --charuco"
-    same = sorted((target.columns, target.rows)) == sorted((rows, columns))
-    return "" if same else f"a checkerboard of {size} inner corners is seen: give --board {size}"
 
 
 def _markers(dictionary: str) -> cv2.aruco.Dictionary:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,6 @@ from scopemap.io.source import Source
 
 _FRAMES_SEARCHED = 300
 _FARTHEST_EDGE_PX = 20
-_LONGEST_KEPT_SIDE_PX = 1200
 _MOST_VIEWS = 40
 _CELLS_ACROSS = 16
 # Edges so much wider than in the sharper quarter of the views are blurred.
@@ -51,18 +51,14 @@ class Search:
     Attributes
     ----------
     size : width and height of the frames, px.
-    selection : the frames that were searched, every `every`-th of those asked for.
-    looked_at : number of these frames.
+    every : one in so many frames was searched. looked_at : number of frames searched.
     views : the views found.
-    without : some of the frames without a view, grey, 1200 px at most.
     """
 
     size: tuple[int, int]
-    selection: slice = field(default_factory=lambda: slice(None))
     every: int = 1
     looked_at: int = 0
     views: list[BoardView] = field(default_factory=list)
-    without: list[np.ndarray] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -71,6 +67,10 @@ class LeftOut:
 
     view: BoardView
     reason: str
+
+    def summary(self) -> dict[str, Any]:
+        """Return the frame's number and name, and the reason."""
+        return {"frame": self.view.index, "name": self.view.name, "reason": self.reason}
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,7 @@ def find_views(
     every = every or max(1, (count or 0) // _FRAMES_SEARCHED)
     total = None if count is None else -(-count // every)
     searched = slice(selection.start, selection.stop, every * (selection.step or 1))
-    search = Search((source.width, source.height), searched, every)
-    missed = 0
+    search = Search((source.width, source.height), every)
     for frame in source.frames(searched):
         search.looked_at += 1
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
@@ -110,22 +109,9 @@ def find_views(
         if corners is not None:
             width_px = edge_width_px(grey, corners.pixels)
             search.views.append(BoardView(frame.index, frame.name, corners, width_px, corners))
-        else:
-            missed += 1
-            if missed & (missed - 1) == 0:  # the 1st, 2nd, 4th, 8th ...: few, from all parts of a long video
-                shrink = min(1.0, _LONGEST_KEPT_SIDE_PX / max(grey.shape))
-                search.without.append(cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA))
         if listener is not None:
             listener(search.looked_at, total)
     return search
-
-
-def image_of(view: BoardView, source: Source, search: Search) -> np.ndarray:
-    """Return the frame (h, w, 3) uint8 of a view that `search` found in `source`, read anew."""
-    for frame in source.frames(search.selection):
-        if frame.index == view.index:
-            return frame.rgb
-    raise InputError(f"reading {source.path} again: frame {view.index} is gone")
 
 
 def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:

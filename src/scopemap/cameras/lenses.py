@@ -48,12 +48,26 @@ class _RadialLens(ABC):
         return self.plane.height
 
     @abstractmethod
+    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance from the axis on the lens' plane of rays at `angle` from it, rad, and its derivative."""
+
+    @cached_property
+    def field_rad(self) -> float:
+        """Largest angle from the axis, rad, that the lens maps one to one and that still points forward."""
+        return float(self._grid[-1])
+
+    @cached_property
+    def _grid(self) -> np.ndarray:
+        return _while_increasing(self._radial, _ANGLES_RAD)
+
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
         """Return where the lens moves points (..., 2) of the plane z = 1, NaN beyond its field."""
+        angle = np.arctan(np.linalg.norm(xy, axis=-1))
+        return _with_radius(xy, self._radial(np.where(angle <= self.field_rad, angle, np.nan))[0])
 
-    @abstractmethod
     def _undistorted(self, xy: np.ndarray) -> np.ndarray:
         """Return the inverse of `_distorted`."""
+        return _with_radius(xy, np.tan(_invert_increasing(self._radial, self._grid, np.linalg.norm(xy, axis=-1))))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
@@ -94,19 +108,12 @@ class OpenCvCamera(_RadialLens):
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * (8 - len(self.distortion)))
         return Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
 
-    @cached_property
-    def field_radius(self) -> float:
-        """Largest distance from the axis, on the plane z = 1, that the lens maps one to one."""
-        return float(self._grid[-1])
-
-    @cached_property
-    def _grid(self) -> np.ndarray:
-        return _while_increasing(self._radial, np.tan(_ANGLES_RAD))
-
-    def _radial(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         above, below = self._fraction
+        r = np.tan(angle)
         s, n, d = r * r, above(r * r), below(r * r)
-        return r * n / d, n / d + 2 * s * (above.deriv()(s) * d - n * below.deriv()(s)) / d**2
+        slope = n / d + 2 * s * (above.deriv()(s) * d - n * below.deriv()(s)) / d**2
+        return r * n / d, slope * (1 + s)
 
     def _tangential(self, xy: np.ndarray) -> np.ndarray:
         p1, p2 = self.distortion[2:4]
@@ -115,16 +122,12 @@ class OpenCvCamera(_RadialLens):
         return np.stack([2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1)
 
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
-        r = np.linalg.norm(xy, axis=-1)
-        r = np.where(r <= self.field_radius, r, np.nan)
-        return _with_radius(xy, self._radial(r)[0]) + self._tangential(xy)
+        return super()._distorted(xy) + self._tangential(xy)
 
     def _undistorted(self, xy: np.ndarray) -> np.ndarray:
         shift = np.zeros_like(xy)
         for _ in range(_MAX_STEPS):
-            radial = xy - shift
-            radius = _invert_increasing(self._radial, self._grid, np.linalg.norm(radial, axis=-1))
-            found = _with_radius(radial, radius)
+            found = super()._undistorted(xy - shift)
             previous, shift = shift, self._tangential(found)
             if not np.any(np.abs(shift - previous) > 1e-14):
                 break
@@ -154,24 +157,8 @@ class FisheyeCamera(_RadialLens):
         k1, k2, k3, k4 = self.distortion
         return Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
 
-    @cached_property
-    def field_rad(self) -> float:
-        """Largest angle from the axis, rad, that the lens maps one to one and that still points forward."""
-        return float(self._grid[-1])
-
-    @cached_property
-    def _grid(self) -> np.ndarray:
-        return _while_increasing(self._radial, _ANGLES_RAD)
-
     def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._polynomial(angle), self._polynomial.deriv()(angle)
-
-    def _distorted(self, xy: np.ndarray) -> np.ndarray:
-        angle = np.arctan(np.linalg.norm(xy, axis=-1))
-        return _with_radius(xy, self._polynomial(np.where(angle <= self.field_rad, angle, np.nan)))
-
-    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
-        return _with_radius(xy, np.tan(_invert_increasing(self._radial, self._grid, np.linalg.norm(xy, axis=-1))))
 
 
 @dataclass(frozen=True)
@@ -201,15 +188,9 @@ class FovCamera(_RadialLens):
     def _slope(self) -> float:
         return float(2 * np.tan(self.omega / 2) / self.omega)
 
-    def _distorted(self, xy: np.ndarray) -> np.ndarray:
-        r = np.linalg.norm(xy, axis=-1)
-        r = np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan)
-        return _with_radius(xy, np.arctan(r * self._slope * self.omega) / self.omega)
-
-    def _undistorted(self, xy: np.ndarray) -> np.ndarray:
-        angle = np.linalg.norm(xy, axis=-1) * self.omega
-        r = np.tan(np.where(angle < np.pi / 2, angle, np.nan)) / (self._slope * self.omega)
-        return _with_radius(xy, np.where(np.arctan(r) <= _WIDEST_RAD, r, np.nan))
+    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r, stretch = np.tan(angle), self._slope * self.omega
+        return np.arctan(stretch * r) / self.omega, self._slope * (1 + r * r) / (1 + (stretch * r) ** 2)
 
 
 @dataclass(frozen=True)
@@ -260,9 +241,7 @@ class OmnidirectionalCamera:
 
     @cached_property
     def _grid(self) -> np.ndarray:
-        grid = _while_increasing(self._radial, self.polynomial[0] * np.tan(_ANGLES_RAD))
-        sideways = _invert_increasing(self._radial, grid, np.array(_WIDEST_RAD))
-        return np.append(grid[grid < sideways], sideways) if np.isfinite(sideways) else grid
+        return _while_increasing(self._radial, self.polynomial[0] * np.tan(_ANGLES_RAD), most=_WIDEST_RAD)
 
     def _radial(self, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         z = self._depth(rho)
@@ -312,11 +291,11 @@ def _with_radius(xy: np.ndarray, radius: np.ndarray) -> np.ndarray:
     return xy * scale[..., None]
 
 
-def _while_increasing(function: _Radial, grid: np.ndarray) -> np.ndarray:
-    """Return the part of `grid` over which `function` increases, its end moved to where it stops (a turn or a pole)."""
+def _while_increasing(function: _Radial, grid: np.ndarray, most: float = np.inf) -> np.ndarray:
+    """Return the part of `grid` over which `function` increases up to `most`, its end moved to where it stops."""
     with np.errstate(divide="ignore", invalid="ignore"):
         value, slope = function(grid)
-        stops = np.flatnonzero(~(slope[1:] > 0) | ~(np.diff(value) > 0))
+        stops = np.flatnonzero(~((slope[1:] > 0) & (np.diff(value) > 0) & (value[1:] <= most)))
         if not stops.size:
             return grid
         last = int(stops[0])
@@ -324,7 +303,7 @@ def _while_increasing(function: _Radial, grid: np.ndarray) -> np.ndarray:
         for _ in range(_MAX_STEPS):
             middle = 0.5 * (low + high)
             value_there, slope_there = function(middle)
-            rises = slope_there > 0 and value[last] < value_there < np.inf
+            rises = slope_there > 0 and value[last] < value_there < np.inf and value_there <= most
             low, high = (middle, high) if rises else (low, middle)
     return np.append(grid[: last + 1], low)
 

@@ -83,7 +83,7 @@ def calibrate(
     # Imported here, so that --help does not wait for it.
     from scopemap.calibration import camera_calibration
     from scopemap.calibration.picture import draw_calibration
-    from scopemap.calibration.views import find_views, image_of
+    from scopemap.calibration.views import find_views
     from scopemap.io.opening import open_source
 
     silent = quiet or as_json
@@ -92,9 +92,9 @@ def calibrate(
         search = find_views(pictures, target, selection, every, listener)
     if not silent:
         typer.echo(f"the board was found in {len(search.views)} of {search.looked_at} frames; fitting", err=True)
-    done = camera_calibration.calibrate(search, target, model.value, pictures.pixel_aspect)
+    done = camera_calibration.calibrate(search, target, model.value)
     camera_calibration.save_calibration(done, out)
-    draw_calibration(done, image_of(done.example, pictures, search), picture)
+    draw_calibration(done, picture)
     for note in [] if silent else pictures.notes:
         typer.echo(f"note: {note}", err=True)
     for warning in [] if quiet else [*pictures.warnings, *done.warnings]:

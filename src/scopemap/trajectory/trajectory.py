@@ -1,12 +1,4 @@
-"""Stamped poses with a status each, the two forms that we write, and the door to every form that we read.
-
-A TUM file that we write says its unit and its time base in a `#` line, so that it can be read back without asking:
-
-    # unit: mm; time: s; T_world_camera, OpenCV axes (x right, y down, z forward)
-    # time tx ty tz qx qy qz qw
-
-Files of others often carry no unit: the caller names it. `scopemap.trajectory.formats` reads each format.
-"""
+"""Stamped camera poses with a status each, and the two forms in which they are written, TUM and KITTI."""
 
 from __future__ import annotations
 
@@ -99,19 +91,14 @@ def write_tum(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> None:
     Lost frames are written too. The header says the unit, the time base and the axes.
     """
     quaternions = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    positions = trajectory.positions_mm / MM_PER_UNIT[unit]
-    lines = [
-        f"# unit: {unit}; time: s; T_world_camera, OpenCV axes (x right, y down, z forward)",
-        "# time tx ty tz qx qy qz qw",
-    ]
-    for time_s, numbers in zip(trajectory.times_s, np.hstack([positions, quaternions]), strict=True):
-        lines.append(f"{time_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = np.column_stack([trajectory.times_s, trajectory.positions_mm / MM_PER_UNIT[unit], quaternions])
+    axes = "T_world_camera, OpenCV axes (x right, y down, z forward)"
+    header = f"unit: {unit}; time: s; {axes}\ntime tx ty tz qx qy qz qw"
+    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9f"] * 7, header=header)
 
 
 def write_kitti(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> None:
     """Write the upper (3, 4) of each pose as one row-major line; the form has no room for times, unit or status."""
     rows = trajectory.T_world_camera[:, :3].copy()
     rows[:, :, 3] /= MM_PER_UNIT[unit]
-    lines = [" ".join(f"{number:.12g}" for number in row.ravel()) for row in rows]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    np.savetxt(path, rows.reshape(-1, 12), fmt="%.12g")

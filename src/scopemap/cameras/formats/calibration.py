@@ -87,7 +87,6 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
         raise CalibrationError(
             f"{_sizes(camera, image_size, calibration.name)}; give --camera-fit scale if the images were resized from "
             "that size, --camera-fit crop:X,Y if they were cut out of it, else another calibration (--camera)"
-            f"{_swapped_note(camera, image_size)}"
         )
     check_plausible(camera, calibration.name)
     return calibration
@@ -106,11 +105,11 @@ def fitted_to(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
 def _resized(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
     if (camera.width, camera.height) == image_size:
         return camera
-    if not _same_aspect(camera, image_size):
+    width, height = image_size
+    if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
         raise CalibrationError(
             f"{_sizes(camera, image_size, name)}: another aspect, perhaps cropped; give --camera-fit crop:X,Y if the "
-            f"images were cut out of that size, else a calibration for these images (--camera)"
-            f"{_swapped_note(camera, image_size)}"
+            "images were cut out of that size, else a calibration for these images (--camera)"
         )
     return camera.resized(*image_size)
 
@@ -148,8 +147,7 @@ def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
             "image_width and image_height"
         )
     scaled = _resized(camera, image_size, calibration.name)
-    note = rescaled_note(camera, scaled) or ", of the images' size: nothing to scale"
-    return replace(calibration, camera=scaled, source=calibration.source + note)
+    return replace(calibration, camera=scaled, source=calibration.source + rescaled_note(camera, scaled))
 
 
 def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]) -> Calibration:
@@ -159,26 +157,15 @@ def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]
             f"{calibration.name} holds shares of a size that it does not state, so that nothing can be cut out of it "
             "(--camera-fit crop): add width and height"
         )
-    of_size = ""
-    if calibration.size_origin == "stated":
-        of_size = f" of {camera.width}x{camera.height} px"
-        if x + image_size[0] > camera.width or y + image_size[1] > camera.height:
-            raise CalibrationError(
-                f"{_sizes(camera, image_size, calibration.name)}: too large to have been cut out of it at {x},{y} px "
-                f"(--camera-fit crop:{x},{y})"
-            )
+    is_stated = calibration.size_origin == "stated"
+    if is_stated and (x + image_size[0] > camera.width or y + image_size[1] > camera.height):
+        raise CalibrationError(
+            f"{_sizes(camera, image_size, calibration.name)}: too large to have been cut out of it at {x},{y} px "
+            f"(--camera-fit crop:{x},{y})"
+        )
+    of_size = f" of {camera.width}x{camera.height} px" if is_stated else ""
     source = f"{calibration.source}, cut out{of_size} at {x},{y} px"
     return replace(calibration, camera=camera.cropped(x, y, *image_size), source=source)
-
-
-def _same_aspect(camera: CameraModel, image_size: Size) -> bool:
-    width, height = image_size
-    return abs(camera.width * height / (camera.height * width) - 1) <= _ASPECT_TOLERANCE
-
-
-def _swapped_note(camera: CameraModel, image_size: Size) -> str:
-    swapped = _same_aspect(camera, image_size[::-1]) and not _same_aspect(camera, image_size)
-    return "; its height and width may be swapped" if swapped else ""
 
 
 def _sizes(camera: CameraModel, image_size: Size, name: str) -> str:

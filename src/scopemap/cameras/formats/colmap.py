@@ -1,10 +1,7 @@
 """COLMAP models: cameras and images with their poses, text or binary, in a folder or a zip archive.
 
-Formats: colmap.github.io/format.html, colmap.github.io/cameras.html. Binary files are little-endian: a count (uint64),
-then per camera its number (uint32), its model's (int32), width, height (uint64) and parameters (double); per image its
-number (uint32), qw qx qy qz tx ty tz (double), its camera's number (uint32), its name ending in a zero byte, a count of
-points (uint64) and 24 bytes for each. COLMAP's pixels count from the corner of the image, so principal points are half
-a pixel larger than here.
+Formats: colmap.github.io/format.html, colmap.github.io/cameras.html. Binary files are little-endian. COLMAP's pixels
+count from the corner of the image, so principal points are half a pixel larger than here.
 """
 
 from __future__ import annotations
@@ -43,12 +40,13 @@ _ADVICE = (
     f"reconstruct with {', '.join(_READ[:-1])} or {_READ[-1]}, undistort the images with COLMAP, or put a calibration "
     "(camera.yaml) into the folder"
 )
-_COUNT, _CAMERA, _IMAGE = Struct("<Q"), Struct("<IiQQ"), Struct("<I7dI")
+_COUNT = Struct("<Q")
+_CAMERA = Struct("<IiQQ")  # number, number of the model, width, height; then the parameters, double
+_IMAGE = Struct("<I7dI")  # number, qw qx qy qz tx ty tz, number of the camera; then name, 0, count of points, points
 _POINT_BYTES, _PIECE_BYTES = 24, 1 << 20
 _MOST_IMAGES, _LONGEST_NAME_BYTES = 1_000_000, 4096
-_FIELDS_BEFORE_NAME, _FIELDS_OF_POINT = 9, 3
-_MODEL_IN_ARCHIVE = re.compile(r"(?:.*/)?sparse/\d{1,9}/images\.bin")
-_MOST_MODEL_BYTES, _MOST_LIST_BYTES = 1 << 30, 1 << 20
+_FIELDS_BEFORE_NAME = 9
+_MODEL_IN_ARCHIVE = re.compile(r"(?:.*/)?sparse/(\d{1,9})/images\.bin")
 _DAMAGED_ARCHIVE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError)
 
 
@@ -105,15 +103,13 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
     return next((pair for pair in pairs if pair[0].is_file() and pair[1].is_file()), None)
 
 
-def read_cameras(file: Path, *, binary: bool | None = None) -> dict[int, ModelCamera]:
-    """Return the cameras of a model by number; `binary` None: by the file's ending.
-
-    Raises `CalibrationError` for a file that is damaged.
-    """
+def read_cameras(file: Path) -> dict[int, ModelCamera]:
+    """Return the cameras of a model by number; `CalibrationError` for a file that is damaged."""
     cameras: dict[int, ModelCamera] = {}
     try:
         with file.open("rb") as stream:
-            is_binary = file.suffix == ".bin" if binary is None else binary
+            is_binary = file.suffix == ".bin" or b"\0" in stream.read(_COUNT.size)
+            stream.seek(0)
             for number, camera in _binary_cameras(stream) if is_binary else _text_cameras(stream):
                 if number in cameras:
                     raise ValueError(f"camera {number} comes again; leave one out")
@@ -133,25 +129,26 @@ def read_images(file: Path) -> list[ModelImage]:
 
 
 def read_largest_model(archive: Path) -> SubModel:
-    """Return the model `sparse/<M>/images.bin` in a zip archive whose `cluster_list/<M>.txt` names the most frames.
+    """Return the model `sparse/<M>/images.bin` in a zip archive that has the most images, of equals the first.
 
-    Without lists that with the longest file; of equals the first. Raises `InputError` for an archive that is damaged,
-    holds no model, or one of more than 1 GB.
+    Raises `InputError` for an archive that is damaged or holds no model.
     """
     try:
         with zipfile.ZipFile(archive) as opened:
-            sizes = _model_sizes(opened)
-            if not sizes:
+            numbers = {name: int(m[1]) for name in opened.namelist() if (m := _MODEL_IN_ARCHIVE.fullmatch(name))}
+            if not numbers:
                 raise InputError(f"reading {archive}: it holds no COLMAP model (sparse/<number>/images.bin)")
-            member = max(sizes, key=lambda member: (sizes[member], -_model_number(member)))
-            size = opened.getinfo(member).file_size
-            if size > _MOST_MODEL_BYTES:
-                raise InputError(f"reading {archive}: {member} holds {size >> 20} MB, expected 1024 MB at most")
-            with opened.open(member) as stream:
-                images = _images_in(stream, f"{archive}, {member}", binary=True)
+            largest = max(numbers, key=lambda name: (_image_count(opened, name), -numbers[name]))
+            with opened.open(largest) as stream:
+                images = _images_in(stream, f"{archive}, {largest}", binary=True)
     except _DAMAGED_ARCHIVE as error:
         raise InputError(f"reading {archive}: the archive is damaged or incomplete ({error})") from None
-    return SubModel(_model_number(member), len(sizes), images)
+    return SubModel(numbers[largest], len(numbers), images)
+
+
+def _image_count(archive: zipfile.ZipFile, name: str) -> int:
+    with archive.open(name) as stream:
+        return int(_taken(stream, _COUNT)[0])
 
 
 def is_cameras_text(text: str) -> bool:
@@ -180,9 +177,9 @@ def is_image_line(line: str) -> bool:
     )
 
 
-def only_camera(file: Path, *, binary: bool) -> CameraModel:
+def only_camera(file: Path) -> CameraModel:
     """Return the camera of a file that holds one; `CalibrationError` for any other file."""
-    cameras = read_cameras(file, binary=binary)
+    cameras = read_cameras(file)
     if len(cameras) != 1:
         raise CalibrationError(
             f"the calibration {file} holds {len(cameras)} cameras (COLMAP): leave the one of these images in it"
@@ -219,24 +216,6 @@ def camera_model(camera: ModelCamera, name: str) -> CameraModel:
     return model
 
 
-def _model_number(member: str) -> int:
-    return int(PurePosixPath(member).parent.name)
-
-
-def _model_sizes(archive: zipfile.ZipFile) -> dict[str, int]:
-    """Return how many frames the lists of the models name, by member; without all lists the sizes of the members."""
-    members = [name for name in archive.namelist() if _MODEL_IN_ARCHIVE.fullmatch(name)]
-    sizes = {}
-    for member in members:
-        try:
-            name = f"{PurePosixPath(member).parents[2] / 'cluster_list' / str(_model_number(member))}.txt"
-            with archive.open(name) as stream:
-                sizes[member] = len(stream.read(_MOST_LIST_BYTES).split())
-        except KeyError:
-            return {member: archive.getinfo(member).file_size for member in members}
-    return sizes
-
-
 def _with_lens(model: str, central: PinholeCamera, lens: list[float]) -> CameraModel:
     if model in _FISHEYES:
         return FisheyeCamera(central, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
@@ -251,8 +230,6 @@ def _text_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
     # Comments may have any encoding.
     for number, line in enumerate(io.TextIOWrapper(stream, "utf-8-sig", errors="replace"), start=1):
         fields = line.split()
-        if "\0" in line:
-            raise ValueError("it is binary, not text")
         if not fields or line.startswith("#"):
             continue
         try:
@@ -289,8 +266,7 @@ def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
 
 
 def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
-    """Yield the images of `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, each with a line of points below or none."""
-    points_may_follow = False
+    """Yield the images of `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`; lines of points, all numbers, are skipped."""
     for number, line in enumerate(io.TextIOWrapper(stream, "utf-8"), start=1):
         if line.startswith("#"):
             continue
@@ -299,14 +275,11 @@ def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
             if not re.fullmatch(r"[0-9]{1,10}", camera):
                 raise ValueError(f"line {number}: expected the number of a camera before the name, found {camera!r}")
             yield ModelImage(name.strip(), int(camera), tuple(map(float, values)), f"{where}, line {number}")
-            points_may_follow = True
-        elif line.strip() and not (points_may_follow and _is_points_line(line)):
+        elif line.strip() and not _is_number(line.split()[-1]):
             raise ValueError(
-                f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and below it points of three "
-                f"numbers each, found {line.strip()[:60]!r}"
+                f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, or numbers, found "
+                f"{line.strip()[:60]!r}"
             )
-        else:
-            points_may_follow = False
 
 
 def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
@@ -346,12 +319,6 @@ def _skip(stream: IO[bytes], size: int) -> None:
 def _check_end(stream: IO[bytes]) -> None:
     if stream.read(1):
         raise ValueError("bytes are left after the last entry; it is damaged")
-
-
-def _is_points_line(line: str) -> bool:
-    """Whether a line holds points; there may be thousands, so only the first is checked."""
-    fields = line.split()
-    return len(fields) % _FIELDS_OF_POINT == 0 and all(_is_number(field) for field in fields[:_FIELDS_OF_POINT])
 
 
 def _is_number(text: str) -> bool:

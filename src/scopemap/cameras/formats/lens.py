@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
@@ -45,7 +44,7 @@ _BESIDE = re.compile(
 )
 _LONGEST_QUOTE = 40
 _WITH_THIN_PRISM = (12, 14)
-_MAX_NODES = 10_000
+_MOST_TRIED, _DEEPEST = 100, 3
 
 
 def model_in(levels: Sequence[Fields]) -> str:
@@ -62,14 +61,11 @@ def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tup
     something looks like coefficients but is not read.
     """
     found = list(_candidates(levels, model))
-    coefficients, is_list = next((each for each in found if any(each[0])), ([], False))
-    if not coefficients:
+    coefficients = next(filter(any, found), None)
+    if coefficients is None:
         _check_nothing_unread(levels)
-        coefficients = found[0][0] if found else []
-    camera, note = with_lens(pinhole, model, coefficients)
-    if is_list and not model and len(coefficients) == 4:
-        note = ", its four coefficients taken as k1 k2 p1 p2 (no model is named)"
-    return camera, note
+        coefficients = found[0] if found else []
+    return with_lens(pinhole, model, coefficients)
 
 
 def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float]) -> tuple[CameraModel, str]:
@@ -114,21 +110,21 @@ def _places(levels: Sequence[Fields]) -> list[Fields]:
     return [*levels, *(inner for level in levels for inner in level.inner(_LISTS))]
 
 
-def _candidates(levels: Sequence[Fields], model: str) -> Iterator[tuple[list[float], bool]]:
-    """Yield coefficients in the order of the lens, and whether they were in one list: by list, by kind, by name."""
+def _candidates(levels: Sequence[Fields], model: str) -> Iterator[list[float]]:
+    """Yield coefficients in the order of the lens: of each list, by kind, by name."""
     for place in _places(levels):
         for name, node in place.nodes(_LISTS):
             if (coefficients := numbers_in(node, name)) is not None:
-                yield coefficients, True
+                yield coefficients
         radial, tangential = place.numbers(_RADIAL_LISTS) or [], place.numbers(_TANGENTIAL_LISTS) or []
         if len(radial) > len(_RADIAL) or len(tangential) > len(_TANGENTIAL):
             raise ValueError("it has more radial or tangential coefficients than any lens")
         if radial or tangential:
             tangential += [0.0] * (len(_TANGENTIAL) - len(tangential))
-            yield _in_order(dict(zip((*_TANGENTIAL, *_RADIAL), (*tangential, *radial), strict=False)), model), False
+            yield _in_order(dict(zip((*_TANGENTIAL, *_RADIAL), (*tangential, *radial), strict=False)), model)
         named = {name: place.number((name,)) for name in (*_RADIAL, *_TANGENTIAL)}
         if found := {name: value for name, value in named.items() if value is not None}:
-            yield _in_order(found, model), False
+            yield _in_order(found, model)
 
 
 def _in_order(found: dict[str, float], model: str) -> list[float]:
@@ -147,22 +143,17 @@ def _in_order(found: dict[str, float], model: str) -> list[float]:
 def _check_nothing_unread(levels: Sequence[Fields]) -> None:
     for name, node in (pair for level in levels for pair in level.pairs):
         is_lens = _UNREAD.search(name) or (isinstance(node, Fields) and node.number(("k1",)) is not None)
-        if is_lens and not _BESIDE.search(name) and any(map(_is_not_zero, islice(_leaves(node), _MAX_NODES))):
+        if is_lens and not _BESIDE.search(name) and _has_numbers(node):
             raise ValueError(
                 f"{name[:_LONGEST_QUOTE]!r} in it looks like distortion but is not read: call it "
                 "distortion_coefficients, a list in OpenCV's order, k1 k2 p1 p2 k3"
             )
 
 
-def _leaves(node: Any) -> Iterator[Any]:
-    """Yield a node and all that is in it; YAML's aliases may make that many more than the file has."""
-    yield node
+def _has_numbers(node: Any, depth: int = 0) -> bool:
+    """Return whether a number other than 0 is in a node; YAML's aliases may make it larger than the file."""
     if isinstance(node, Fields):
         node = [inner for name, inner in node.pairs if name not in ("rows", "cols")]
-    for inner in node if isinstance(node, list) else ():
-        yield from _leaves(inner)
-
-
-def _is_not_zero(node: Any) -> bool:
-    words = node.split() if isinstance(node, str) else [] if isinstance(node, Fields | list) else [node]
-    return any(is_number(word) and float(word) for word in words)
+    if isinstance(node, list):
+        return depth < _DEEPEST and any(_has_numbers(inner, depth + 1) for inner in node[:_MOST_TRIED])
+    return any(is_number(word) and float(word) for word in str(node).split())

@@ -27,8 +27,9 @@ _LONGEST_QUOTE = 40
 # ORB-SLAM writes `Camera.fx` or `Camera1.fx` for fx.
 _PASSED_OVER = re.compile(r"^camera1?\.|[-_\s]+")
 _WORD_BREAK = re.compile(r"[-_.\s]+")
+_BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
 _SEPARATORS = str.maketrans(",;[]", "    ")
-_FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "": False}
+_UNSET = ("false", "no", "off", "", "0", "0.0")
 
 
 def calibration_bytes(file: Path) -> bytes:
@@ -81,9 +82,9 @@ class Fields:
         return " ".join(_WORD_BREAK.sub(" ", text.strip("\"' \t").lower()).strip() for text in texts).strip()
 
     def flag(self, names: Iterable[str]) -> bool:
-        """Return whether one of `names` is set: true, yes, on, or a number that is not zero."""
-        leaves = [(name, node) for name, node in self.nodes(names) if not isinstance(node, Fields | list)]
-        return any(_FLAGS[word] if (word := str(node).lower()) in _FLAGS else as_number(node, n) for n, node in leaves)
+        """Return whether one of `names` is set, to anything but false, no, off or 0."""
+        leaves = (node for _, node in self.nodes(names) if not isinstance(node, Fields | list))
+        return any(str(node).lower() not in _UNSET for node in leaves)
 
     def inner(self, names: Iterable[str]) -> list[Fields]:
         """Return the mappings under `names` that are no matrices."""
@@ -155,18 +156,17 @@ def named_values(text: str) -> Fields | None:
 
 
 def read_tree(text: str) -> Any:
-    """Return the tree in JSON, XML or else YAML; `ValueError` for anything else, and for what is too large or deep."""
+    """Return the tree in JSON, XML or else YAML; `ValueError` for anything else, and for what is nested too deeply."""
     start = text.lstrip()[:1]
-    if not start:
-        raise ValueError("it is empty")
-    if start == "<":
-        return _of_element(xml_root(text))
-    if start not in ("{", "["):
-        return _yaml(text)
     try:
-        return json.loads(text, object_pairs_hook=Fields, parse_int=float)
-    except json.JSONDecodeError as error:  # OpenCV wrote numbers such as 318. into its JSON, which YAML allows
-        return _yaml(text, f"it is no JSON: {error}")
+        if start == "<":
+            return _of_element(xml_root(text))
+        if start not in ("{", "["):
+            return _yaml(text)
+        # OpenCV wrote numbers such as 318. into its JSON.
+        return json.loads(_BARE_POINT.sub(".0", text), object_pairs_hook=Fields, parse_int=float)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"it is no JSON: {error}") from None
     except RecursionError:
         raise ValueError("it is nested deeper than any calibration") from None
 
@@ -179,21 +179,21 @@ class _YamlLoader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignor
         return Fields([(self.construct_object(k, deep), self.construct_object(v, deep)) for k, v in node.value])
 
 
-def _yaml(text: str, fault: str = "") -> Any:
-    """Return the first document; `fault` is the error where the text is no YAML, "": the parser's own."""
+def _yaml(text: str) -> Any:
+    """Return the first document."""
     # OpenCV's first line, %YAML:1.0, is no YAML, and versions later than a parser's own make it stop.
     text = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     depth = 0
     try:
         for count, event in enumerate(yaml.parse(text, Loader=_YamlLoader)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if count > _MAX_EVENTS or depth > _MAX_DEPTH:
+            if depth > _MAX_DEPTH or count > _MAX_EVENTS:  # deep nesting overflows the stack of PyYAML's C code
                 raise ValueError("it is larger or nested deeper than any calibration")
             if isinstance(event, yaml.DocumentEndEvent):
                 break  # a recorded topic repeats itself
-        return next(iter(yaml.load_all(text, Loader=_YamlLoader)), None)
+        return next(yaml.load_all(text, Loader=_YamlLoader), None)
     except yaml.YAMLError as error:
-        raise ValueError(fault or f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
 
 
 def xml_root(text: str) -> ElementTree.Element:
@@ -201,18 +201,13 @@ def xml_root(text: str) -> ElementTree.Element:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it holds a document type or entities, which no calibration needs")
     try:
-        root = ElementTree.fromstring(text.lstrip())
+        return ElementTree.fromstring(text.lstrip())
     except ElementTree.ParseError as error:
         raise ValueError(f"it is no XML: {error}") from None
-    if sum(1 for _ in root.iter()) > _MAX_EVENTS:
-        raise ValueError("it is larger than any calibration")
-    return root
 
 
-def _of_element(element: ElementTree.Element, depth: int = 0) -> Any:
-    if depth > _MAX_DEPTH:
-        raise ValueError("it is nested deeper than any calibration")
-    inner = [(child.tag, _of_element(child, depth + 1)) for child in element]
+def _of_element(element: ElementTree.Element) -> Any:
+    inner = [(child.tag, _of_element(child)) for child in element]
     if not inner:
         return (element.text or "").strip()
     return [node for _, node in inner] if all(tag == "_" for tag, _ in inner) else Fields(inner)

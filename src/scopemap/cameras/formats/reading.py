@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats import colmap
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, Calibration, Size, check_size, fitted, pinhole_of
 from scopemap.cameras.formats.lens import lens_of, model_in
@@ -50,7 +50,6 @@ _SIZES = ("image_size", "img_size", "im_size", "resolution", "image_resolution",
 _SIDES = tuple((f"{of}_width", f"{of}_height") for of in ("image", "img", "im", "frame"))
 # Of the image, or of the calibration board, whose number of corners or squares has the same names.
 _UNSURE_SIDES = (("width", "height"), ("w", "h"), ("cols", "rows"))
-_SMALLEST_SIDE_PX = 16
 
 
 def read_calibration(camera: Path | str, image_size: Size, fit: str = "exact") -> Calibration:
@@ -85,14 +84,14 @@ def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
 def _read(file: Path, image_size: Size) -> Calibration:
     content = calibration_bytes(file)
     if colmap.is_cameras_binary(content):
-        return Calibration(colmap.only_camera(file, binary=True), None, "")
+        return Calibration(colmap.only_camera(file), None, "")
     if b"\0" in content:
         raise ValueError("it is binary, not text")
     text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
     if (rows := number_rows(text)) is not None:
         return of_numbers(rows, image_size)
     if colmap.is_cameras_text(text):
-        return Calibration(colmap.only_camera(file, binary=False), None, "")
+        return Calibration(colmap.only_camera(file), None, "")
     if is_stereo_ini(text):
         return Calibration(of_stereo_ini(text), None, "")
     if "<camera_model" in text:
@@ -163,71 +162,61 @@ def _omnidirectional(fields: Fields, pinhole: PinholeCamera) -> OmnidirectionalC
 def _size_of(levels: Sequence[Fields], intrinsics: Sequence[float], image_size: Size) -> tuple[Size | None, str]:
     """Return the size (width, height), px, that a tree states, None where it states none, and a note on it.
 
-    A `width` and the like that does not contain the principal point is the calibration board's and passed over. Zeros,
-    which ROS writes for an unknown size, are no size. Raises `ValueError` for half a size.
+    Zeros, which ROS writes for an unknown size, are no size. Raises `ValueError` for half a size.
     """
     _, _, cx, cy = intrinsics
-    note = ""
-    for width, height, kind in _sizes_in(levels):
+    for width, height, is_list in _sizes_in(levels, cx, cy):
         if not width and not height:
             continue
         if not width or not height:
             raise ValueError("it states one of width and height, but not both")
-        if kind == "unsure" and not (min(width, height) >= _SMALLEST_SIDE_PX and cx < width and cy < height):
-            note = f", its size {width:g}x{height:g} passed over as no image's"
-            continue
         size = check_size(width, height)
-        if kind == "list" and size != image_size and size[::-1] == image_size:
+        if is_list and size != image_size and size[::-1] == image_size:
             as_stated, swapped = ((cx - w / 2) ** 2 + (cy - h / 2) ** 2 for w, h in (size, image_size))
             if swapped < as_stated:
                 return image_size, f", its size {size[0]}, {size[1]} taken as height, width"
         return size, ""
-    return None, note
+    return None, ""
 
 
-def _sizes_in(levels: Sequence[Fields]) -> Iterator[tuple[float | None, float | None, str]]:
+def _sizes_in(levels: Sequence[Fields], cx: float, cy: float) -> Iterator[tuple[float | None, float | None, bool]]:
+    """Yield width, height, and whether they were in one list."""
     for level in levels:
         if (pair := level.numbers(_SIZES, 2)) is not None:
-            yield pair[0], pair[1], "list"
+            yield pair[0], pair[1], True
         for place in (level, *level.inner(_SIZES)):
-            for wide, high in _SIDES if place is level else (*_SIDES, *_UNSURE_SIDES):
-                yield place.number((wide,)), place.number((high,)), "sides"
-        if (pair := level.numbers(("size",), 2)) is not None:
-            yield pair[0], pair[1], "unsure"
-        for wide, high in _UNSURE_SIDES:
-            yield level.number((wide,)), level.number((high,)), "unsure"
-
-
-def read_out(camera: CameraModel, region: tuple[int, int, int, int], binning: tuple[int, int]) -> CameraModel:
-    """Return the camera of the images that ROS publishes of a sensor (sensor_msgs/CameraInfo): a region of it, binned.
-
-    `region` is x, y, width, height, px, of the sensor that `camera` sees; no width or height: all of it. `binning` is
-    columns and rows of a block; 0 stands for 1. Raises `ValueError` where the region is no part of the sensor.
-    """
-    x, y, width, height = region if region[2] and region[3] else (0, 0, camera.width, camera.height)
-    across, down = (max(1, count) for count in binning)
-    columns, rows = width // across, height // down
-    if x + width > camera.width or y + height > camera.height or not columns or not rows:
-        raise ValueError(f"its region, {width}x{height} px at {x},{y}, is no part of {camera.width}x{camera.height} px")
-    if (x, y, width, height, across, down) == (0, 0, camera.width, camera.height, 1, 1):
-        return camera
-    return camera.cropped(x, y, columns * across, rows * down).resized(columns, rows)
+            for wide, high in (*_SIDES, *_UNSURE_SIDES):
+                width, height = place.number((wide,)), place.number((high,))
+                # A width that does not contain the principal point is the calibration board's.
+                if (wide, high) in _SIDES or ((width or 0) > cx and (height or 0) > cy):
+                    yield width, height, False
 
 
 def _read_out(fields: Fields, calibration: Calibration) -> Calibration:
-    def whole(place: Fields, name: str) -> int:
-        value = place.number((name,)) or 0.0
-        if value % 1 or not 0 <= value <= LARGEST_SIDE_PX:
-            raise ValueError(f"{name} must be a whole number of pixels, found {value:g}")
-        return int(value)
+    """Return the camera of the images that ROS publishes of a sensor (sensor_msgs/CameraInfo): a region of it, binned.
 
-    roi = next(iter(fields.inner(("roi",))), Fields([]))
-    region = (whole(roi, "x_offset"), whole(roi, "y_offset"), whole(roi, "width"), whole(roi, "height"))
+    Raises `ValueError` where the region is no part of the sensor.
+    """
     sensor = calibration.camera
-    camera = read_out(sensor, region, (whole(fields, "binning_x"), whole(fields, "binning_y")))
-    if camera is sensor:
+    roi = next(iter(fields.inner(("roi",))), Fields([]))
+    x, y, width, height = (_whole(roi, name) for name in ("x_offset", "y_offset", "width", "height"))
+    if not width or not height:
+        x, y, width, height = 0, 0, sensor.width, sensor.height
+    across, down = (max(1, _whole(fields, name)) for name in ("binning_x", "binning_y"))
+    if (width, height, across, down) == (sensor.width, sensor.height, 1, 1):
         return calibration
     if calibration.size_origin != "stated":
         raise ValueError("it has a region or a binning, but not the size of the sensor (image_width, image_height)")
+    columns, rows = width // across, height // down
+    if x + width > sensor.width or y + height > sensor.height or not columns or not rows:
+        raise ValueError(f"its region, {width}x{height} px at {x},{y}, is no part of {sensor.width}x{sensor.height} px")
+    camera = sensor.cropped(x, y, columns * across, rows * down).resized(columns, rows)
     source = f"{calibration.source}, its region and binning of {sensor.width}x{sensor.height} px taken"
     return replace(calibration, camera=camera, source=source)
+
+
+def _whole(place: Fields, name: str) -> int:
+    value = place.number((name,)) or 0.0
+    if value % 1 or not 0 <= value <= LARGEST_SIDE_PX:
+        raise ValueError(f"{name} must be a whole number of pixels, found {value:g}")
+    return int(value)

@@ -56,12 +56,13 @@ def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:
     numbered = sorted((int(re.sub(r"\D", "", path.name)), path) for path in folder.glob("frame-*.pose.txt"))
     if not numbered:
         raise InputError(f"cannot read a trajectory from {folder}: looked for frame-*.pose.txt")
-    poses = [(number, read_seven_scenes_pose(path)) for number, path in numbered]
-    lost = next((path for (_, path), (_, pose) in zip(numbered, poses, strict=True) if pose is None), None)
-    if lost is not None:
-        raise InputError(f"{lost}: a pose holds NaN or infinity; leave out frames without a pose")
-    T = np.stack([pose for _, pose in poses if pose is not None])
-    return stamped(T, np.array([number for number, _ in poses]), None, "7-Scenes, camera-to-world, m")
+    poses = []
+    for _, path in numbered:
+        pose = read_seven_scenes_pose(path)
+        if pose is None:
+            raise InputError(f"{path}: a pose holds NaN or infinity; leave out frames without a pose")
+        poses.append(pose)
+    return stamped(np.stack(poses), np.array([number for number, _ in numbered]), None, "7-Scenes, camera-to-world, m")
 
 
 def read_seven_scenes_pose(file: Path) -> np.ndarray | None:

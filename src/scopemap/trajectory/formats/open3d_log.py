@@ -1,16 +1,12 @@
 """Open3D's `.log` files: a line of three integers per pose, then four lines of its 4x4 matrix.
 
 The form is Redwood's (redwood-data.org/indoor/fileformat.html); Open3D (io/file_format/FileLOG.cpp) writes `i i i+1`
-and the camera-to-world matrix, the inverse of its `extrinsic`.
-
-Endo-Depth-and-Motion (UZ-SLAMLab, apps/tracking_ours and apps/volumetric_fusion) writes `trajectory.log` with Open3D,
-but puts its world-to-camera matrices (`c_pose_w`) where Open3D has camera-to-world; it tracks in metres, as it divides
-depth in mm by 1000. The two look alike, so a `.log` is read only when its kind is named.
+and the camera-to-world matrix. Endo-Depth-and-Motion (UZ-SLAMLab) writes `trajectory.log` with Open3D, but puts its
+world-to-camera matrices, in metres, there. The two look alike, so a `.log` is read only when its kind is named.
 """
 
 from __future__ import annotations
 
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +35,10 @@ def read_endo_depth(path: Path, unit: Unit) -> Trajectory:
 
 def _read_log(path: Path, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     rows = read_rows(path)
-    for (line, numbers), width in zip(rows, cycle(_WIDTHS), strict=False):
-        if len(numbers) != width:
-            raise InputError(f"{path}, line {line}: found {len(numbers)} numbers where a log has {width}")
     period = len(_WIDTHS)
-    if len(rows) % period:
-        raise InputError(f"reading {path}: a log has five lines per pose, found {len(rows)} lines in all")
     heads = rows[::period]
+    if [len(numbers) for _, numbers in rows] != [*_WIDTHS] * len(heads):
+        raise InputError(f"reading {path}: a log has lines of 3, 4, 4, 4 and 4 numbers for each pose")
     T = np.array([numbers for row, (_, numbers) in enumerate(rows) if row % period]).reshape(-1, 4, 4)
     T[:, :3, 3] *= MM_PER_UNIT[unit]
     indices = np.array([numbers[0] for _, numbers in heads])

@@ -22,7 +22,7 @@ READERS: dict[str, Reader] = {
     "7-scenes": folders.read_seven_scenes,
     "scared": scared.read_scared,
     "oneslam": text.read_oneslam,
-    "bodyslam": text.read_bodyslam,
+    "bodyslam": text.read_kitti,
     "endogslam": splatam.read_endogslam,
     "splatam": splatam.read_splatam,
     "open3d": open3d_log.read_open3d,
@@ -48,7 +48,6 @@ def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Tra
     # Path.exists raises for names that no file system allows.
     if not os.path.exists(path):
         raise InputError(f"cannot read a trajectory: no file or folder {path}")
-    _refuse_pickle(path)
     if kind != "auto":
         return READERS[kind](path, unit)
     return (_reader_of_folder(path) if path.is_dir() else _reader_of_file(path))(path, unit)
@@ -114,16 +113,3 @@ def _reader_of_file(path: Path) -> Reader:
             "and 16 (C3VD pose.txt)"
         )
     return _COLUMNS[columns]
-
-
-def _refuse_pickle(path: Path) -> None:
-    if not path.is_file():
-        return
-    with path.open("rb") as file:
-        start = file.read(2)
-    pickled = len(start) == 2 and start[0] == 0x80 and 2 <= start[1] <= 5
-    if pickled or path.suffix in (".pkl", ".pickle"):
-        raise InputError(
-            f"cannot read a trajectory from {path}: it is a Python pickle, which may run any code when it is loaded; "
-            "write its poses as TUM or KITTI lines, or give the trajectory.log of Endo-Depth-and-Motion"
-        )

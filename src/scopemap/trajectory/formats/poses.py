@@ -25,10 +25,9 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
     bottom = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
     wrong = np.flatnonzero((deviation > _RIGID_TOLERANCE) | (np.linalg.det(R) < 0) | (bottom > _RIGID_TOLERANCE))
     if wrong.size:
-        last_row = " ".join(f"{value:.3g}" for value in T[wrong[0], 3])
         raise InputError(
             f"{where[wrong[0]]}: not a rigid motion (R^T R is off the identity by {deviation[wrong[0]]:.3g}, det R = "
-            f"{np.linalg.det(R[wrong[0]]):.3g}, last row {last_row}); poses must be without scale"
+            f"{np.linalg.det(R[wrong[0]]):.3g}); poses must be without scale"
         )
     # Files hold six digits or so, and the inverse by transposition needs exact rotations.
     return np.stack([orthonormalised(pose) for pose in T])
@@ -50,8 +49,7 @@ def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) 
 def poses_by_row(rows: np.ndarray, mm_per_unit: float, where: list[str]) -> dict[int, np.ndarray]:
     """Return the pose (4, 4), translation in mm, of each row (N, 7) `tx ty tz qx qy qz qw`, by number of the row.
 
-    A row that holds NaN or infinity has no pose. `where` names the rows in the `InputError` at
-    a quaternion that is not of length 1.
+    A row that holds NaN or infinity has no pose. Raises `InputError`, with its `where`, for other quaternions.
     """
     known = np.flatnonzero(np.isfinite(rows).all(axis=1))
     T = from_quaternions(rows[known, 3:], rows[known, :3] * mm_per_unit, [where[row] for row in known])

@@ -2,12 +2,9 @@
 challenge", arXiv 2101.01133).
 
 `camera-pose` is the 4x4 world-to-camera motion of the left camera, mm; the world is the left camera at the keyframe. So
-it is read by scared_toolkit (scaredtk), AF-SfMLearner (export_gt_pose.py), EndoSurf (data/scared2019/preprocess.py) and
-SurgCUT3R. The number in a file's name is the frame's: from 0 in SCARED, from 1 and with gaps in SCARED-C
-(juseonghan/SCARED-C), whose `camera-calibration` is a file name instead of matrices.
-
-The unit of `timestamp` is not documented. It is taken for the power of ten of a second by which a frame lasts 10 to
-100 ms.
+it is read by scared_toolkit, AF-SfMLearner, EndoSurf and SurgCUT3R. The number in a file's name is the frame's: from 0
+in SCARED, from 1 and with gaps in SCARED-C, whose `camera-calibration` is a file name instead of matrices. The unit of
+`timestamp` is not documented. It is taken for the power of ten of a second by which a frame lasts 10 to 100 ms.
 """
 
 from __future__ import annotations
@@ -63,21 +60,20 @@ class FrameData:
 
 def parse_frame_data(where: str, index: int, content: bytes) -> FrameData:
     """Return what a `frame_data` file holds; a file that cannot be used is not an error but has a `fault`."""
+    T_world_camera, stamp, calibration, fault = None, None, None, ""
     try:
         document = json.loads(content)
         stamp, calibration = document.get("timestamp"), document.get("camera-calibration")
         pose = np.array(document["camera-pose"], dtype=np.float64)
+        if pose.shape != (4, 4):
+            raise ValueError(f"found the shape {pose.shape}")
+        T_world_camera = inverse(rigid(pose[None], [where])[0])
+    except InputError as error:
+        fault = str(error)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         fault = f"{where}: expected a JSON object with a 4x4 'camera-pose' ({error!r})"
-        return FrameData(where, index, fault=fault)
     calibration = calibration if isinstance(calibration, dict) else None
-    if pose.shape != (4, 4):
-        fault = f"{where}: expected a 4x4 'camera-pose', found the shape {pose.shape}"
-        return FrameData(where, index, None, stamp, calibration, fault)
-    try:
-        return FrameData(where, index, inverse(rigid(pose[None], [where])[0]), stamp, calibration)
-    except InputError as error:
-        return FrameData(where, index, None, stamp, calibration, str(error))
+    return FrameData(where, index, T_world_camera, stamp, calibration, fault)
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
@@ -126,11 +122,10 @@ def read_scared(path: Path, unit: Unit) -> Trajectory:
     for earlier, later in pairwise(frames):
         if earlier.index == later.index:
             raise InputError(f"{later.where}: frame {later.index} comes a second time, it is in {earlier.where} too")
-    poses = []
-    for frame in frames:
-        if frame.T_world_camera is None:
-            raise InputError(frame.fault)
-        poses.append(frame.T_world_camera)
+    fault = next((frame.fault for frame in frames if frame.fault), "")
+    if fault:
+        raise InputError(fault)
+    poses = [frame.T_world_camera for frame in frames if frame.T_world_camera is not None]
     times_s, words = times_of(frames)
     indices = np.array([frame.index for frame in frames])
     source = f"SCARED JSON, world-to-camera inverted, mm, {words or '30 frames per s (assumed)'}"

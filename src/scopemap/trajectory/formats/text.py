@@ -1,12 +1,8 @@
 """Text files with one pose a line: TUM (8 numbers), KITTI (12), C3VD (16), and what OneSLAM and BodySLAM write.
 
-OneSLAM (github.com/arcadelab/OneSLAM, slam.py, write_tum_poses) writes its keyframes alone to `poses_pred.txt`, as TUM
-rows camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same
-form. Its scale is that of a constant first guess of depth, so arbitrary.
-
-BodySLAM (github.com/GuidoManni/BodySLAM, UTILS/io_utils.py and EVALUATION/MPEM_eval.py, save_poses_as_kitti) writes the
-upper 3x4 of every pose as a KITTI line. It chains T_i = T_(i-1) relative_i, which is right for camera-to-world poses;
-scale and unit are not stated. Its SCARED truth is the JSON's world-to-camera matrix as it is: read the JSON.
+OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes alone to `poses_pred.txt`, as TUM rows
+camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same form.
+BodySLAM (github.com/GuidoManni/BodySLAM, save_poses_as_kitti) writes camera-to-world KITTI lines without a unit.
 """
 
 from __future__ import annotations
@@ -138,26 +134,18 @@ def read_oneslam(path: Path, unit: Unit) -> Trajectory:
     T, words = tum_poses(table, unit)
     stamps = table.values[:, 0]
     if not are_frame_numbers(stamps):
-        raise InputError(
-            f"{table.path}: OneSLAM stamps poses by frame number, found {stamps[0]:g} to {stamps[-1]:g}, not all of "
-            "them whole; files with seconds are of the kind 'tum'"
-        )
+        raise InputError(f"{table.path}: OneSLAM stamps poses by frame number; with seconds the kind is 'tum'")
     return stamped(T, stamps, None, f"OneSLAM, TUM rows by frame number, camera-to-world, {words}")
 
 
-def read_kitti(path: Path, unit: Unit, form: str = "KITTI") -> Trajectory:
+def read_kitti(path: Path, unit: Unit) -> Trajectory:
     """Read KITTI rows, the upper 3x4 of a camera-to-world pose each; row = frame number, from 0."""
-    table = read_numbers(file_of(path, ())).with_columns(12, form)
+    table = read_numbers(file_of(path, ())).with_columns(12, "KITTI")
     mm_per_unit, words = table.unit(unit)
     T = np.tile(np.eye(4), (len(table.values), 1, 1))
     T[:, :3] = table.values.reshape(-1, 3, 4)
     T[:, :3, 3] *= mm_per_unit
-    return stamped(rigid(T, table.where), np.arange(len(T)), None, f"{form}, camera-to-world, {words}, row = frame")
-
-
-def read_bodyslam(path: Path, unit: Unit) -> Trajectory:
-    """Read the KITTI rows that BodySLAM writes."""
-    return read_kitti(path, unit, "BodySLAM, KITTI rows")
+    return stamped(rigid(T, table.where), np.arange(len(T)), None, f"KITTI, camera-to-world, {words}, row = frame")
 
 
 def read_c3vd(path: Path, unit: Unit) -> Trajectory:
