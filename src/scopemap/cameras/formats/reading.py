@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats import colmap
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, Calibration, Size, check_size, fitted, pinhole_of
 from scopemap.cameras.formats.lens import lens_of, model_in
