@@ -63,7 +63,7 @@ PHOTOMETRIC: dict[str, dict[str, Any]] = {
 }
 # ... and of the back end, with all of the front end.
 BACK_END: dict[str, dict[str, Any]] = {
-    "no loops": {"mapping.loop_landmarks": 0},
+    "no loops": {"mapping.min_loop_inliers": 0},
     "links to the keyframe before only": {"mapping.gaps": (1,)},
     "depth of keyframes hardly adjusted": {"mapping.scale_sigma": 1e-3},
     "back end, but no corners while tracking": {"tracking.advanced.corner_depth_sigma": 0.0},

@@ -116,7 +116,7 @@ def test_one_false_loop_gives_way_to_others() -> None:
 @pytest.mark.parametrize("closing", [True, False])
 def test_the_back_end_closes_loops_where_it_may(closing: bool) -> None:
     tracked = _drifting()
-    settings = SETTINGS if closing else SETTINGS.model_copy(update={"loop_landmarks": 0})
+    settings = SETTINGS if closing else SETTINGS.model_copy(update={"min_loop_inliers": 0})
     backend = Backend(settings, DisFlow())
     for number in range(COUNT):
         backend.add(_frame(number, tracked[number]))

@@ -29,6 +29,9 @@ from scopemap.errors import SettingsError
 Preset = Literal["paper", "default", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
 RENAMED = {
+    "mapping.loop_landmarks": "mapping.min_loop_inliers",
+    "mapping.turn_sigma_deg": "mapping.rotation_sigma_deg",
+    "mapping.way_sigma_share": "mapping.translation_sigma_share",
     "tracking.corner_depth_share": "tracking.advanced.corner_depth_sigma",
     "tracking.depth_share": "tracking.advanced.depth_weight",
     "tracking.keyframe_agreement": "tracking.advanced.min_keyframe_agreement",
@@ -85,7 +88,7 @@ class Config(Settings):
             raise SettingsError("; ".join(explain(item) for item in error.errors())) from None
 
     def toml(self) -> str:
-        """Return all settings as TOML text that `load` reads back; what is None is left out."""
+        """Return all settings as TOML text that `load` reads back; settings of None are left out."""
         flat = _flatten(self.model_dump())
         return "".join(f"{key} = {_toml_value(value)}\n" for key, value in flat.items() if value is not None)
 

@@ -15,10 +15,14 @@ class DepthAdvanced(Settings):
     reanchor_every: int = Field(
         0,
         ge=0,
-        description="fit the metric anchor again every n-th frame, best a multiple of keyframe_every; 0: once",
+        description="fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once",
     )
-    shading_exponent: float = Field(0.6, gt=0, le=1, description="shading: distance = k * brightness^-exponent")
-    exponent_frames: int = Field(80, ge=2, description="exponent = fit: number of frames at the start that are used")
+    shading_exponent: float = Field(
+        0.6, gt=0, le=1, description="inert unless depth is from shading: distance = k * brightness^-exponent"
+    )
+    exponent_frames: int = Field(
+        80, ge=2, description="inert unless exponent = fit: number of frames at the start that are used"
+    )
 
 
 class DepthPaper(Settings):
@@ -108,8 +112,12 @@ class MapisPaper(Settings):
     blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = Field(
         "auto", description="weight of the warped depth; auto: linear for predicted depth, none for measured"
     )
-    tau: float = Field(0.15, gt=0, description="blend = exponential: LPIPS distance at which the weight is 1/e")
-    constant_weight: float = Field(0.5, ge=0, le=1, description="blend = constant: weight of the warped depth")
+    tau: float = Field(
+        0.15, gt=0, description="inert unless blend = exponential: LPIPS distance at which the weight is 1/e"
+    )
+    constant_weight: float = Field(
+        0.5, ge=0, le=1, description="inert unless blend = constant: weight of the warped depth"
+    )
     recursive: bool = Field(True, description="warp the refined previous depth; False: the raw one (the paper)")
     compare_warped: bool = Field(
         True, description="perceptual distance to the warped previous image; False: to the image as it is (the paper)"

@@ -21,15 +21,15 @@ class InputSettings(Settings):
     focal: Literal["auto", "assume", "flow"] = Field(
         "auto",
         description="focal length of an unknown camera, assume: by the assumed field of view; flow: from the motion "
-        "of the first frames; auto: flow where that tells it, Depth Pro's where that is in use",
+        "of the first frames; auto: Depth Pro's where it is in use, else flow where the motion constrains it",
     )
     stereo: Literal["auto", "none", "left-right", "top-bottom"] = Field(
         "auto",
-        description="two views in one picture, of which the left or upper is used; auto: told from a video's pictures",
+        description="two views in one image, of which the left or upper is used; auto: detected in a video",
     )
-    deinterlace: bool = Field(False, description="one field of each picture only, its missing rows interpolated")
-    fps: float | None = Field(None, gt=0, description="at most so many frames per second, by the time stamps")
-    skip_duplicates: bool = Field(True, description="leave out pictures of a video that repeat the one before")
+    deinterlace: bool = Field(False, description="use one field of each interlaced image, interpolate the missing rows")
+    fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
+    skip_duplicates: bool = Field(True, description="leave out images of a video that repeat the one before")
 
 
 class MaskAdvanced(Settings):
@@ -47,7 +47,7 @@ class MaskSettings(Settings):
     overlays: bool = Field(True, description="find burned-in text and logos, which stay while the rest moves")
     files: str = Field(
         "",
-        description="folder of masks, one image per frame, found by the number in its name: what is not 0 is masked "
+        description="folder of masks, one image per frame, found by the number in its name: non-zero pixels are masked "
         "(instruments, overlays); empty: the data set's own where it has some; none: no masks from files",
     )
     advanced: MaskAdvanced = MaskAdvanced()

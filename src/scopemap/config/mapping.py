@@ -10,33 +10,39 @@ from scopemap.config.settings import Settings
 
 
 class MappingSettings(Settings):
-    """Adjustment of all keyframes together, once the last frame is tracked."""
+    """Back end: bundle adjustment of all keyframes, loop closure and map merging after the last frame."""
 
     method: Literal["none", "full"] = Field(
         "full",
-        description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
-        "predicted (measured depth tracks as well or better without)",
+        description="none: poses as tracked; full: bundle adjustment after the last frame where depth is predicted "
+        "(measured depth tracks as well or better without)",
     )
     gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (1, 2, 3, 5, 8), min_length=1, description="keyframes are linked to those so many before them"
+        (1, 2, 3, 5, 8), min_length=1, description="a keyframe is matched with the keyframes this many before it"
     )
-    cell_px: int = Field(16, ge=4, description="one point in each cell of that size")
-    consistency_px: float = Field(1.0, gt=0, description="largest error of flow there and back")
-    loop_landmarks: int = Field(
-        25, ge=0, description="that must agree where a keyframe shows an old place; 0: no loops, no joining of maps"
+    cell_px: int = Field(16, ge=4, description="one point per cell of this size, px")
+    consistency_px: float = Field(1.0, gt=0, description="largest forward-backward error of flow, px")
+    min_loop_inliers: int = Field(
+        25, ge=0, description="PnP inliers that a loop closure needs at least; 0: no loop closure, no map merging"
     )
-    depth_share: float = Field(0.15, gt=0, description="relative error that all depth has anyhow")
+    depth_share: float = Field(0.15, gt=0, description="minimum relative standard deviation of depth")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     depth_step_sigma: float = Field(
-        0.1, ge=0, description="how depth may be bent, ln from node to node of a coarse grid; 0: only scaled"
+        0.1,
+        ge=0,
+        description="standard deviation of ln depth between nodes of the depth correction field; 0: scale only",
     )
-    turn_sigma_deg: float = Field(3.0, gt=0, description="how far tracked turns between keyframes are trusted")
-    way_sigma_share: float = Field(0.1, gt=0, description="the same of ways, over the mean depth")
+    rotation_sigma_deg: float = Field(3.0, gt=0, description="standard deviation of rotations between keyframes")
+    translation_sigma_share: float = Field(
+        0.1, gt=0, description="standard deviation of translations between keyframes over the mean depth"
+    )
     max_sigma_px: float = Field(
-        0.8, gt=0, description="poses stay as tracked where points seen again stay farther off (robust deviation)"
+        0.8,
+        gt=0,
+        description="poses stay as tracked where the adjusted reprojection error (MAD) exceeds this, px",
     )
     max_depth_change: float = Field(
-        0.3, gt=0, description="the same where points ask for more than that change of ln depth (their median)"
+        0.3, gt=0, description="poses stay as tracked where the median change of ln depth exceeds this"
     )
 
 

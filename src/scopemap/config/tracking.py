@@ -46,7 +46,7 @@ class TrackingAdvanced(Settings):
 class TrackingPaper(Settings):
     """Parts of the photometric alignment that the paper's preset and its ablations replace."""
 
-    solver: Literal["dogleg", "gauss-newton"] = "dogleg"
+    solver: Literal["dogleg", "gauss-newton"] = Field("dogleg", description="minimiser of the photometric error")
     rotation_first: bool = Field(True, description="SO(3) only at the coarsest level")
     start: Literal["identity", "previous"] = Field(
         "previous", description="first guess of a frame: the keyframe's pose, or the previous frame's"
@@ -84,12 +84,16 @@ class TrackingSettings(Settings):
 class SmoothingSettings(Settings):
     """WEMA: weighted mean of the last three poses, on the group (METHOD section WEMA)."""
 
-    method: Literal["none", "wema"] = "none"
-    alpha: float = Field(0.6, ge=0, le=1, description="weight of pose i")
-    beta: float = Field(0.3, ge=0, le=1, description="weight of pose i-1")
-    gamma: float = Field(0.1, ge=0, le=1, description="weight of pose i-2")
-    omega: float = Field(0.1, gt=0, description="s = 1 - exp(-i omega); frames count from 0")
-    dynamic: bool = Field(True, description="False: s = 1 (the paper's ablation without DyEMA)")
+    method: Literal["none", "wema"] = Field("none", description="wema: smooth poses; none: off, the others are inert")
+    alpha: float = Field(0.6, ge=0, le=1, description="inert unless method = wema: weight of pose i")
+    beta: float = Field(0.3, ge=0, le=1, description="inert unless method = wema: weight of pose i-1")
+    gamma: float = Field(0.1, ge=0, le=1, description="inert unless method = wema: weight of pose i-2")
+    omega: float = Field(
+        0.1, gt=0, description="inert unless method = wema: s = 1 - exp(-i omega); frames count from 0"
+    )
+    dynamic: bool = Field(
+        True, description="inert unless method = wema; False: s = 1 (the paper's ablation without DyEMA)"
+    )
 
     @model_validator(mode="after")
     def _weights_sum_to_one(self) -> SmoothingSettings:

@@ -70,7 +70,7 @@ class Backend:
         self.settings = settings
         self._keyframes: list[_Keyframe] = []
         self._linker = Linker(settings, flow)
-        self._finder = LoopFinder(settings) if settings.loop_landmarks > 0 else None
+        self._finder = LoopFinder(settings) if settings.min_loop_inliers > 0 else None
         self._loops: list[Loop] = []
         self._camera: PinholeCamera | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
@@ -159,7 +159,9 @@ class Backend:
         log_unit = np.log([world.scale for world in world_of])
         points, sightings = self._linker.collected(chosen)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
-        priors = Priors(settings.scale_sigma, math.radians(settings.turn_sigma_deg), settings.way_sigma_share)
+        priors = Priors(
+            settings.scale_sigma, math.radians(settings.rotation_sigma_deg), settings.translation_sigma_share
+        )
         pairs, loops = _neighbours(own), 0
         problem = Problem(inverse(T_world_camera), points, sightings, priors, pairs, camera.fx)
         if said := _of(self._loops, chosen, log_unit):

@@ -1,4 +1,4 @@
-"""Loops: keyframes that show what one long before has shown, told by their landmarks and held to geometry."""
+"""Loops: keyframes that show what one long before has shown, told by their features and held to geometry."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from scopemap.config import MappingSettings
 from scopemap.frame import Frame
-from scopemap.tracking.features import Landmarks, find_landmarks, locate
+from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
 
-_STRONGEST = 64  # landmarks by which candidates are chosen
+_STRONGEST = 64  # features by which candidates are chosen
 _ALIKE = 0.8  # cosine of descriptors from which on they speak for a candidate
 _CANDIDATES = 3
 _STICKS_PX = 2.0
@@ -26,7 +26,7 @@ class Loop:
     Attributes
     ----------
     past, new : their numbers. T_new_past : (4, 4), mm of the past one's depth. log_ratio : ln of the new one's depth
-    over what the past one's depth and this motion make of it. pixels_past, pixels_new : (M, 2) of the landmarks that
+    over what the past one's depth and this motion make of it. pixels_past, pixels_new : (M, 2) of the features that
     agree. log_depth_past, log_depth_new : (M,) ln of their depth, NaN = unknown.
     """
 
@@ -43,23 +43,23 @@ class Loop:
 class LoopFinder:
     """Takes keyframes one by one and tells which of those long before, and of other maps, show the same place.
 
-    Candidates are those whose strongest landmarks look most like the new one's; only what PnP can place from at least
-    `settings.loop_landmarks` of them is a loop.
+    Candidates are those whose strongest features look most like the new one's; only what PnP can place from at least
+    `settings.min_loop_inliers` of them is a loop.
     """
 
     def __init__(self, settings: MappingSettings) -> None:
         self.settings = settings
-        self._known: list[Landmarks] = []
+        self._known: list[Features] = []
         self._map_of: list[int] = []
         self._closed: defaultdict[int, list[int]] = defaultdict(list)
 
     def add(self, keyframe: Frame, map_number: int = 0) -> list[Loop]:
         """Return the loops that a keyframe with depth closes, those into other maps among them."""
-        new = find_landmarks(keyframe)
+        new = detect_features(keyframe)
         loops = []
         for past in self._candidates(new, map_number):
             known = self._known[past]
-            located = locate(known, new, keyframe.camera, self.settings.loop_landmarks)
+            located = relative_pose_pnp(known, new, keyframe.camera, self.settings.min_loop_inliers)
             if located is None or (self._map_of[past] != map_number and self._sticks(known, new, located.pairs)):
                 continue
             one, other = located.pairs[:: -(-len(located.pairs) // _MOST_PAIRS)].T
@@ -67,7 +67,7 @@ class LoopFinder:
             with np.errstate(invalid="ignore", divide="ignore"):
                 z_past, z_new = np.log(known.points_mm[one, 2]), np.log(new.points_mm[other, 2])
                 ratio = z_new - np.log(moved)
-            if np.isfinite(ratio).sum() < min(self.settings.loop_landmarks, _MOST_PAIRS) // 2:
+            if np.isfinite(ratio).sum() < min(self.settings.min_loop_inliers, _MOST_PAIRS) // 2:
                 continue
             self._closed[past].append(len(self._known))
             loops.append(
@@ -87,7 +87,7 @@ class LoopFinder:
         self._map_of.append(map_number)
         return loops
 
-    def _candidates(self, new: Landmarks, map_number: int) -> list[int]:
+    def _candidates(self, new: Features, map_number: int) -> list[int]:
         """Numbers of the keyframes that look most alike, of this map and of others.
 
         Those that flow links to anyhow, the last ones of this map, are left out.
@@ -101,13 +101,13 @@ class LoopFinder:
             likely += [k for k in ranked if self._may_close(k)][:_CANDIDATES]
         return likely
 
-    def _sticks(self, past: Landmarks, new: Landmarks, pairs: np.ndarray) -> bool:
-        """Whether too few landmarks are elsewhere in the picture: dirt on the lens looks alike in unrelated places."""
+    def _sticks(self, past: Features, new: Features, pairs: np.ndarray) -> bool:
+        """Whether too few features are elsewhere in the picture: dirt on the lens looks alike in unrelated places."""
         way_px = np.linalg.norm(new.pixels[pairs[:, 1]] - past.pixels[pairs[:, 0]], axis=1)
-        return int((way_px > _STICKS_PX).sum()) < self.settings.loop_landmarks
+        return int((way_px > _STICKS_PX).sum()) < self.settings.min_loop_inliers
 
     @staticmethod
-    def _votes(strongest: np.ndarray, known: Landmarks) -> float:
+    def _votes(strongest: np.ndarray, known: Features) -> float:
         """How much a keyframe looks like one with these descriptors."""
         alike = strongest @ known.descriptors[:_STRONGEST].T.astype(np.float32)
         return float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0

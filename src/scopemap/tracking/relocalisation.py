@@ -11,12 +11,12 @@ import numpy as np
 
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
-from scopemap.tracking.features import Landmarks, find_landmarks, locate
+from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, align
 
-_MIN_LANDMARKS = 20
-_MIN_MAP_FRAMES = 5  # tracked in another map for it to be searched
+_MIN_INLIERS = 20
+_MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Keyframe:
     map: int
 
     @cached_property
-    def landmarks(self) -> Landmarks:
+    def features(self) -> Features:
         """Features with depth, detected on first use: most clips never need them."""
-        return find_landmarks(self.frame)
+        return detect_features(self.frame)
 
 
 class Relocaliser:
@@ -78,13 +78,13 @@ class Relocaliser:
         """
         if self.settings.relocalisation_keyframes == 0:
             return None
-        current = find_landmarks(replace(frame, depth_mm=None))
+        current = detect_features(replace(frame, depth_mm=None))
         for keyframes in (self._keyframes, self._of_other_maps if other_maps else ()):
             found = []
             for keyframe in keyframes:
-                located = locate(keyframe.landmarks, current, frame.camera, _MIN_LANDMARKS)
-                if located is not None:
-                    alignment = align(keyframe.pyramid, pyramid, located.T_current_reference, self.settings)
+                relative = relative_pose_pnp(keyframe.features, current, frame.camera, _MIN_INLIERS)
+                if relative is not None:
+                    alignment = align(keyframe.pyramid, pyramid, relative.T_current_reference, self.settings)
                     if is_accepted(keyframe, alignment):
                         found.append((keyframe, alignment))
             if found:

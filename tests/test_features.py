@@ -1,4 +1,4 @@
-"""Landmarks on a textured plane whose truth is a closed form, and what is not known again."""
+"""Features on a textured plane whose truth is a closed form, and what is not known again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plane_scene import CAMERA
 
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.features import find_landmarks, locate, matches
+from scopemap.tracking.features import detect_features, match_features, relative_pose_pnp
 
 HERE = plane_scene.pose()
 # Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.
@@ -23,9 +23,9 @@ def _frame(T_world_camera: np.ndarray, index: int = 0) -> Frame:
     return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
 
 
-def test_a_far_view_is_placed_by_its_landmarks() -> None:
-    known, seen = find_landmarks(_frame(HERE)), find_landmarks(replace(_frame(THERE), depth_mm=None))
-    located = locate(known, seen, CAMERA, least=20)
+def test_the_pose_of_a_far_view_is_found_from_features() -> None:
+    known, seen = detect_features(_frame(HERE)), detect_features(replace(_frame(THERE), depth_mm=None))
+    located = relative_pose_pnp(known, seen, CAMERA, min_inliers=20)
     assert located is not None
     off = located.T_current_reference @ inverse(HERE) @ THERE
     assert rotation_angle_rad(off[:3, :3]) < np.radians(0.5)
@@ -38,31 +38,31 @@ def test_a_far_view_is_placed_by_its_landmarks() -> None:
     assert len(located.pairs) >= 20
 
 
-def test_landmarks_carry_the_point_that_their_pixel_shows() -> None:
+def test_features_have_the_3d_point_of_their_pixel() -> None:
     frame = _frame(THERE)
-    landmarks = find_landmarks(frame)
-    assert len(landmarks.pixels) > 100
-    np.testing.assert_allclose(CAMERA.project(landmarks.points_mm), landmarks.pixels, atol=1e-6)
-    column, row = np.rint(landmarks.pixels).astype(int).T
+    features = detect_features(frame)
+    assert len(features.pixels) > 100
+    np.testing.assert_allclose(CAMERA.project(features.points_mm), features.pixels, atol=1e-6)
+    column, row = np.rint(features.pixels).astype(int).T
     assert frame.depth_mm is not None
-    np.testing.assert_allclose(landmarks.points_mm[:, 2], frame.depth_mm[row, column])
-    np.testing.assert_allclose(np.linalg.norm(landmarks.descriptors, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(features.points_mm[:, 2], frame.depth_mm[row, column])
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-5)
 
 
-def test_what_is_not_usable_is_no_landmark() -> None:
+def test_masked_pixels_have_no_features() -> None:
     half = plane_scene.EVERYWHERE.copy()
     half[:, 120:] = False
-    assert find_landmarks(replace(_frame(HERE), valid=half)).pixels[:, 0].max() < 120
+    assert detect_features(replace(_frame(HERE), valid=half)).pixels[:, 0].max() < 120
     flat = replace(_frame(HERE), rgb=np.full((CAMERA.height, CAMERA.width, 3), 99, np.uint8))
-    nothing = find_landmarks(flat)
+    nothing = detect_features(flat)
     assert nothing.pixels.shape == (0, 2)
-    assert matches(nothing, find_landmarks(_frame(HERE))).shape == (0, 2)
+    assert match_features(nothing, detect_features(_frame(HERE))).shape == (0, 2)
 
 
-@pytest.mark.parametrize("what", ["another place", "no depth", "too many asked for"])
-def test_nothing_is_placed_without_evidence(what: str) -> None:
+@pytest.mark.parametrize("what", ["another place", "no depth", "too many required"])
+def test_no_pose_without_enough_inliers(what: str) -> None:
     known, least = _frame(HERE), 20
-    seen = find_landmarks(_frame(THERE))
+    seen = detect_features(_frame(THERE))
     if what == "another place":
         noise = np.random.default_rng(3).integers(0, 255, known.rgb.shape, dtype=np.uint8)
         known = replace(known, rgb=noise)
@@ -70,12 +70,12 @@ def test_nothing_is_placed_without_evidence(what: str) -> None:
         known = replace(known, depth_mm=None)
     else:
         least = 10_000
-    assert locate(find_landmarks(known), seen, CAMERA, least) is None
+    assert relative_pose_pnp(detect_features(known), seen, CAMERA, least) is None
 
 
-def test_the_same_frames_are_placed_the_same_way_twice() -> None:
-    known, seen = find_landmarks(_frame(HERE)), find_landmarks(_frame(THERE))
-    one, other = (locate(known, seen, CAMERA, least=20) for _ in range(2))
+def test_the_pose_is_deterministic() -> None:
+    known, seen = detect_features(_frame(HERE)), detect_features(_frame(THERE))
+    one, other = (relative_pose_pnp(known, seen, CAMERA, min_inliers=20) for _ in range(2))
     assert one is not None
     assert other is not None
     np.testing.assert_array_equal(one.T_current_reference, other.T_current_reference)
