@@ -150,7 +150,7 @@ def test_metadata_that_does_not_fit_the_files_is_one_sentence(tmp_path: Path) ->
     metadata.unlink()
     assert RosBag(folder).count == 4
     (folder / "other.mcap").write_bytes((folder / "a.mcap").read_bytes())
-    with pytest.raises(InputError, match=r"2 bags and no metadata\.yaml .*\(a\.mcap, other\.mcap\)"):
+    with pytest.raises(InputError, match=r"2 bags and no metadata\.yaml"):
         RosBag(folder)
 
 
@@ -166,12 +166,6 @@ def test_a_count_beyond_the_file_is_bounded(tmp_path: Path) -> None:
         RosBag(folder)
 
 
-def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:
-    bag = small_bag(2)
-    bag.image(IMAGE, 2, picture(2, SIZE), "rgb8", stamp_ns=0)
-    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
-    assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 2 * STEP_NS + 5) / 1e9)
-    assert any("hold no stamp" in warning for warning in source.warnings)
 
 
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

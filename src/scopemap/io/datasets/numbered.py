@@ -10,19 +10,16 @@ from __future__ import annotations
 import re
 import tarfile
 import threading
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-from scopemap.errors import InputError
 from scopemap.io.decoding import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
-_ARCHIVES = (".tar.gz", ".tgz", ".tar")
+_ARCHIVES = (".tar.gz", ".tar")
 _SPACING_BYTES, _BUFFER_BYTES = 32 << 20, 1 << 20
-_BLOCK_BYTES = 512
 
 
 class FolderFiles:
@@ -36,19 +33,13 @@ class FolderFiles:
         file = self._files.get(number)
         if file is None:
             return None
-        try:
+        with reporting(f"reading {file}"):
             check_bytes(str(file), file.stat().st_size, LARGEST_FILE_BYTES)
             return file.read_bytes()
-        except OSError as error:
-            raise InputError(f"reading {file}: {error.strerror}") from None
 
     def numbers(self) -> list[int]:
         """Return all numbers, ascending."""
         return list(self._files)
-
-    def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield name, number and content of every file."""
-        return ((file.name, number, self.read(number) or b"") for number, file in self._files.items())
 
 
 class ArchiveFiles:
@@ -77,27 +68,12 @@ class ArchiveFiles:
                 self._advance()
             return sorted(self._found)
 
-    def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield name, number and content of every file, in the order in which they are stored."""
-        position = 0
-        while True:
-            with self._lock:
-                while len(self._found) <= position and not self._complete:
-                    self._advance()
-                if len(self._found) <= position:
-                    return
-                number, member = list(self._found.items())[position]
-                name, content = PurePosixPath(member.name).name, self._content(member)
-            yield name, number, content
-            position += 1
-
     def _advance(self) -> None:
         """Look at the next member."""
         with self._reporting():
             self._tar = self._tar or _opened(self.path)
             member = self._tar.next()
             if member is None:
-                _check_end(self._tar)
                 self._complete = True
                 return
             # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
@@ -129,7 +105,7 @@ def find_numbered(
 ) -> NumberedFiles | None:
     """Return the files PREFIX<number>SUFFIX in the first of `places` below `folder` that has them, or None.
 
-    A place is a folder, or an archive of the same name with `.tar.gz`, `.tgz` or `.tar`; the folder is preferred.
+    A place is a folder, or an archive of the same name with `.tar.gz` or `.tar`; the folder is preferred.
     """
     for place in places:
         inside = folder / place
@@ -157,11 +133,3 @@ def _opened(path: Path) -> tarfile.TarFile:
 
     stream = IndexedGzipFile(str(path), spacing=_SPACING_BYTES, buffer_size=_BUFFER_BYTES)
     return tarfile.open(fileobj=stream, mode="r:")
-
-
-def _check_end(archive: tarfile.TarFile) -> None:
-    """Raise `EOFError` unless a block of zeros follows the last member: `tarfile` ends at any other, too."""
-    assert archive.fileobj is not None
-    archive.fileobj.seek(archive.offset)
-    if archive.fileobj.read(_BLOCK_BYTES) != bytes(_BLOCK_BYTES):
-        raise EOFError("it breaks off")

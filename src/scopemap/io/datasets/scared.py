@@ -1,10 +1,10 @@
 """SCARED and SCARED-C: da Vinci stereo video of porcine abdomens, surface from structured light.
 
 SCARED, a keyframe's folder as it is downloaded: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the
-right), `data/frame_data.tar.gz` (poses from robot kinematics), `data/scene_points.tar.gz`. Copies that others have
-unpacked are read, too. Frame number = order in the video, from 0 = number of the JSON and of the scene points. A scene
-point file holds X, Y, Z per pixel in the camera's frame, mm, the left view above the right one. Allan et al., "Stereo
-correspondence and reconstruction of endoscopic data challenge", arXiv 2101.01133.
+right), `data/frame_data.tar.gz` (poses from robot kinematics), `data/scene_points.tar.gz`, or these archives unpacked.
+Frame number = order in the video, from 0 = number of the JSON and of the scene points. A scene point file holds X, Y, Z
+per pixel in the camera's frame, mm, the left view above the right one. Allan et al., "Stereo correspondence and
+reconstruction of endoscopic data challenge", arXiv 2101.01133.
 
 SCARED-C: SCARED's left images with poses by structure from motion (github.com/juseonghan/SCARED-C): also
 `intrinsics_colmap.yaml`, `frame_log.json` and `data/rgb_frames.tar.gz`. Frames count from 1 and have gaps, where COLMAP
@@ -22,31 +22,23 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.parsing import Fields
-from scopemap.cameras.formats.reading import of_fields, read_calibration, stated_calibration
+from scopemap.cameras.formats.reading import read_calibration, stated_calibration
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.numbered import NumberedFiles, find_numbered
-from scopemap.io.decoding import decoded
-from scopemap.io.images import OWN_CALIBRATION, ImageFolder, decoded_image, frame_number, image_files
+from scopemap.io.decoding import decoded, reporting
+from scopemap.io.images import OWN_CALIBRATION, ImageFolder, decoded_image, frame_number
 from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
 from scopemap.io.video import VideoFile
 from scopemap.trajectory.formats.scared import parse_frame_data, times_of
 
-_CALIBRATIONS = ("endoscope_calibration.yaml", "camera_calibration.yaml")
+_CALIBRATION = "endoscope_calibration.yaml"
 _VIDEOS = ("data/rgb.mp4", "rgb.mp4")
-_IMAGES = ("image_02/data", "left", "data/left", "left_finalpass")
-_RECTIFIED = "data/left_finalpass"
-_STILL = "Left_Image.png"
-# The last place are files that are loose in `data`; an archive of that name is not meant.
-_FRAME_DATA = ("data/frame_data", "frame_data", "image_02/data/frame_data", "data/.")
-_SCENE_POINTS = ("data/scene_points", "scene_points", "image_02/data/groundtruth")
+_FRAME_DATA = ("data/frame_data", "frame_data")
+_SCENE_POINTS = ("data/scene_points", "scene_points")
 _INTRINSICS, _LOG = "intrinsics_colmap.yaml", "frame_log.json"
-_NAMED = re.compile(r"dataset_?\d+.*keyframe_?\d+")
 _BADLY_CALIBRATED = (4, 5)
 _STACKED_ASPECT = 1.4
-_MOST_OFF_CENTRE = 0.25
 # COLMAP puts the centre of the top-left pixel at (0.5, 0.5).
 _COLMAP_CENTRE_PX = 0.5
 
@@ -54,12 +46,11 @@ _COLMAP_CENTRE_PX = 0.5
 class ScaredKeyframe(SourceDefaults):
     """The left view of one keyframe's video, with its true poses and depth where they are beside it.
 
-    Raises `InputError` for a keyframe that is a single picture, and `CalibrationError` for one that does not fit.
+    Raises `InputError` for a keyframe without a video, and `CalibrationError` for a calibration that does not fit.
     """
 
     name = "scared"
     quality: TruthQuality = "kinematic"
-    _counts_from_one = False
 
     def __init__(self, path: Path) -> None:
         self.path = _keyframe(path)
@@ -79,11 +70,9 @@ class ScaredKeyframe(SourceDefaults):
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Return whether `path` is a keyframe's folder, by its calibration file or its name, with pictures in it."""
+        """Return whether `path` holds `endoscope_calibration.yaml` and `rgb.mp4`, here or in `data`."""
         path = _keyframe(path)
-        known = any((path / name).is_file() for name in _CALIBRATIONS)
-        named = _NAMED.search("/".join(path.absolute().parts[-2:])) is not None
-        return (known or named) and any((path / name).exists() for name in (*_VIDEOS, *_IMAGES, _RECTIFIED, _STILL))
+        return (path / _CALIBRATION).is_file() and any((path / name).is_file() for name in _VIDEOS)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected left views, decoded in order."""
@@ -105,37 +94,21 @@ class ScaredKeyframe(SourceDefaults):
         return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
     def _find_pictures(self) -> VideoFile | ImageFolder:
-        for place in _VIDEOS:
-            if (self.path / place).is_file():
-                return VideoFile(self.path / place)
-        for place in _IMAGES:
-            if image_files(self.path / place):
-                folder = ImageFolder(self.path / place)
-                if folder.numbers[0] != 0:
-                    folder.numbers = [number - 1 for number in folder.numbers]
-                    self._counts_from_one = True
-                return folder
-        if (self.path / _RECTIFIED).is_dir():
-            raise InputError(
-                f"reading {self.path}: {_RECTIFIED} holds rectified images, to which neither the calibration nor the "
-                "poses belong; give the folder with rgb.mp4"
-            )
-        if (self.path / _STILL).is_file():
-            raise InputError(
-                f"reading {self.path}: this SCARED keyframe is a single stereo picture without a video (rgb.mp4), a "
-                "sequence needs two frames; give another keyframe"
-            )
-        raise InputError(f"reading {self.path}: no SCARED keyframe, looked for {', '.join((*_VIDEOS, *_IMAGES))}")
+        video = next((file for name in _VIDEOS if (file := self.path / name).is_file()), None)
+        if video is None:
+            raise InputError(f"reading {self.path}: no SCARED keyframe with a video (rgb.mp4); give another keyframe")
+        return VideoFile(video)
 
     def _read_frame_data(self) -> None:
         """Read all poses, time stamps and the calibration; a file that cannot be used is a warning."""
         files = find_numbered(self.path, _FRAME_DATA, "frame_data", (".json",))
-        frames = [parse_frame_data(name, number, content) for name, number, content in files or []]
-        frames.sort(key=lambda frame: frame.index)
+        frames = []
+        for number in files.numbers() if files is not None else []:
+            content = files.read(number) if files is not None else None
+            frames.append(parse_frame_data(f"frame_data{number:06d}.json", number, content or b""))
         self._posed = [frame.index for frame in frames]
         self._poses = {frame.index: frame.T_world_camera for frame in frames if frame.T_world_camera is not None}
         self._times_s, _ = times_of(frames)
-        self._stated = next((frame.calibration for frame in frames if frame.calibration is not None), None)
         self.stamped = bool(self._times_s)
         faults = [frame.fault for frame in frames if frame.fault]
         if faults and files is not None:
@@ -182,24 +155,12 @@ class ScaredKeyframe(SourceDefaults):
     def _calibrate(self) -> None:
         size = (self.width, self.height)
         own = self.path / OWN_CALIBRATION
-        file = next((self.path / name for name in _CALIBRATIONS if (self.path / name).is_file()), None)
         if own.is_file():
             self._use_calibration(stated_calibration(own, size))
-            return
-        if file is not None:
-            calibration = read_calibration(file, size)
+        elif (self.path / _CALIBRATION).is_file():
+            calibration = read_calibration(self.path / _CALIBRATION, size)
             self.camera, self.depth_scale_mm = calibration.camera, calibration.depth_scale_mm
             self.camera_source = f"{calibration.source} beside the frames"
-        elif self._stated is not None:
-            try:
-                self.camera = of_fields(Fields(self._stated.items()), size).camera
-            except ValueError as error:
-                raise CalibrationError(
-                    f"the calibration in frame_data of {self.path} cannot be used: {error}"
-                ) from None
-            self.camera_source = "camera-calibration in frame_data"
-        if self.camera is not None:
-            _check_centred(self.camera, self.path)
 
     def _assumptions(self, stacked: bool) -> list[str]:
         numbers = [int(n) for part in self.path.absolute().parts[-3:] for n in re.findall(r"dataset_?(\d+)", part)]
@@ -208,8 +169,6 @@ class ScaredKeyframe(SourceDefaults):
                 f"SCARED dataset {numbers[-1]}: its calibration is known to be inaccurate, and so is what is measured"
             )
         notes = ["the view used: " + ("left, the upper half" if stacked else "the whole image")]
-        if self._counts_from_one:
-            notes.append("image number n is taken as frame n - 1: images that a video was unpacked to count from 1")
         if not self._poses:
             return [*notes, "no pose is known: frame_data is not there"]
         return [*notes, "truth: scan of the keyframe moved by robot kinematics; its error grows away from the keyframe"]
@@ -219,19 +178,18 @@ class ScaredKeyframe(SourceDefaults):
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         """Return the left view's depth (h, w) float32, NaN = unknown; None where the frame has no scene points."""
-        content = None if self._points is None else self._points.read(index)
-        if content is None or self._points is None:
+        if self._points is None or (content := self._points.read(index)) is None:
             return None
-        where = f"{self._points.path}, frame {index}"
         points = decoded(content)
-        if points is None or points.dtype != np.float32 or points.ndim != 3 or points.shape[2] != 3:
-            found = "no readable image" if points is None else f"{points.dtype} of shape {points.shape}"
-            raise InputError(f"reading {where}: expected scene points, an image of three 32-bit floats, found {found}")
+        if points is None or points.dtype != np.float32 or points.shape[2:] != (3,):
+            raise InputError(
+                f"reading {self._points.path}, frame {index}: scene points are no image of 3 32-bit floats"
+            )
         rows, columns = points.shape[:2]
         if rows * self.width not in (self.height * columns, 2 * self.height * columns):
             raise InputError(
-                f"reading {where}: scene points of {columns}x{rows} px fit neither the left images of "
-                f"{self.width}x{self.height} px nor both views above each other"
+                f"reading {self._points.path}, frame {index}: scene points of {columns}x{rows} px do not fit images of "
+                f"{self.width}x{self.height} px"
             )
         # The left view is on top; OpenCV reverses X, Y, Z as it does R, G, B.
         depth_mm = points[: self.height * columns // self.width, :, 0] * np.float32(self.depth_scale_mm or 1.0)
@@ -290,19 +248,7 @@ class _ArchivedImages(ImageFolder):
 
 def _keyframe(path: Path) -> Path:
     """Return the keyframe's folder, also where its `data` was named."""
-    calibrated = any((path.parent / name).is_file() for name in _CALIBRATIONS)
-    return path.parent if path.name == "data" and calibrated else path
-
-
-def _check_centred(camera: CameraModel, path: Path) -> None:
-    central = camera.central
-    off = max(abs((central.cx + 0.5) / camera.width - 0.5), abs((central.cy + 0.5) / camera.height - 0.5))
-    if off > _MOST_OFF_CENTRE:
-        raise CalibrationError(
-            f"the calibration of {path} does not fit images of {camera.width}x{camera.height} px: its principal point "
-            f"{central.cx:g}, {central.cy:g} is far off their centre; for reduced images put their own "
-            f"{OWN_CALIBRATION} there"
-        )
+    return path.parent if path.name == "data" and (path.parent / _CALIBRATION).is_file() else path
 
 
 def _find_frames(path: Path) -> NumberedFiles | None:
@@ -310,11 +256,8 @@ def _find_frames(path: Path) -> NumberedFiles | None:
 
 
 def _read_log(file: Path) -> list[int]:
-    try:
-        included = json.loads(file.read_text(encoding="utf-8"))["included_frames"]
-        numbers = sorted({int(number) for number in included})
-    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        raise InputError(f"cannot read included_frames in {file}: {error!r}") from None
+    with reporting(f"cannot read included_frames in {file}"):
+        numbers = sorted({int(number) for number in json.loads(file.read_bytes())["included_frames"]})
     if not numbers:
         raise InputError(f"reading {file}: included_frames names no frame")
     return numbers

@@ -47,23 +47,22 @@ class FrameData:
     """The content of one `frame_data` file.
 
     where : file. index : number of the frame. T_world_camera : (4, 4), mm, None where it cannot be used, which `fault`
-    explains. stamp : `timestamp`. calibration : `camera-calibration`, None where that is no map.
+    explains. stamp : `timestamp`.
     """
 
     where: str
     index: int
     T_world_camera: np.ndarray | None = None
     stamp: Any = None
-    calibration: dict[str, Any] | None = None
     fault: str = ""
 
 
 def parse_frame_data(where: str, index: int, content: bytes) -> FrameData:
     """Return what a `frame_data` file holds; a file that cannot be used is not an error but has a `fault`."""
-    T_world_camera, stamp, calibration, fault = None, None, None, ""
+    T_world_camera, stamp, fault = None, None, ""
     try:
         document = json.loads(content)
-        stamp, calibration = document.get("timestamp"), document.get("camera-calibration")
+        stamp = document.get("timestamp")
         pose = np.array(document["camera-pose"], dtype=np.float64)
         if pose.shape != (4, 4):
             raise ValueError(f"found the shape {pose.shape}")
@@ -72,8 +71,7 @@ def parse_frame_data(where: str, index: int, content: bytes) -> FrameData:
         fault = str(error)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         fault = f"{where}: expected a JSON object with a 4x4 'camera-pose' ({error!r})"
-    calibration = calibration if isinstance(calibration, dict) else None
-    return FrameData(where, index, T_world_camera, stamp, calibration, fault)
+    return FrameData(where, index, T_world_camera, stamp, fault)
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
