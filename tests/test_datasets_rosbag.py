@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -119,8 +118,6 @@ def test_rows_may_be_filled_up_and_samples_stored_the_other_way_round(tmp_path: 
         np.testing.assert_array_equal(rgb, COLOUR)
 
 
-
-
 def test_the_calibrated_then_the_left_then_the_longest_topic_is_taken(tmp_path: Path) -> None:
     def chosen(counts: dict[str, int], infos: tuple[str, ...] = ()) -> tuple[str, list[str]]:
         bag = Bag()
@@ -191,8 +188,6 @@ def test_depth_that_is_aligned_is_truth(tmp_path: Path) -> None:
     assert any("not used: /endoscope/depth/image" in note for note in source.notes)
 
 
-
-
 def test_times_without_stamps_are_those_of_recording(tmp_path: Path) -> None:
     bag = Bag()
     for number in range(3):
@@ -251,5 +246,3 @@ def test_depth_is_that_of_the_pictures_it_names(tmp_path: Path, depth: str, pict
         bag.image(pictures, number, picture(number, SIZE), "rgb8")
         bag.image(depth, number, np.full((SIZE[1], SIZE[0]), 50, np.uint16), "16UC1")
     assert (RosBag(bag.write_bag1(tmp_path / "a.bag")).truth(0) is not None) == used
-
-

@@ -1,7 +1,7 @@
 """Decoding of images and archives from files of unknown origin: limits of pixels and bytes, checked before decoding.
 
 The limit is 64 million pixels an image; the environment variable `SCOPEMAP_MAX_MEGAPIXELS` sets another (up to what
-Pillow opens, 178 million, but for TIFF and PNG).
+Pillow opens, 178 million, but for TIFF).
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,7 +22,6 @@ from scopemap.errors import InputError, ScopemapError
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_PNG = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
 
 
@@ -110,8 +108,6 @@ def most_pixels() -> float:
 
 def _claimed_pixels(content: bytes) -> float:
     """Return how many pixels the header claims; 0 for formats that Pillow does not know and damaged headers."""
-    if content[:8] == _PNG:
-        return _png_pixels(content)
     # Only reading of images waits for the import.
     from PIL import Image, TiffImagePlugin
 
@@ -131,17 +127,3 @@ def _claimed_pixels(content: bytes) -> float:
         return math.inf
     except Exception:  # damaged headers end in exceptions of any kind
         return 0
-
-
-def _png_pixels(content: bytes) -> int:
-    """Return the pixels of a PNG; 0 where a chunk is longer than the file: OpenCV would allocate its claim first."""
-    place, pixels = len(_PNG), 0
-    while place + 8 <= len(content):
-        (length,) = struct.unpack(">I", content[place : place + 4])
-        if place + 12 + length > len(content):
-            return 0
-        if content[place + 4 : place + 8] == b"IHDR" and length >= 8:
-            width, height = struct.unpack(">II", content[place + 8 : place + 16])
-            pixels = max(pixels, width * height)
-        place += 12 + length
-    return pixels

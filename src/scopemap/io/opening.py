@@ -159,16 +159,12 @@ def _reader(path: Path, dataset: str | None) -> Reader:
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
-    within: list[str] = []
-    around: list[str] = []
+    closed: list[Path] = []
     if path.is_dir():
-        around = _closed_folders(path)
+        closed = _closed_folders(path)
         path = _innermost(path, dataset or None)
-        within = _closed_folders(path)
     elif not path.is_file():
-        raise InputError(
-            f"reading {path}: it is a pipe or a device; store what comes out of it as a file, and give that"
-        )
+        raise InputError(f"reading {path}: it is no file and no folder")
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), ImageFolder.name)
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
@@ -176,25 +172,26 @@ def _reader(path: Path, dataset: str | None) -> Reader:
         raise InputError(
             f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon, got '{part}'"
         )
-    if within and DATASETS[kind] not in _WITHOUT_LAYOUT:
-        raise InputError(f"reading {path}: {within[0]}")
+    within = next((folder for folder in closed if folder.is_relative_to(path)), None)
+    if within is not None and DATASETS[kind] not in _WITHOUT_LAYOUT:
+        raise InputError(f"reading {path}: no permission to look into {within}")
     reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
-    reader.warnings += [f"left out: {closed}" for closed in list(dict.fromkeys([*within, *around]))[:_MOST_NAMED]]
+    reader.warnings += [f"left out: no permission to look into {folder}" for folder in closed[:_MOST_NAMED]]
     return reader
 
 
-def _closed_folders(folder: Path) -> list[str]:
-    """Return, as phrases, the folders in `folder` without permission; links are not followed.
+def _closed_folders(folder: Path) -> list[Path]:
+    """Return the folders in `folder` without permission, four levels deep; links are not followed.
 
-    Whether a file in such a folder exists cannot be told, so that truth would be left out silently. Four levels are
-    looked at. Raises `InputError` where `folder` itself has no permission.
+    Whether a file in such a folder exists cannot be told, so that truth would be left out silently. Raises `InputError`
+    where `folder` itself has no permission.
     """
     if not _may_enter(folder):
         raise InputError(f"reading {folder}: no permission to look into it")
-    closed: list[str] = []
+    closed: list[Path] = []
     for root, inner, _ in islice(os.walk(folder), _MOST_FOLDERS):
         inner[:] = [name for name in inner if not _is_ignored(name)]
-        closed += [f"no permission to look into {path}" for name in inner if not _may_enter(path := Path(root, name))]
+        closed += [path for name in inner if not _may_enter(path := Path(root, name))]
         if len(Path(root).relative_to(folder).parts) + 1 >= _DEEPEST_CLOSED:
             inner.clear()
     return closed
@@ -218,16 +215,12 @@ def _innermost(path: Path, dataset: str | None) -> Path:
     if dataset is not None:
         found = _descended(path, [DATASETS[dataset]])
         return found if DATASETS[dataset].recognises(found) else path
-    containers = [kind for kind in _KINDS if kind in (RosBag, Dicom)]
-    others = [kind for kind in _KINDS if kind not in containers]
+    others = [kind for kind in _KINDS if kind not in (RosBag, Dicom)]
     found = _descended(path, others)
-    has_images = ImageFolder.recognises(found)
-    layouts = [kind for kind in others if kind not in _WITHOUT_LAYOUT]
-    if (has_images and (found == path or found.name == _IMAGES)) or any(kind.recognises(found) for kind in layouts):
+    has_images = ImageFolder.recognises(found) and (found == path or found.name == _IMAGES)
+    if has_images or any(kind.recognises(found) for kind in others if kind not in _WITHOUT_LAYOUT):
         return found
-    # Without its package a container cannot be read, the images beside it can.
-    readable = [kind for kind in containers if not has_images or kind.is_installed()]
-    return _descended(path, [*readable, *others])
+    return _descended(path, list(_KINDS))
 
 
 def _descended(path: Path, kinds: list[type[Reader]]) -> Path:

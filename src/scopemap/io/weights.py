@@ -49,8 +49,7 @@ def is_present(*names: str) -> bool:
 def locate(*names: str) -> Path:
     """Return the checked file or folder of the first of `names` that is there; never downloads.
 
-    Files unchanged since they were recorded are not hashed again (`verify` does that). Raises `WeightsError` that names
-    what to fetch and where to put it, or the damaged file.
+    Raises `WeightsError` that names what to fetch and where to put it, or the damaged file.
     """
     checkpoints = [find(name) for name in names]
     for checkpoint in checkpoints:
@@ -65,7 +64,7 @@ def verify(name: str) -> Path:
     checkpoint = find(name)
     if not _is_there(checkpoint):
         raise WeightsError(_advice([checkpoint]))
-    return _checked(checkpoint, trust_stamps=False)
+    return _checked(checkpoint)
 
 
 def overview() -> list[Row]:
@@ -130,13 +129,10 @@ def _is_there(checkpoint: Checkpoint) -> bool:
     return bool(expected) and all((weights_folder() / file).is_file() for file in expected)
 
 
-def _checked(checkpoint: Checkpoint, *, trust_stamps: bool = True) -> Path:
-    recorded = _read_lock().get(checkpoint.name, {}).get("files", {})
+def _checked(checkpoint: Checkpoint) -> Path:
     for file, hashes in _expected(checkpoint).items():
         path = weights_folder() / file
-        record = recorded.get(file)
-        unchanged = trust_stamps and record is not None and record == _stamp(path, record["sha256"])
-        found = record["sha256"] if unchanged else sha256_of(path)
+        found = sha256_of(path)
         if not all(found.startswith(wanted) for wanted in hashes):
             raise WeightsError(
                 f"the weights of '{checkpoint.name}' are damaged or of another version: {path} has SHA-256 {found}, "
@@ -207,16 +203,11 @@ def _record(checkpoint: Checkpoint, revision: str) -> None:
         raise WeightsError(
             f"'{checkpoint.location}' holds no safetensors, and other formats are not loaded: use another"
         )
-    files = {path.relative_to(folder).as_posix(): _stamp(path, sha256_of(path)) for path in sorted(found)}
+    files = {path.relative_to(folder).as_posix(): {"sha256": sha256_of(path)} for path in sorted(found)}
     lock = _read_lock() | {checkpoint.name: {"revision": revision, "files": files}}
     draft = folder / f"{LOCK_NAME}.part"
     draft.write_text(json.dumps(lock, indent=2) + "\n", encoding="utf-8")
     draft.replace(folder / LOCK_NAME)
-
-
-def _stamp(path: Path, sha256: str) -> dict[str, Any]:
-    stat = path.stat()
-    return {"sha256": sha256, "size": stat.st_size, "mtime_ns": stat.st_mtime_ns}
 
 
 def _read_lock() -> dict[str, Any]:

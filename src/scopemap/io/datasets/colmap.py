@@ -7,11 +7,9 @@ Schoenberger and Frahm, "Structure-from-motion revisited", CVPR 2016; colmap.git
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
 from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
@@ -21,7 +19,6 @@ from scopemap.trajectory.formats.colmap import camera_poses
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 _DEEPEST_MODEL = 3
 _IMAGES = "images"
-_MOST_NAMED = 5
 
 
 class ColmapFolder(ImageFolder):
@@ -49,7 +46,7 @@ class ColmapFolder(ImageFolder):
         here = {names[image.path.name]: image for image in images if image.path.name in names}
         if self.camera is None:
             with self._making_camera():
-                self._use_camera(cameras_file, Counter(image.camera for image in here.values()))
+                self._use_camera(cameras_file, {image.camera for image in here.values()})
         posed = {number: image for number, image in here.items() if image.is_posed}
         if not posed:
             raise InputError(f"reading {images_file}: every pose of the images that are here holds NaN or infinity")
@@ -61,24 +58,19 @@ class ColmapFolder(ImageFolder):
         """Whether there is a model in `path` or in one of its usual places below, and images beside it."""
         return path.is_dir() and _model(path) is not None and any(_image_folders(path))
 
-    def _use_camera(self, file: Path, uses: Counter[int]) -> None:
+    def _use_camera(self, file: Path, uses: set[int]) -> None:
         cameras = read_cameras(file)
         unknown = [number for number in uses if number not in cameras]
         if unknown:
             raise InputError(f"reading {file}: it has no camera {unknown[0]}, by which images of the model were taken")
-        most_used = [number for number, _ in uses.most_common()]
-        models = {number: camera_model(cameras[number], f"camera {number} of {file}") for number in most_used}
+        models = {number: camera_model(cameras[number], f"camera {number} of {file}") for number in uses}
         if len(set(models.values())) > 1:
-            named = [f"camera {n}, {cameras[n].model}, {uses[n]} images" for n in most_used[:_MOST_NAMED]]
             raise InputError(
-                f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ "
-                f"({'; '.join(named)}{'; ...' * (len(models) > _MOST_NAMED)}); a sequence has one: reconstruct with a "
-                f"single camera for all images, or give their calibration (--camera, or as camera.yaml in {self.path})"
+                f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ; a sequence "
+                "has one: reconstruct with a single camera for all images, or give their calibration (--camera)"
             )
-        camera = models[most_used[0]]
-        self.camera = fitted_to(camera, (self.width, self.height), f"camera {most_used[0]} of {file}")
-        note = rescaled_note(camera, self.camera)
-        self.camera_source = f"COLMAP {file.name}, {cameras[most_used[0]].model}{note}"
+        number, camera = next(iter(models.items()))
+        self._set_camera(camera, f"COLMAP {file.name}, {cameras[number].model}", f"camera {number} of {file}")
 
     def _report_model(self, file: Path, in_model: int, here: int) -> None:
         self.notes.append(
@@ -86,13 +78,6 @@ class ColmapFolder(ImageFolder):
         )
         if len(self.poses) < len(self.files):
             self.notes.append(f"{len(self.files) - len(self.poses)} of {len(self.files)} images have no pose")
-        beside = file.absolute().parent.parent.iterdir() if file.parent.name.isdecimal() else ()
-        others = sorted(o.name for o in beside if o.name.isdecimal() and o.name != file.parent.name and model_files(o))
-        if others:
-            self.notes.append(
-                f"{file.parent} was read, one of {len(others) + 1} models, each in a frame of its own; the others: "
-                f"{', '.join(others[:_MOST_NAMED])}{', ...' * (len(others) > _MOST_NAMED)}"
-            )
         if here < in_model:
             self._warn(f"{in_model - here} of {in_model} images in {file} are not beside it and were left out")
         if len(self.poses) < here:
@@ -119,9 +104,8 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
     """Return all images of the folder that holds those of the model; `InputError` where there is none, or several."""
     inner = sorted({image.path.parent for image in images})
     if len(inner) > 1:
-        named = ", ".join(repr(str(folder)) for folder in inner[:_MOST_NAMED]) + ", ..." * (len(inner) > _MOST_NAMED)
         raise InputError(
-            f"reading {path}: the images of the COLMAP model are in {len(inner)} folders ({named}), a sequence in one; "
+            f"reading {path}: the images of the COLMAP model are in {len(inner)} folders, a sequence in one; "
             "reconstruct one of them, or leave the others out of the model"
         )
     wanted = {image.path.name for image in images}

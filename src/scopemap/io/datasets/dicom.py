@@ -19,9 +19,7 @@ from scopemap.io.decoding import first_bytes
 from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
 from scopemap.io.source import SourceDefaults, SourceFrame
 
-_PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
-# The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
-_DIRECTORY = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
+_PREAMBLE, _MAGIC = 128, b"DICM"
 
 
 class Dicom(SourceDefaults):
@@ -129,18 +127,14 @@ class Dicom(SourceDefaults):
 
     def _in_folder(self, path: Path) -> list[Header]:
         """Return the headers of the one series in a folder, sorted."""
-        files = _files(path)
-        headers, fault = [], ""
-        for file in files:
+        headers = []
+        for file in _files(path):
             try:
                 headers.append(read_header(file))
             except InputError as error:
-                fault = str(error)
+                self._warn(f"{error}; it was left out")
         if not headers:
-            raise InputError(fault or f"reading {path}: it holds no DICOM file")
-        if len(headers) < len(files):
-            left_out = f"{len(files) - len(headers)} of {len(files)} DICOM files"
-            self._warn(f"{left_out} hold no images or cannot be read, and were left out")
+            raise InputError(f"reading {path}: no DICOM file with images ({'; '.join(self.warnings[:1])})")
         single = [header for header in headers if not header.is_video and header.frames + header.missing == 1]
         several, series = len(headers) - len(single), {str(h.fields.get("SeriesInstanceUID", "")) for h in single}
         if several + len(series) > 1:
@@ -159,11 +153,8 @@ class Dicom(SourceDefaults):
 
 
 def _is_dicom(file: Path) -> bool:
-    """Whether a file is DICOM by its magic word or its ending, and not the directory of a medium."""
-    start = first_bytes(file, _META_BYTES)
-    is_directory = file.name.upper() == "DICOMDIR" or _DIRECTORY in start
-    has_magic = start[_PREAMBLE : _PREAMBLE + 4] == _MAGIC
-    return bool(start) and not is_directory and (has_magic or file.suffix.lower() == ".dcm")
+    """Whether a file is DICOM by its magic word, and not the directory of a medium."""
+    return file.name.upper() != "DICOMDIR" and first_bytes(file, _PREAMBLE + len(_MAGIC))[_PREAMBLE:] == _MAGIC
 
 
 def _files(folder: Path) -> list[Path]:

@@ -65,10 +65,7 @@ class EndoMapperSequence(PosedVideo):
         places = [self.path, *(folder / "Calibrations" / name for folder in above)]
         found = next((file for place in places if (file := place / f"{name}{_GEOMETRICAL}").is_file()), None)
         if found is None:
-            self.warnings.append(
-                f"{info.name} names {name}, but {name}{_GEOMETRICAL} is neither beside the video nor in "
-                f"Calibrations/{name} above it: the camera is assumed"
-            )
+            self.warnings.append(f"{name}{_GEOMETRICAL} ({info.name}) is not in Calibrations/{name}: camera assumed")
         return found
 
     def _take_poses(self, archive: Path) -> None:

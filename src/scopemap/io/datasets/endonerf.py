@@ -82,11 +82,9 @@ class EndoNerfFolder(ImageFolder):
         if at_rest:
             self.notes.append("the camera is at rest while the tissue moves: errors of the path say little here")
         if len(rows) != len(self.numbers):
-            counts = f"{file} holds {len(rows)} rows for {len(self.numbers)} images"
-            if not (at_rest and known.all()):
-                raise InputError(f"reading {counts}: rows belong to the images in their order; restore the images")
-            self._warn(f"{counts}; its poses are all the same and used for all images")
-            return dict.fromkeys(self.numbers, poses[0])
+            raise InputError(
+                f"reading {file}: it holds {len(rows)} rows for {len(self.numbers)} images, in whose order they are"
+            )
         return dict(zip(np.array(self.numbers)[known].tolist(), poses, strict=True))
 
 

@@ -108,9 +108,7 @@ class EndoSlamFolder(ImageFolder):
             image = rows[row, 0]
             if not (np.isfinite(image) and image >= 0 and image == int(image)):
                 raise InputError(f"{where[row]}: ImageFrame must be the number of an image, found {image:g}")
-            known = self.poses.setdefault(int(image), T)
-            if np.abs(known - T).max() > _SAME:
-                raise InputError(f"{where[row]}: image {int(image)} has another pose in an earlier row")
+            self.poses[int(image)] = T
         self.notes += [
             "poses: metres, as in the file; whether of camera or robot hand, and in which axes, is not documented",
             "poses: joined by ImageFrame = number in the image's name",
@@ -151,17 +149,10 @@ def _frame_files(path: Path) -> list[Path]:
 
 
 def _find_poses(folder: Path) -> Path | None:
-    """Return the file of poses in `folder`, which need not exist, or None; several are an `InputError`."""
-    for pattern in _POSE_FILES:
-        # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
-        files = (file for file in folder.glob(pattern) if not file.name.startswith((".", "~")))
-        found = sorted(file for file in files if file.is_file())
-        if len(found) > 1:
-            names = ", ".join(file.name for file in found[:5])
-            raise InputError(f"reading {folder}: it holds {len(found)} files of poses ({names}); leave one there")
-        if found:
-            return found[0]
-    return None
+    """Return the file of poses in `folder`, which need not exist, or None."""
+    # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
+    files = [file for pattern in _POSE_FILES for file in sorted(folder.glob(pattern))]
+    return next((file for file in files if file.is_file() and not file.name.startswith((".", "~"))), None)
 
 
 def _rate_hz(path: Path, camera: str) -> tuple[float, str]:

@@ -1,16 +1,13 @@
 """StereoMIS: da Vinci stereo video of porcine abdomens, poses from robot kinematics (Zenodo 8154924).
 
 One folder per recording: one `.mp4` with the left view above the right, `StereoCalibration.ini`, `groundtruth.txt` with
-rows `frame tx ty tz qx qy qz qw` (camera-to-world, metres, OpenCV axes), `masks/000001l.png`. Copies without the first
-column are read, too; there row = frame. Hayoz et al., "Learning how to robustly estimate camera pose in endoscopic
-videos", IJCARS 2023, arXiv 2304.08023.
+rows `frame tx ty tz qx qy qz qw` (camera-to-world, metres, OpenCV axes), `masks/000001l.png`. Hayoz et al.,
+"Learning how to robustly estimate camera pose in endoscopic videos", IJCARS 2023, arXiv 2304.08023.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-
-import numpy as np
 
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
@@ -53,32 +50,24 @@ class StereoMisFolder(PosedVideo):
         return (path / _CALIBRATION).is_file() and bool(videos_in(path, ".mp4"))
 
     def _read_poses(self, file: Path) -> None:
-        """Read rows of 8 numbers, the first the frame, or of 7, in any order; numbers from 1 count frames from 1.
+        """Read rows of 8 numbers, the first the frame, in any order; numbers from 1 count frames from 1.
 
         A row that holds NaN or infinity is a frame without a pose. Raises `InputError`, with the line, for what is no
         such row, and for a frame that comes again.
         """
-        table = read_numbers(file, missing=True)
-        rows, columns = table.values.shape
-        if columns not in (7, 8):
-            expected = "frame tx ty tz qx qy qz qw, or the last 7"
-            raise InputError(f"{table.where[0]}: found {columns} columns, expected {expected}")
-        numbers, offset, base = np.arange(rows), 0, "the rows have no frame numbers: row = frame, from 0"
-        if columns == 8:
-            table = table.sorted_by_stamp()
-            numbers = table.values[:, 0]
-            if not are_frame_numbers(numbers) or numbers[0] < 0:
-                raise InputError(f"reading {file}: the first column of 8 must be frame numbers, found {numbers[0]:g}")
-            offset = int(numbers[0] == 1)
-            base = f"row {offset} is the video's first frame"
+        table = read_numbers(file, missing=True).with_columns(8, "frame tx ty tz qx qy qz qw").sorted_by_stamp()
+        numbers = table.values[:, 0]
+        if not are_frame_numbers(numbers) or numbers[0] < 0:
+            raise InputError(f"reading {file}: the first column of 8 must be frame numbers, found {numbers[0]:g}")
+        offset = int(numbers[0] == 1)
         poses = poses_by_row(table.values[:, -7:], _MM_PER_METRE, table.where)
         self.poses = {int(numbers[row]) - offset: pose for row, pose in poses.items()}
         self.notes.append(
-            f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; {base}; no depth is known"
+            f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; row {offset} is the video's first "
+            "frame; no depth is known"
         )
-        beyond = self._beyond()
-        if beyond or (columns == 7 and self.count is not None and rows != self.count):
+        if self._beyond():
             self.warnings.append(
-                f"{file}: it holds {rows} rows, {beyond} of them beyond the {self.count} frames of the video; poses "
-                "may belong to other frames"
+                f"{file}: {self._beyond()} of its {len(numbers)} rows are beyond the {self.count} frames of the video; "
+                "poses may belong to other frames"
             )
