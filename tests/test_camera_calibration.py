@@ -38,7 +38,7 @@ def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
         search.looked_at += 1
         if corners is not None:
             width_px = edge_width_px(grey, corners.pixels)
-            search.views.append(BoardView(index, f"{index}.png", corners, width_px, corners))
+            search.views.append(BoardView(index, f"{index}.png", corners, width_px))
     return search
 
 
@@ -118,7 +118,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
             # By so much the plate bends from view to view: errors of the corners of one view are alike.
             pixels = studio.corners_px(pose, bow_mm=rng.normal(0, 0.05))
             corners = Corners(CHECKERBOARD.corners_mm, pixels + rng.normal(0, 0.05, pixels.shape))
-            views.append(BoardView(i, "", corners, 1.0, corners))
+            views.append(BoardView(i, "", corners, 1.0))
         fit = with_deviations(fit_camera(views, SIZE, form, near=PINHOLE), views)
         off = np.array(list(fit.parameters.values())) - true
         shares.append(off / np.array(list(fit.deviations.values())))
@@ -145,11 +145,10 @@ def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pi
         pixels = view.corners.pixels.copy()
         pixels[:2] += [7.0, -4.0]
         corners = Corners(view.corners.board_mm, pixels)
-        spoiled.append(replace(view, corners=corners, found=corners))
+        spoiled.append(replace(view, corners=corners))
     searched_again = replace_views(pinhole_search, [*spoiled, *list(views.values())[3:]])
     done = calibrate(searched_again, CHECKERBOARD, "pinhole")
     assert [view.index for view in done.views] == list(views)
-    assert done.stray_corners >= 6
     for view in spoiled:
         kept = next(each for each in done.views if each.index == view.index).corners.pixels
         assert not any((kept == pixel).all(axis=1).any() for pixel in view.corners.pixels[:2])
@@ -193,12 +192,11 @@ def test_the_summary_says_where_the_boards_were(pinhole: CameraCalibration) -> N
 def test_views_that_show_the_same_count_once(pinhole_search: Search) -> None:
     sharp = [view for view in pinhole_search.views if view.index < 100]
     again = [replace(view, index=1000 * k + view.index) for k in range(5) for view in sharp]
-    selected = select_views(again, SIZE)
-    assert len(selected.views) == len({view.index % 1000 for view in selected.views}) <= len(sharp)
-    assert selected.alike == len(again) - len(selected.views)
-    few = select_views(sharp, SIZE, most=5)
-    assert len(few.views) == 5
-    spread = np.ptp([view.corners.pixels.mean(axis=0) for view in few.views], axis=0)
+    selected, _ = select_views(again, SIZE)
+    assert len(selected) == len({view.index % 1000 for view in selected}) <= len(sharp)
+    few, _ = select_views(sharp, SIZE, most=5)
+    assert len(few) == 5
+    spread = np.ptp([view.corners.pixels.mean(axis=0) for view in few], axis=0)
     assert (spread > 0.25 * np.array(SIZE)).all()
 
 

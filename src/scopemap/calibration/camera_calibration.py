@@ -39,10 +39,9 @@ class CameraCalibration:
 
     Attributes
     ----------
-    fit : the camera, and the poses of the target. views : those it was fitted to, in the input's order.
+    fit, views : the camera and the poses of the target, and the views that they were fitted to, in the input's order.
     held_out_px : error of every form tried, in views that it was not fitted to, px.
-    left_out : views that do not fit. blurred : views that are blurred.
-    alike : number of views that were not used because another one shows the same.
+    left_out, blurred : views that do not fit, and views that are not sharp.
     coverage : share of the image within targets.
     warnings : shortcomings to know before use.
     """
@@ -52,14 +51,8 @@ class CameraCalibration:
     held_out_px: dict[LensForm, float]
     left_out: list[LeftOut]
     blurred: list[LeftOut]
-    alike: int
     coverage: float
     warnings: list[str]
-
-    @property
-    def stray_corners(self) -> int:
-        """Number of corners of the views that were left out, as they do not fit."""
-        return sum(len(view.found) - len(view.corners) for view in self.views)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and texts: px, mm, degrees."""
@@ -87,8 +80,6 @@ class CameraCalibration:
             ],
             "left_out": [out.summary() for out in self.left_out],
             "blurred": [out.summary() for out in self.blurred],
-            "alike": self.alike,
-            "stray_corners": self.stray_corners,
             "warnings": self.warnings,
         }
 
@@ -106,17 +97,17 @@ def calibrate(
     seen = f"the board was found in {found} of {search.looked_at} frames"
     if found < FEWEST_VIEWS:
         raise _too_few(seen, f"looked for a {target.described}; is it this one, and whole in the picture?")
-    selected = select_views(search.views, size)
-    if len(selected.views) < FEWEST_VIEWS:
-        differ = f"but {len(selected.views)} of these views are sharp and differ"
+    selected, blurred = select_views(search.views, size)
+    if len(selected) < FEWEST_VIEWS:
+        differ = f"but {len(selected)} of these views are sharp and differ"
         raise _too_few(f"{seen}, {differ}", "move the board through the picture and tilt it")
     forms = [form for form in FORMS if model in ("auto", form.model)]
-    flexible = _flexible_fits(selected.views, size, forms)
+    flexible = _flexible_fits(selected, size, forms)
     best = min(flexible.values(), key=lambda fit: float(np.median(fit.view_rms_px)))
-    views, out = without_outliers(selected.views, size, best.form)
+    views, out = without_outliers(selected, size, best.form)
     views.sort(key=lambda view: view.index)
     if len(views) < FEWEST_VIEWS:
-        agree = f"{seen}, but only {len(views)} of {len(selected.views)} views agree"
+        agree = f"{seen}, but only {len(views)} of {len(selected)} views agree"
         raise _too_few(agree, "is the board flat and the zoom untouched?")
     near = {model: fit.camera for model, fit in flexible.items()}
     errors = {form: held_out_error_px(views, size, form, near[form.model]) for form in forms if form.model in near}
@@ -124,7 +115,7 @@ def calibrate(
     fit = with_deviations(fit_camera(views, size, form, near[form.model]), views)
     covered = float((views_per_pixel(views, size) > 0).mean())
     warnings = warnings_about(fit, covered)
-    return CameraCalibration(fit, views, errors, out, selected.blurred, selected.alike, covered, warnings)
+    return CameraCalibration(fit, views, errors, out, blurred, covered, warnings)
 
 
 def save_calibration(calibration: CameraCalibration, file: Path) -> None:

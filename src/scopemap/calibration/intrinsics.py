@@ -62,10 +62,7 @@ FORMS = (
 class Fit:
     """A camera, and the poses of the target in its views.
 
-    Attributes
-    ----------
-    form : the free coefficients.
-    T_camera_board : (V, 4, 4), mm, of the V views, in their order.
+    form : the free coefficients. T_camera_board : (V, 4, 4), mm, of the V views, in their order.
     residuals_px : V arrays (N, 2), corner seen minus corner projected; NaN beyond the field of the lens.
     deviations : standard deviations of fx, fy, cx, cy (px) and the free coefficients; empty before `with_deviations`.
     """

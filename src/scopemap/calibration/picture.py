@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 # The longer residuals are drawn this share of the picture's width long.
 _DRAWN_SHARE = 0.04
 _LONGER_PERCENT = 95
-_MOST_LABELS = 25
 
 
 def draw_calibration(calibration: CameraCalibration, file: Path) -> None:
@@ -66,12 +65,8 @@ def _draw_errors(axes: Axes, calibration: CameraCalibration, colours: np.ndarray
     places = np.arange(len(calibration.views))
     axes.bar(places, calibration.fit.view_rms_px, color=colours)
     axes.axhline(calibration.fit.rms_px, color="black", linestyle="--", linewidth=1)
-    step = -(-len(places) // _MOST_LABELS)
-    axes.set_xticks(places[::step], [str(view.index) for view in calibration.views[::step]], rotation=90, fontsize=8)
+    axes.set_xticks(places, [str(view.index) for view in calibration.views], rotation=90, fontsize=7)
     axes.set_xlabel("frame")
     axes.set_ylabel("reprojection error, px RMS")
-    axes.set_title(
-        f"{len(places)} views used, {calibration.alike} alike, {len(calibration.blurred)} blurred, "
-        f"{len(calibration.left_out)} unfit; dashed: all",
-        fontsize=10,
-    )
+    unused = f"{len(calibration.blurred)} blurred, {len(calibration.left_out)} unfit"
+    axes.set_title(f"{len(places)} views used, {unused}; dashed: all", fontsize=10)

@@ -22,18 +22,11 @@ _SEARCH_SIDE_PX = 800
 # off, the lens bends the edges.
 _REACH_PX, _REACH_SHARE, _REACH_SQUARES = 8, 1 / 160, 0.4
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners of a target in an image.
-
-    Attributes
-    ----------
-    board_mm : (N, 3) float64, on the target, z = 0.
-    pixels : (N, 2) float64, in the image.
-    """
+    """Corners of a target: `board_mm` (N, 3) float64, on the target, z = 0; `pixels` (N, 2) float64, in the image."""
 
     board_mm: np.ndarray
     pixels: np.ndarray
@@ -85,14 +78,12 @@ class Checkerboard:
     def find(self, grey: np.ndarray) -> Corners | None:
         """Return all corners, None where one is missing.
 
-        Found by Duda and Frese (BMVC 2018), else by OpenCV's older search; refined to subpixels in the full image.
+        Found by Duda and Frese (BMVC 2018) and refined to subpixels in the full image.
         """
         shrink = min(1.0, _SEARCH_SIDE_PX / max(grey.shape))
         small = grey if shrink == 1 else cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         size = (self.columns, self.rows)
         found, pixels = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        if not found:
-            found, pixels = cv2.findChessboardCorners(small, size, flags=_CLASSIC)
         if not found:
             return None
         scale = np.array(grey.shape[::-1]) / small.shape[::-1]

@@ -28,32 +28,17 @@ Listener = Callable[[int, int | None], None]
 
 @dataclass(frozen=True)
 class BoardView:
-    """The target in one frame.
-
-    Attributes
-    ----------
-    index : number of the frame in the input. name : the frame's file, or "".
-    corners : the corners in use. found : all corners that were found.
-    edge_px : width of the edges between black and white, px.
-    """
+    """The target in one frame: number and file ("" for none) of the frame, corners, width of their edges in px."""
 
     index: int
     name: str
     corners: Corners
     edge_px: float
-    found: Corners
 
 
 @dataclass
 class Search:
-    """The views found in an input.
-
-    Attributes
-    ----------
-    size : width and height of the frames, px.
-    every : one in so many frames was searched. looked_at : number of frames searched.
-    views : the views found.
-    """
+    """The views in frames of `size` (width, height) px, of which one in `every` was searched, `looked_at` in all."""
 
     size: tuple[int, int]
     every: int = 1
@@ -71,15 +56,6 @@ class LeftOut:
     def summary(self) -> dict[str, Any]:
         """Return the frame's number and name, and the reason."""
         return {"frame": self.view.index, "name": self.view.name, "reason": self.reason}
-
-
-@dataclass(frozen=True)
-class Selected:
-    """Views to calibrate with; those that were blurred; the number of those like a selected one."""
-
-    views: list[BoardView]
-    blurred: list[LeftOut]
-    alike: int
 
 
 def find_views(
@@ -107,8 +83,7 @@ def find_views(
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = target.find(grey)
         if corners is not None:
-            width_px = edge_width_px(grey, corners.pixels)
-            search.views.append(BoardView(frame.index, frame.name, corners, width_px, corners))
+            search.views.append(BoardView(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels)))
         if listener is not None:
             listener(search.looked_at, total)
     return search
@@ -126,14 +101,14 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(np.median(widths))
 
 
-def select_views(views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS) -> Selected:
-    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, best first.
+def select_views(
+    views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS
+) -> tuple[list[BoardView], list[LeftOut]]:
+    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, and those that are blurred.
 
     The next view is the one with most new cells of the image under its corners and the greatest distance, in position,
     size and tilt, from those that were taken.
     """
-    if not views:
-        return Selected([], [], 0)
     edge_px = np.array([view.edge_px for view in views])
     usual = float(np.percentile(edge_px, 25))
     limit = max(_BLURRED * usual, usual + _BLURRED_PX)
@@ -155,7 +130,7 @@ def select_views(views: list[BoardView], size: tuple[int, int], most: int = _MOS
         chosen.append(best)
         covered |= cells[best]
         distance = np.minimum(distance, np.linalg.norm(pose - pose[best], axis=1))
-    return Selected([sharp[i] for i in chosen], blurred, len(sharp) - len(chosen))
+    return [sharp[i] for i in chosen], blurred
 
 
 def views_per_pixel(views: list[BoardView], size: tuple[int, int], across: int = 160) -> np.ndarray:
@@ -169,19 +144,10 @@ def views_per_pixel(views: list[BoardView], size: tuple[int, int], across: int =
 
 
 def _pose(view: BoardView, size: tuple[int, int]) -> np.ndarray:
-    """Position (2), log size and tilt (2) of the target, all about 1 at most, from the homography to the image."""
-    board, pixels = view.corners.board_mm[:, :2], view.corners.pixels
-    centre, extent = board.mean(axis=0), float(np.linalg.norm(np.ptp(board, axis=0)))
-    image = float(np.sqrt(size[0] * size[1]))
-    H, _ = cv2.findHomography((board - centre) / extent, pixels / image)
-    if H is None:
-        return np.array([*(pixels.mean(axis=0) / image), 0, 0, 0])
-    jacobian = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
-    # The direction of the image in which the target recedes, however it is rotated in its plane.
-    recedes = jacobian @ H[2, :2]
-    tilt = recedes / max(float(np.linalg.norm(recedes)), 1e-12) * float(np.linalg.norm(H[2, :2]))
-    log_size = 0.5 * float(np.log(max(abs(np.linalg.det(jacobian)), 1e-12)))
-    return np.array([*H[:2, 2], log_size, *tilt])
+    """Position (2), log extent, and elongation (2), which changes with the tilt, of the target in the image."""
+    pixels = view.corners.pixels / np.sqrt(size[0] * size[1])
+    (xx, xy), (_, yy) = np.cov(pixels.T)
+    return np.array([*pixels.mean(axis=0), 0.5 * np.log(xx + yy), (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
 
 
 def _cells(view: BoardView, size: tuple[int, int]) -> np.ndarray:

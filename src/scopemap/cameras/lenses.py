@@ -91,9 +91,6 @@ class _RadialLens(ABC):
 class OpenCvCamera(_RadialLens):
     """OpenCV's radial-tangential lens, `cv2.projectPoints` (Brown 1966).
 
-    Attributes
-    ----------
-    plane : focal lengths, principal point and image size, px.
     distortion : k1 k2 p1 p2 [k3 [k4 k5 k6]] in OpenCV's order.
     """
 
@@ -140,9 +137,6 @@ class FisheyeCamera(_RadialLens):
 
     The angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
 
-    Attributes
-    ----------
-    plane : focal lengths, principal point and image size, px.
     distortion : k1 k2 k3 k4.
     """
 
@@ -167,10 +161,8 @@ class FovCamera(_RadialLens):
 
     The distance r from the axis on the plane z = 1 becomes atan(2 r tan(omega / 2)) / omega.
 
-    Attributes
-    ----------
-    plane : takes the distorted plane to pixels: scales (fx, fy), principal point and image size, px.
-    omega : the lens' angle of view in the model, rad, 0 < omega < pi.
+    plane : scales (fx, fy) that take the distorted plane to pixels. omega : the lens' angle of view in the model, rad,
+    0 < omega < pi.
     """
 
     omega: float
@@ -200,12 +192,8 @@ class OmnidirectionalCamera:
     With (u'', v'') = inverse of [[c, d], [e, 1]] times (u - cx, v - cy), and rho the length of that, the ray is
     (u'', v'', a0 + a1 rho + a2 rho^2 + ...).
 
-    Attributes
-    ----------
-    polynomial : a0 > 0, a1 (0 in practice), a2, ... in px.
+    polynomial : a0 > 0, a1 (0 in practice), a2, ... in px. stretch : c, d, e.
     cx, cy : principal point, px (top-left pixel centre is 0, 0; MATLAB's values are larger by 1).
-    width, height : image size, px.
-    stretch : c, d, e.
     """
 
     polynomial: tuple[float, ...]

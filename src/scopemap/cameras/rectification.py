@@ -61,11 +61,9 @@ class Rectifier:
     @cached_property
     def only_resizes(self) -> bool:
         """Whether source and target are the same view at two sizes."""
-        if not isinstance(self.source, PinholeCamera):
-            return False
-        same = self.source.resized(self.target.width, self.target.height)
-        pairs = [(same.fx, self.target.fx), (same.fy, self.target.fy), (same.cx, self.target.cx)]
-        return all(abs(a - b) < 1e-6 for a, b in [*pairs, (same.cy, self.target.cy)])
+        same = self.source.central.resized(self.target.width, self.target.height)
+        is_pinhole = isinstance(self.source, PinholeCamera)
+        return is_pinhole and np.allclose(same.matrix, self.target.matrix, rtol=0, atol=1e-6)
 
     def source_pixel(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return source pixels (..., 2) of target pixels `u`, `v` (...); NaN where the source has none."""
@@ -131,10 +129,7 @@ class Rectifier:
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """A depth camera beside the camera of the images.
-
-    camera : of the depth files. T_colour_depth : (4, 4), mm, takes its points to the camera of the images.
-    """
+    """A depth camera; T_colour_depth (4, 4), mm, takes its points to the camera of the images beside it."""
 
     camera: PinholeCamera
     T_colour_depth: np.ndarray

@@ -166,10 +166,7 @@ def _print(done: CameraCalibration) -> None:
     console.print(table)
     for out in facts["left_out"]:
         typer.echo(f"left out: frame {out['frame']}, {out['reason']}")
-    typer.echo(
-        f"left out besides: {len(done.blurred)} blurred view(s), {done.alike} that show what another one shows, "
-        f"{done.stray_corners} corner(s) that do not fit"
-    )
+    typer.echo(f"left out besides: {len(done.blurred)} blurred view(s), and views that show what another one shows")
     typer.echo(
         f"model: {done.fit.form.described}; {done.fit.rms_px:.3f} px RMS over {len(done.views)} views, which cover "
         f"{100 * done.coverage:.0f} % of the picture"

@@ -23,10 +23,7 @@ MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 class Trajectory:
     """Camera poses over time; lost frames stay in it.
 
-    Attributes
-    ----------
-    indices : (N,) int64 frame numbers, ascending.
-    times_s : (N,) float64 time stamps, s; index / 30 where the file gave none.
+    indices : (N,) int64 frame numbers, ascending. times_s : (N,) float64, s; index / 30 where the file gave none.
     T_world_camera : (N, 4, 4) float64 camera-to-world, mm, OpenCV axes; a lost frame repeats the last pose.
     status : (N,) of str: "initial", "ok" or "lost".
     has_indices : False where the file gave only times; `indices` then are row numbers and match nothing.

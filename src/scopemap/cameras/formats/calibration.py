@@ -26,14 +26,10 @@ _FOCAL_RATIO = (0.2, 5.0)
 class Calibration:
     """A camera and where it is from.
 
-    Attributes
-    ----------
-    camera : camera model.
     depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it.
-    source : how the camera is known, one phrase.
-    size_origin : where the size of `camera` is from. stated: the file. images: the file has none, and that of the
-        images was taken. relative: as images, and the file's numbers are shares of the size.
-    file : the file, None where there is none.
+    source : how the camera is known, one phrase. file : the file, None where there is none.
+    size_origin : where the size of `camera` is from. stated: the file. images: the file has none. relative: as images,
+        and the file's numbers are shares of the size.
     """
 
     camera: CameraModel
@@ -122,21 +118,17 @@ def rescaled_note(camera: CameraModel, scaled: CameraModel) -> str:
 
 def check_plausible(camera: CameraModel, name: str) -> None:
     """Raise `CalibrationError` where no endoscope has such a camera for images of its size."""
-    central = camera.central
-    width, height = camera.width, camera.height
+    central, width, height = camera.central, camera.width, camera.height
     least, most = (share * width for share in _FOCAL_PER_WIDTH)
     narrow, wide = _FOCAL_RATIO
     # Written so that NaN is refused, too.
+    fault = ""
     if not least < central.fx < most or not narrow < central.fy / central.fx < wide:
-        raise CalibrationError(
-            f"{name} does not fit images of {width}x{height} px: focal length {central.fx:g}, {central.fy:g} px "
-            f"(plausible: {least:g} to {most:g})"
-        )
-    if not (0 <= central.cx < width and 0 <= central.cy < height):
-        raise CalibrationError(
-            f"{name} does not fit images of {width}x{height} px: its principal point {central.cx:g}, {central.cy:g} "
-            "is outside; it was made for larger images or for a crop"
-        )
+        fault = f"focal length {central.fx:g}, {central.fy:g} px (plausible: {least:g} to {most:g})"
+    elif not (0 <= central.cx < width and 0 <= central.cy < height):
+        fault = f"its principal point {central.cx:g}, {central.cy:g} is outside; it was made for a larger image"
+    if fault:
+        raise CalibrationError(f"{name} does not fit images of {width}x{height} px: {fault}")
 
 
 def _scaled(calibration: Calibration, image_size: Size) -> Calibration:

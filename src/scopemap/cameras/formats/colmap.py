@@ -62,14 +62,9 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """An image of a model.
+    """An image of a model: path below the folder of the images, camera, qw qx qy qz tx ty tz world to camera, place.
 
-    Attributes
-    ----------
-    name : its path below the folder of the images, as written.
-    camera : number of its camera.
-    values : qw qx qy qz tx ty tz, world to camera, in units of the model.
-    where : file and place in it, for errors.
+    `where` is the file and the place in it, for errors.
     """
 
     name: str
@@ -162,19 +157,15 @@ def is_cameras_binary(content: bytes) -> bool:
     """Whether content begins as `cameras.bin` does: a count, then a camera of a known model."""
     if len(content) < _COUNT.size + _CAMERA.size:
         return False
-    (count,) = _COUNT.unpack_from(content)
-    _, model, width, height = _CAMERA.unpack_from(content, _COUNT.size)
+    (count,), (_, model, width, height) = _COUNT.unpack_from(content), _CAMERA.unpack_from(content, _COUNT.size)
     return bool(0 < count <= len(content) and 0 <= model < len(_PARAMETERS) and width and height)
 
 
 def is_image_line(line: str) -> bool:
     """Whether a line of text gives the pose of an image: nine numbers, then a name; lines of points are all numbers."""
-    fields = line.split(maxsplit=_FIELDS_BEFORE_NAME)
-    return (
-        len(fields) > _FIELDS_BEFORE_NAME
-        and all(_is_number(field) for field in fields[:_FIELDS_BEFORE_NAME])
-        and not _is_number(fields[_FIELDS_BEFORE_NAME].split()[0])
-    )
+    *numbers, name = line.split(maxsplit=_FIELDS_BEFORE_NAME) or [""]
+    is_row = len(numbers) == _FIELDS_BEFORE_NAME and all(map(_is_number, numbers))
+    return is_row and not _is_number(name.split()[0])
 
 
 def only_camera(file: Path) -> CameraModel:
@@ -250,7 +241,8 @@ def _binary_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
             raise ValueError(f"camera {key} is of an unknown model, number {model}; {_ADVICE}")
         parameters = _taken(stream, Struct(f"<{_PARAMETERS[models[model]]}d"))
         yield key, ModelCamera(models[model], width, height, parameters)
-    _check_end(stream)
+    if stream.read(1):
+        raise ValueError("bytes are left after the last entry; it is damaged")
 
 
 def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
@@ -296,7 +288,8 @@ def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
         (points,) = _taken(stream, _COUNT)
         _skip(stream, _POINT_BYTES * points)
         yield ModelImage(name.decode(), camera, tuple(values), f"{where}, image {position + 1}")
-    _check_end(stream)
+    if stream.read(1):
+        raise ValueError("bytes are left after the last entry; it is damaged")
 
 
 def _taken(stream: IO[bytes], form: Struct) -> tuple:
@@ -314,11 +307,6 @@ def _skip(stream: IO[bytes], size: int) -> None:
         if not piece:
             raise ValueError("it is cut off; write the model anew")
         size -= piece
-
-
-def _check_end(stream: IO[bytes]) -> None:
-    if stream.read(1):
-        raise ValueError("bytes are left after the last entry; it is damaged")
 
 
 def _is_number(text: str) -> bool:

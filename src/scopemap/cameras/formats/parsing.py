@@ -37,13 +37,11 @@ def calibration_bytes(file: Path) -> bytes:
     try:
         if not file.is_file():  # a pipe would be waited for
             raise OSError("there is no such file" if not file.exists() else "it is no file")
-        with file.open("rb") as opened:
-            content = opened.read(_MAX_BYTES + 1)
+        if file.stat().st_size > _MAX_BYTES:
+            raise OSError(f"it is larger than any calibration: more than {_MAX_BYTES} bytes")
+        return file.read_bytes()
     except (OSError, ValueError) as error:
         raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
-    if len(content) > _MAX_BYTES:
-        raise CalibrationError(f"the calibration {file} is larger than any calibration: more than {_MAX_BYTES} bytes")
-    return content
 
 
 class Fields:

@@ -84,11 +84,10 @@ def _is_matrix(rows: list[list[float]], values: list[float]) -> bool:
 def _of_ocamcalib(rows: list[list[float]]) -> OmnidirectionalCamera:
     """Return the camera of the toolbox' `calib_results.txt` (Scaramuzza et al., IROS 2006).
 
-    Its lines: `n a0 a1 ...`, the polynomial from the pixel to the ray; `n b0 b1 ...`, its inverse, which is not used
-    here; `row column`, the centre, from 0; `c d e`, the affine part; `height width`. The toolbox' axes are x down, y
-    right, z backwards, and its affine matrix [[c, d], [e, 1]] takes (down, right) to (row, column). With right before
-    down it is [[1, e], [d, c]], and divided by its last entry what our camera has; rho, and with it the polynomial's
-    argument, is c times the toolbox' then.
+    Its lines: `n a0 a1 ...`, the polynomial; `n b0 b1 ...`, its inverse, which is not used; `row column`, the centre,
+    from 0; `c d e`; `height width`. Its axes are x down, y right, z backwards, and [[c, d], [e, 1]] takes (down, right)
+    to (row, column). With right before down that is [[1, e], [d, c]], divided by c what our camera has; rho is c times
+    the toolbox' then.
     """
     (_, *polynomial), _, (row, column), (c, d, e), (height, width) = rows
     size = check_size(width, height)

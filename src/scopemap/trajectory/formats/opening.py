@@ -38,9 +38,8 @@ def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Tra
     """Read a trajectory of any format, which its content tells; its `source` states what was assumed.
 
     The kinds, their conventions and units are listed in docs/formats.md, "Trajectories". `unit` is that of a file that
-    neither states nor fixes one. TUM time stamps that are all integers below 1e9 are frame numbers, unless the header
-    says `time: s`. Where content fits two readings, the error asks for `kind`. Raises `InputError` with the line or
-    frame at fault, `SettingsError` for an unknown `kind`.
+    neither states nor fixes one. Raises `InputError` with the line or frame at fault, and where content fits two kinds;
+    `SettingsError` for an unknown `kind`.
     """
     path = Path(path)
     if kind not in KINDS:

@@ -81,8 +81,7 @@ def fields_of(line: str) -> list[str]:
 def read_rows(path: Path, *, missing: bool = False) -> list[tuple[int, list[float]]]:
     """Return line number, from 1, and numbers of each line that is neither empty nor a comment.
 
-    `missing` allows NaN and infinity, which mark a frame without a pose. Raises `InputError`, with the line, at
-    anything but numbers, and where there is no row.
+    `missing` allows NaN and infinity. Raises `InputError`, with the line, for other text, and where there is no row.
     """
     rows = []
     for number, line in enumerate(text_lines(path), start=1):
@@ -151,8 +150,7 @@ def read_kitti(path: Path, unit: Unit) -> Trajectory:
 def read_c3vd(path: Path, unit: Unit) -> Trajectory:
     """Read C3VD's `pose.txt`, 16 numbers a line, always mm; `unit` is not used.
 
-    C3VD stores the transposed matrix, its documentation says row-major; which of both a file holds is decided once,
-    over all its lines (with no translation at all they look alike: taken as stored).
+    C3VD stores the transposed matrix, its documentation says row-major; which of both is decided over all lines.
     """
     table = read_numbers(file_of(path, ("pose.txt",))).with_columns(16, "C3VD's pose.txt")
     T = table.values.reshape(-1, 4, 4)
