@@ -18,8 +18,7 @@ from scipy.stats import spearmanr
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
 from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher
-from scopemap.evaluation.depth import evaluate_depth
-from scopemap.evaluation.depth_sequence import depth_scale, scale_jitter
+from scopemap.evaluation.depth import depth_scale, evaluate_depth, scale_jitter
 from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -301,8 +300,8 @@ def steadiness(
         previous_mm = current_mm
     report = meter.report()
     log_std = scale_jitter(np.array(scales)).log_std
-    flow = report.along_flow
-    return Steadiness(report.pairs, log_std, flow.relative, flow.rtc, report.opw.relative)
+    flow = report["along_flow"]
+    return Steadiness(report["pairs"], log_std, flow["relative"], flow["rtc"], report["opw"]["relative"])
 
 
 def _mean(values: np.ndarray | Sequence[float]) -> float:

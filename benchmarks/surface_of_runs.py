@@ -108,7 +108,9 @@ def phantom_rows(folder: Path, data: Path, settings: dict[str, Any]) -> Iterator
             ate_mm, mesh = aligned(result, source)
             surface = compare_surfaces(mesh, trimesh.load_mesh(source / "mesh_truth.ply"))
             errors = depth_errors(truths_mm, DepthReader(folder / "run"))
-            yield row(f"{name}, {variant}", ate_mm, errors, (surface.accuracy.mean_mm, surface.completeness.mean_mm))
+            yield row(
+                f"{name}, {variant}", ate_mm, errors, (surface["accuracy_mean_mm"], surface["completeness_mean_mm"])
+            )
 
 
 def clip_rows(folder: Path, data: Path, settings: dict[str, Any]) -> Iterator[str]:

@@ -23,11 +23,10 @@ from scopemap.benchmark.tables import PublishedTable, benchmark_tables, publishe
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.evaluation.consistency import ConsistencyMeter
-from scopemap.evaluation.depth import DepthReport
-from scopemap.evaluation.depth_sequence import scale_jitter
+from scopemap.evaluation.depth import DepthReport, scale_jitter
 from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import PoseReport, match
-from scopemap.evaluation.surface import DistanceSummary, compare_surfaces
+from scopemap.evaluation.surface import compare_surfaces, distance_figures
 
 NAN = float("nan")
 PAPER_FIGURES = paper_figures(match(*(as_trajectory(poses) for poses in vector_a()), "sim3"))
@@ -230,13 +229,13 @@ def test_without_the_papers_figures_there_are_no_tables_1_to_3() -> None:
 
 def test_every_column_names_a_figure_that_is_measured() -> None:
     plane = np.stack([*np.meshgrid(np.arange(5.0), np.arange(5.0)), np.zeros((5, 5))], axis=-1).reshape(-1, 3)
-    surface = compare_surfaces(plane, plane).figures | {"normal_consistency": 1.0}
-    surface |= DistanceSummary.of(np.ones(3)).figures("accuracy_icp")
+    surface = compare_surfaces(plane, plane) | {"normal_consistency": 1.0}
+    surface |= distance_figures("accuracy_icp", np.ones(3))
     measured: dict[str, Any] = {
         "poses": {field.name: 0 for field in fields(PoseReport)},
         "paper": PAPER_FIGURES,
         "depth": {field.name: 0 for field in fields(DepthReport)} | {"jitter": asdict(scale_jitter(np.ones(3)))},
-        "consistency": asdict(ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report()) | {"flow": "dis"},
+        "consistency": ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report() | {"flow": "dis"},
         "surface": surface,
     }
     rows = summarise(RESULTS)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,15 @@ from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose,
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
-from scopemap.evaluation.consistency import ConsistencyMeter, ConsistencyReport, DepthFrame
+from scopemap.evaluation.consistency import (
+    ConsistencyMeter,
+    DepthFrame,
+    alignment_errors,
+    depth_change,
+    mean_change,
+    projected_depth,
+)
 from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher, have_same_colour
-from scopemap.evaluation.depth_change import alignment_errors, depth_change, mean_change, projected_depth
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
 from scopemap.io.opening import open_sequence
 
@@ -38,7 +45,7 @@ def measure(
     factors: list[float] | None = None,
     told_poses: list[np.ndarray] | None = None,
     flow_sign: float = 1.0,
-) -> ConsistencyReport:
+) -> dict[str, Any]:
     """Measure exact depth, times a factor per frame, with the true poses as reference or those that are told."""
     views = [see(T) for T in poses]
     meter = ConsistencyMeter(CAMERA)
@@ -49,7 +56,7 @@ def measure(
     return meter.report()
 
 
-def same(a: ConsistencyReport, b: ConsistencyReport) -> bool:
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
     return repr(a) == repr(b)
 
 
@@ -58,44 +65,44 @@ def same(a: ConsistencyReport, b: ConsistencyReport) -> bool:
 
 def test_identical_frames_differ_by_nothing() -> None:
     report = measure(STILL)
-    for change in (report.same_pixel, report.along_flow, report.opw, report.opw_reference):
-        assert (change.pairs, change.mean_mm, change.relative, change.rtc) == (3, 0, 0, 1)
-    assert (report.tae_reference.pairs, report.tae_reference.percent) == (3, pytest.approx(0, abs=1e-4))
-    assert (report.jitter.log_std, report.jitter.log_step) == (0, 0)
-    assert report.orb_reference.pairs == 3
-    assert report.orb_reference.matches > 300
-    assert (report.orb_reference.mean_mm, report.orb_camera.mean_mm) == (0, 0)
+    for change in (report["same_pixel"], report["along_flow"], report["opw"], report["opw_reference"]):
+        assert (change["pairs"], change["mean_mm"], change["relative"], change["rtc"]) == (3, 0, 0, 1)
+    assert (report["tae_reference"]["pairs"], report["tae_reference"]["percent"]) == (3, pytest.approx(0, abs=1e-4))
+    assert (report["jitter"]["log_std"], report["jitter"]["log_step"]) == (0, 0)
+    assert report["orb_reference"]["pairs"] == 3
+    assert report["orb_reference"]["matches"] > 300
+    assert (report["orb_reference"]["mean_mm"], report["orb_camera"]["mean_mm"]) == (0, 0)
 
 
 def test_exact_depth_of_a_plane_passed_sideways_is_consistent() -> None:
     report = measure(ASIDE)
-    assert report.tae_reference.percent < 1e-3
-    assert report.opw.mean_mm < 1e-4
-    assert report.orb_reference.median_mm < 1e-3
-    assert report.orb_camera.median_mm == pytest.approx(SIX_PIXELS_MM, rel=1e-3)
+    assert report["tae_reference"]["percent"] < 1e-3
+    assert report["opw"]["mean_mm"] < 1e-4
+    assert report["orb_reference"]["median_mm"] < 1e-3
+    assert report["orb_camera"]["median_mm"] == pytest.approx(SIX_PIXELS_MM, rel=1e-3)
 
 
 def test_approach_is_change_of_depth_until_the_poses_explain_it() -> None:
     report = measure(FORWARD)
-    for change in (report.same_pixel, report.along_flow, report.opw):
-        assert change.mean_mm == pytest.approx(2, rel=1e-4)
-        assert change.relative == pytest.approx((2 / 48 + 2 / 46) / 2, rel=1e-4)
-        assert change.rtc == 0
-    assert report.opw_reference.mean_mm < 1e-3
-    assert report.opw_reference.rtc == 1
-    assert report.tae_reference.percent < 1e-3
+    for change in (report["same_pixel"], report["along_flow"], report["opw"]):
+        assert change["mean_mm"] == pytest.approx(2, rel=1e-4)
+        assert change["relative"] == pytest.approx((2 / 48 + 2 / 46) / 2, rel=1e-4)
+        assert change["rtc"] == 0
+    assert report["opw_reference"]["mean_mm"] < 1e-3
+    assert report["opw_reference"]["rtc"] == 1
+    assert report["tae_reference"]["percent"] < 1e-3
     # Matches lie on whole pixels, a third of a millimetre wide; the approach is 2 mm.
-    assert report.orb_reference.median_mm < 0.25
-    assert report.orb_camera.median_mm > 1.8
+    assert report["orb_reference"]["median_mm"] < 0.25
+    assert report["orb_camera"]["median_mm"] > 1.8
 
 
 @pytest.mark.parametrize("poses", [TILTED_ASIDE, WANDERING])
 def test_exact_depth_of_a_tilted_plane_is_consistent_up_to_the_rounding_to_pixels(poses: list[np.ndarray]) -> None:
     report = measure(poses)
-    assert report.tae_reference.percent < 0.2
-    assert report.opw_reference.relative < 1e-3
-    assert report.opw_reference.rtc > 0.999
-    assert report.orb_reference.relative_median < 5e-3
+    assert report["tae_reference"]["percent"] < 0.2
+    assert report["opw_reference"]["relative"] < 1e-3
+    assert report["opw_reference"]["rtc"] > 0.999
+    assert report["orb_reference"]["relative_median"] < 5e-3
 
 
 def test_transposed_poses_are_found_out() -> None:
@@ -103,9 +110,9 @@ def test_transposed_poses_are_found_out() -> None:
     told = [inverse(T) for T in WANDERING]
     for wrong in (rows_for_columns, told):
         report = measure(WANDERING, told_poses=wrong)
-        assert report.tae_reference.percent > 1
-        assert report.opw_reference.relative > 1e-2
-        assert report.orb_reference.relative_median > 2e-2
+        assert report["tae_reference"]["percent"] > 1
+        assert report["opw_reference"]["relative"] > 1e-2
+        assert report["orb_reference"]["relative_median"] > 2e-2
 
 
 def test_flow_of_the_wrong_sign_is_found_out() -> None:
@@ -113,8 +120,8 @@ def test_flow_of_the_wrong_sign_is_found_out() -> None:
     turned = TILTED_ASIDE[0][:3, :3]
     poses = [se3(turned, turned @ T[:3, 3]) for T in ASIDE]
     right, wrong = measure(poses), measure(poses, flow_sign=-1.0)
-    assert right.along_flow.mean_mm < 1e-2
-    assert wrong.along_flow.mean_mm > 1
+    assert right["along_flow"]["mean_mm"] < 1e-2
+    assert wrong["along_flow"]["mean_mm"] > 1
     # OPW looks at the pictures too: hardly a pixel finds its colour at the wrong place.
     views = [see(T) for T in poses]
     shares = [np.mean(links(views, sign)[1].same_colour) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
@@ -129,29 +136,29 @@ def test_flow_of_the_wrong_sign_is_found_out() -> None:
 def test_flicker_of_a_still_camera_has_its_closed_forms(e: float) -> None:
     report = measure(STILL, [1 + e, 1 - e, 1 + e, 1 - e])
     step = np.log((1 + e) / (1 - e))
-    assert report.jitter.log_std == pytest.approx(step / 2, rel=1e-4)
-    assert report.jitter.log_step == pytest.approx(step, rel=1e-4)
-    for change in (report.same_pixel, report.along_flow, report.opw, report.opw_reference):
-        assert change.mean_mm == pytest.approx(2 * e * PLANE_MM, rel=1e-3)
+    assert report["jitter"]["log_std"] == pytest.approx(step / 2, rel=1e-4)
+    assert report["jitter"]["log_step"] == pytest.approx(step, rel=1e-4)
+    for change in (report["same_pixel"], report["along_flow"], report["opw"], report["opw_reference"]):
+        assert change["mean_mm"] == pytest.approx(2 * e * PLANE_MM, rel=1e-3)
         # Two of the three pairs end on the lower value.
-        assert change.relative == pytest.approx((2 * 2 * e / (1 - e) + 2 * e / (1 + e)) / 3, rel=1e-3)
-        assert change.rtc == (1 if e < 0.005 else 0)
-    assert report.tae_reference.percent == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
+        assert change["relative"] == pytest.approx((2 * 2 * e / (1 - e) + 2 * e / (1 + e)) / 3, rel=1e-3)
+        assert change["rtc"] == (1 if e < 0.005 else 0)
+    assert report["tae_reference"]["percent"] == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
     matcher = FrameMatcher(CAMERA)
     matcher.match(see(STILL[0]).rgb, EVERYWHERE)
     link = matcher.match(see(STILL[0]).rgb, EVERYWHERE)
     assert link is not None
     from_camera = np.linalg.norm(CAMERA.unproject(link.matches.current_px), axis=1)
-    assert report.orb_reference.mean_mm == pytest.approx(2 * e * PLANE_MM * from_camera.mean(), rel=1e-3)
-    assert report.orb_camera.relative_median == pytest.approx(2 * e * np.median(from_camera), rel=1e-3)
+    assert report["orb_reference"]["mean_mm"] == pytest.approx(2 * e * PLANE_MM * from_camera.mean(), rel=1e-3)
+    assert report["orb_camera"]["relative_median"] == pytest.approx(2 * e * np.median(from_camera), rel=1e-3)
 
 
 def test_flicker_raises_every_figure_of_a_moving_camera() -> None:
     exact, flickering = measure(WANDERING), measure(WANDERING, [0.95, 1.05, 0.95])
-    assert flickering.tae_reference.percent > 8
-    assert flickering.opw_reference.mean_mm > exact.opw_reference.mean_mm + 4
-    assert flickering.orb_reference.median_mm > exact.orb_reference.median_mm + 4
-    assert flickering.opw_reference.rtc < 0.01
+    assert flickering["tae_reference"]["percent"] > 8
+    assert flickering["opw_reference"]["mean_mm"] > exact["opw_reference"]["mean_mm"] + 4
+    assert flickering["orb_reference"]["median_mm"] > exact["orb_reference"]["median_mm"] + 4
+    assert flickering["opw_reference"]["rtc"] < 0.01
 
 
 # ---- scale, poses of the method's own
@@ -167,15 +174,15 @@ def test_scale_serves_depth_and_estimated_poses_and_leaves_relative_figures() ->
             meter.add(DepthFrame(unit * view.depth_mm, EVERYWHERE, own_pose, view.T_world_camera), link)
         reports.append(meter.report())
     exact, tiny, restored = reports
-    assert restored.scale == 10
-    assert tiny.opw.mean_mm == pytest.approx(0.1 * exact.opw.mean_mm, rel=1e-4)
+    assert restored["scale"] == 10
+    assert tiny["opw"]["mean_mm"] == pytest.approx(0.1 * exact["opw"]["mean_mm"], rel=1e-4)
     for name in ("mean_mm", "relative", "rtc"):
-        assert getattr(restored.opw_estimated, name) == pytest.approx(getattr(exact.opw_estimated, name), abs=1e-4)
-        assert getattr(restored.opw_reference, name) == pytest.approx(getattr(exact.opw_reference, name), abs=1e-4)
+        assert restored["opw_estimated"][name] == pytest.approx(exact["opw_estimated"][name], abs=1e-4)
+        assert restored["opw_reference"][name] == pytest.approx(exact["opw_reference"][name], abs=1e-4)
     # Its own poses agree with its own depth at any scale; the reference's poses do not.
-    assert tiny.tae_estimated.percent == pytest.approx(exact.tae_estimated.percent, abs=1e-3)
-    assert tiny.tae_reference.percent > 5
-    assert restored.orb_estimated.median_mm == pytest.approx(exact.orb_reference.median_mm, abs=1e-3)
+    assert tiny["tae_estimated"]["percent"] == pytest.approx(exact["tae_estimated"]["percent"], abs=1e-3)
+    assert tiny["tae_reference"]["percent"] > 5
+    assert restored["orb_estimated"]["median_mm"] == pytest.approx(exact["orb_reference"]["median_mm"], abs=1e-3)
 
 
 def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> None:
@@ -185,16 +192,16 @@ def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> 
     for frame, view in zip(frames, map(see, ASIDE + ASIDE[:1]), strict=True):
         meter.add(frame, matcher.match(view.rgb, EVERYWHERE))
     report = meter.report()
-    assert (report.frames, report.pairs) == (4, 3)
-    assert (report.tae_estimated.pairs, report.tae_reference.pairs) == (1, 0)
-    assert (report.orb_estimated.pairs, report.orb_reference.pairs) == (1, 0)
-    assert report.orb_estimated.pair_matches[:2] == (0, 0)
-    assert report.orb_estimated.pair_matches[2] > 50
-    assert report.orb_camera.pairs == 3
-    assert measure(ASIDE).orb_reference.pairs == 2
+    assert (report["frames"], report["pairs"]) == (4, 3)
+    assert (report["tae_estimated"]["pairs"], report["tae_reference"]["pairs"]) == (1, 0)
+    assert (report["orb_estimated"]["pairs"], report["orb_reference"]["pairs"]) == (1, 0)
+    assert report["orb_estimated"]["pair_matches"][:2] == (0, 0)
+    assert report["orb_estimated"]["pair_matches"][2] > 50
+    assert report["orb_camera"]["pairs"] == 3
+    assert measure(ASIDE)["orb_reference"]["pairs"] == 2
     # Without flow nothing along it is measured; without truth there is no jitter.
-    assert (report.opw.pairs, report.along_flow.pairs, report.same_pixel.pairs) == (0, 0, 3)
-    assert np.isnan([report.opw.mean_mm, report.jitter.log_std, report.tae_reference.percent]).all()
+    assert (report["opw"]["pairs"], report["along_flow"]["pairs"], report["same_pixel"]["pairs"]) == (0, 0, 3)
+    assert np.isnan([report["opw"]["mean_mm"], report["jitter"]["log_std"], report["tae_reference"]["percent"]]).all()
 
 
 def test_without_links_flow_and_features_are_silent_and_the_rest_speaks() -> None:
@@ -202,10 +209,10 @@ def test_without_links_flow_and_features_are_silent_and_the_rest_speaks() -> Non
     for T in FORWARD:
         meter.add(DepthFrame(see(T).depth_mm, EVERYWHERE, T_reference_camera=T))
     report = meter.report()
-    assert (report.orb_reference.matches, report.opw.pairs) == (0, 0)
-    assert report.orb_reference.pair_matches == (0, 0)
-    assert report.same_pixel.mean_mm == pytest.approx(2)
-    assert report.tae_reference.percent < 1e-3
+    assert (report["orb_reference"]["matches"], report["opw"]["pairs"]) == (0, 0)
+    assert report["orb_reference"]["pair_matches"] == (0, 0)
+    assert report["same_pixel"]["mean_mm"] == pytest.approx(2)
+    assert report["tae_reference"]["percent"] < 1e-3
 
 
 @pytest.mark.parametrize("frames", [0, 1])
@@ -214,8 +221,13 @@ def test_fewer_than_two_frames_give_no_figures(frames: int) -> None:
     for T in STILL[:frames]:
         meter.add(DepthFrame(see(T).depth_mm, EVERYWHERE, T, T))
     report = meter.report()
-    assert (report.frames, report.pairs, report.same_pixel.pairs, report.orb_camera.pairs) == (frames, 0, 0, 0)
-    assert np.isnan(report.same_pixel.mean_mm)
+    assert (report["frames"], report["pairs"], report["same_pixel"]["pairs"], report["orb_camera"]["pairs"]) == (
+        frames,
+        0,
+        0,
+        0,
+    )
+    assert np.isnan(report["same_pixel"]["mean_mm"])
 
 
 # ---- masks and missing values
@@ -234,8 +246,8 @@ def test_what_is_masked_unknown_or_impossible_does_not_count() -> None:
         reports.append(meter.report())
     assert all(same(report, reports[0]) for report in reports)
     whole = measure(WANDERING)
-    assert reports[0].orb_reference.matches < whole.orb_reference.matches
-    assert reports[0].opw_reference.relative < 1e-3
+    assert reports[0]["orb_reference"]["matches"] < whole["orb_reference"]["matches"]
+    assert reports[0]["opw_reference"]["relative"] < 1e-3
 
 
 def test_flow_counts_only_where_it_is_trusted() -> None:
@@ -249,7 +261,7 @@ def test_flow_counts_only_where_it_is_trusted() -> None:
         for view in views:
             link = matcher.match(view.rgb, EVERYWHERE, nonsense, trusted)
             meter.add(DepthFrame(depth_mm, EVERYWHERE), link)
-        changes.append(meter.report().along_flow.mean_mm)
+        changes.append(meter.report()["along_flow"]["mean_mm"])
     assert changes[0] > 1
     assert changes[1] < 1e-5
 
@@ -328,10 +340,6 @@ def test_unusable_arguments_are_refused() -> None:
         ConsistencyMeter(CAMERA, 0.0)
     with pytest.raises(ValueError, match=r"DepthFrame.depth_mm"):
         ConsistencyMeter(CAMERA).add(DepthFrame(np.ones((3, 3)), EVERYWHERE))
-    matcher = FrameMatcher(CAMERA)
-    matcher.match(see(pose()).rgb, EVERYWHERE)
-    with pytest.raises(ValueError, match="to_previous"):
-        matcher.match(see(pose()).rgb, EVERYWHERE, np.zeros((3, 3, 2)))
 
 
 # ---- real truth
@@ -350,12 +358,12 @@ def test_true_depth_of_a_real_colon_is_consistent_and_flicker_shows(real_data: P
             depth_mm = truth.depth_mm * np.float32(1 + flicker * (-1) ** number)
             meter.add(DepthFrame(depth_mm, frame.valid, None, truth.T_world_camera, truth.depth_mm), link)
     exact, flickering = (meter.report() for meter in meters.values())
-    assert (exact.pairs, exact.orb_reference.pairs) == (9, 9)
+    assert (exact["pairs"], exact["orb_reference"]["pairs"]) == (9, 9)
     # 0.29 % and 0.29 mm (a pixel is about that wide); the mean holds matches at the edges of folds.
-    assert exact.tae_reference.percent < 0.4
-    assert exact.orb_reference.median_mm < 0.4
-    assert exact.orb_reference.relative_median < 0.01
-    assert flickering.tae_reference.percent == pytest.approx(4.0, abs=0.3)
-    assert flickering.orb_reference.relative_median == pytest.approx(0.04, abs=0.01)
-    assert flickering.jitter.log_step == pytest.approx(np.log(1.02 / 0.98), rel=1e-3)
-    assert set(asdict(exact)) == set(asdict(flickering))
+    assert exact["tae_reference"]["percent"] < 0.4
+    assert exact["orb_reference"]["median_mm"] < 0.4
+    assert exact["orb_reference"]["relative_median"] < 0.01
+    assert flickering["tae_reference"]["percent"] == pytest.approx(4.0, abs=0.3)
+    assert flickering["orb_reference"]["relative_median"] == pytest.approx(0.04, abs=0.01)
+    assert flickering["jitter"]["log_step"] == pytest.approx(np.log(1.02 / 0.98), rel=1e-3)
+    assert set(exact) == set(flickering)

@@ -11,8 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.errors import SettingsError
-from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthFit, DepthReport, evaluate_depth, mean_depth_report
-from scopemap.evaluation.depth_sequence import depth_scale, evaluate_depth_sequence, fit_sequence, scale_jitter
+from scopemap.evaluation.depth import (
+    DEPTH_RANGES_MM,
+    DepthFit,
+    DepthReport,
+    depth_scale,
+    evaluate_depth,
+    evaluate_depth_sequence,
+    fit_sequence,
+    mean_depth_report,
+    scale_jitter,
+)
 
 TRUTH = np.array([[10.0, 20.0], [40.0, np.nan]], dtype=np.float32)
 ALL = (1e-3, float("inf"))

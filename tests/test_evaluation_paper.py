@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, vector_a
 
 from scopemap.evaluation.paper import paper_figures
-from scopemap.evaluation.pose_errors import ErrorSummary, translation_errors_mm
-from scopemap.evaluation.poses import match
+from scopemap.evaluation.poses import ErrorSummary, match, translation_errors_mm
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import se3_exp, so3_exp
 

@@ -12,16 +12,18 @@ from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, vector_a
 
 from scopemap.errors import AlignmentError
-from scopemap.evaluation.pose_errors import (
+from scopemap.evaluation.poses import (
     ErrorSummary,
+    associate,
     below_percent,
+    evaluate_poses,
     frame_pairs,
+    match,
     path_pairs,
     relative_errors,
     rotation_errors_rad,
     translation_errors_mm,
 )
-from scopemap.evaluation.poses import associate, evaluate_poses, match
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import se3_exp, so3_exp
 from scopemap.trajectory.trajectory import Trajectory

@@ -244,7 +244,7 @@ def test_time_stamps_of_bags_and_dicom_are_their_own(tmp_path: Path) -> None:
     pytest.importorskip("pydicom")
     video = inspect(write_dicom_video(tmp_path / "video"))
     assert video.container is not None
-    assert video.container.width == video.size[0]
+    assert video.container["width"] == video.size[0]
 
 
 def test_the_camera_may_be_that_of_one_of_two_views(tmp_path: Path) -> None:

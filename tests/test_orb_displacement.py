@@ -8,8 +8,14 @@ import plane_scene as scene
 import pytest
 from plane_scene import CAMERA, EVERYWHERE, SIX_PIXELS_MM, View, pose, see, true_flow
 
-from scopemap.evaluation.correspondences import Matches, OrbFeatures, match_features, orb_features
-from scopemap.evaluation.displacement import DisplacementSummary, displacements
+from scopemap.evaluation.correspondences import (
+    Matches,
+    OrbFeatures,
+    displacement_figures,
+    displacements,
+    match_features,
+    orb_features,
+)
 from scopemap.geometry.se3 import inverse
 
 START = see(pose())
@@ -155,18 +161,11 @@ def test_smooth_tissue_has_features_too() -> None:
 
 def test_sequence_statistics_pool_matches_and_keep_the_place_of_empty_pairs() -> None:
     rows = [np.array([1.0, 3.0]), np.empty(0), np.array([8.0])]
-    summary = DisplacementSummary.of([np.stack([row, row / 10]) for row in rows])
-    assert (summary.pairs, summary.matches, summary.mean_mm, summary.median_mm) == (2, 3, 4, 3)
-    assert summary.std_mm == pytest.approx(np.sqrt(26 / 3))
-    assert (summary.relative_mean, summary.relative_median) == pytest.approx((0.4, 0.3))
-    assert summary.pair_matches == (2, 0, 1)
-    assert summary.pair_mean_mm == pytest.approx((2, np.nan, 8), nan_ok=True)
-    assert summary.pair_median_mm == pytest.approx((2, np.nan, 8), nan_ok=True)
-    assert np.isnan(DisplacementSummary.of([]).mean_mm)
-
-
-def test_sizes_must_agree() -> None:
-    with pytest.raises(ValueError, match="depth_current_mm"):
-        displacements(exact_matches(START, START), START.depth_mm, START.depth_mm[:5], CAMERA)
-    with pytest.raises(ValueError, match="rgb"):
-        orb_features(START.rgb[..., 0])
+    summary = displacement_figures([np.stack([row, row / 10]) for row in rows])
+    assert (summary["pairs"], summary["matches"], summary["mean_mm"], summary["median_mm"]) == (2, 3, 4, 3)
+    assert summary["std_mm"] == pytest.approx(np.sqrt(26 / 3))
+    assert (summary["relative_mean"], summary["relative_median"]) == pytest.approx((0.4, 0.3))
+    assert summary["pair_matches"] == (2, 0, 1)
+    assert summary["pair_mean_mm"] == pytest.approx((2, np.nan, 8), nan_ok=True)
+    assert summary["pair_median_mm"] == pytest.approx((2, np.nan, 8), nan_ok=True)
+    assert np.isnan(displacement_figures([])["mean_mm"])

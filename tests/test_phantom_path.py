@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.phantom.camera_path import c3vd_line, lumen_path, sweep_path
+from scopemap.phantom.camera_path import lumen_path, sweep_path
 from scopemap.phantom.render import prepare
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.trajectory.formats.text import read_poses
@@ -30,12 +30,6 @@ def test_reads_both_forms(tmp_path: Path, poses: np.ndarray, separator: str, sto
     file = tmp_path / "path.txt"
     file.write_text("# a comment\n" + "\n".join(rows) + "\n\n")
     np.testing.assert_allclose(read_poses(file), poses, atol=1e-6)
-
-
-def test_c3vd_line_has_the_translation_in_the_last_row(poses: np.ndarray) -> None:
-    stored = np.array(c3vd_line(poses[0]).split(","), dtype=float).reshape(4, 4)
-    np.testing.assert_allclose(stored[3, :3], poses[0][:3, 3], rtol=1e-8)
-    np.testing.assert_array_equal(stored[:, 3], [0, 0, 0, 1])
 
 
 @pytest.mark.parametrize(
@@ -65,7 +59,7 @@ def test_missing_file_is_an_input_error(tmp_path: Path) -> None:
 def test_the_first_poses_of_a_file_are_used(tmp_path: Path) -> None:
     poses = lumen_path(12, False, 3)
     file = tmp_path / "path.txt"
-    file.write_text("\n".join(c3vd_line(T) for T in poses))
+    np.savetxt(file, poses.transpose(0, 2, 1).reshape(-1, 16))
     phantom = prepare(PhantomSpec(path_file=file, frames=7, width=32, height=32))
     np.testing.assert_allclose(phantom.poses, poses[:7], atol=1e-6)
     with pytest.raises(InputError, match="holds 12 poses, 13 frames"):

@@ -9,10 +9,10 @@ from scipy import ndimage
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.phantom.deformation import REST, breathing
 from scopemap.phantom.march import march
-from scopemap.phantom.render import Phantom, build_scene, camera_path, prepare, render_surface
+from scopemap.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.truth_mesh import SeenVoxels
 from scopemap.phantom.volume import Volume
+from scopemap.phantom.writer import SeenVoxels
 from scopemap.trajectory.formats.text import read_poses
 
 SMALL = {"width": 96, "height": 80, "frames": 12}
@@ -28,8 +28,14 @@ def breathing_colon() -> Phantom:
     return prepare(PhantomSpec(deform=True, breath_mm=3.0, breath_frames=10.0, **SMALL))
 
 
+def distances_at(volume: Volume, points: np.ndarray) -> np.ndarray:
+    """Distance (N,) in mm, to first order, of points (N, 3) near the surface: value over slope."""
+    value, gradient = volume.values_at(points)
+    return value / np.linalg.norm(gradient, axis=1)
+
+
 def world_points(phantom: Phantom, index: int) -> np.ndarray:
-    _, surface = render_surface(phantom, index)
+    _, surface = render_frame(phantom, index)
     points = phantom.spec.camera.rays.astype(float) * surface.depth_mm[..., None]
     points = points[np.isfinite(surface.depth_mm)]
     return transform(phantom.poses[index], points)
@@ -57,7 +63,7 @@ def test_the_inside_of_a_ball_is_met_where_the_formula_says(ball: Volume) -> Non
 
 
 def test_the_distance_map_never_promises_too_much(phantom: Phantom) -> None:
-    volume = phantom.scene.volume
+    volume = phantom.volume
     rng = np.random.default_rng(0)
     cells = np.argwhere(volume.skip > 1)
     cells = cells[rng.choice(len(cells), 300)]
@@ -71,7 +77,7 @@ def test_the_distance_map_never_promises_too_much(phantom: Phantom) -> None:
 
 
 def test_the_slope_bound_holds(phantom: Phantom) -> None:
-    volume = phantom.scene.volume
+    volume = phantom.volume
     cells = np.argwhere((volume.skip == 0) & (volume.coefficients > -2))
     cells = cells[np.random.default_rng(0).choice(len(cells), 2000)]
     points = (cells + 0.37) * volume.voxel_mm + volume.origin_mm
@@ -85,10 +91,10 @@ def test_the_slope_bound_holds(phantom: Phantom) -> None:
 
 def test_gradient_agrees_with_finite_differences(phantom: Phantom) -> None:
     points = world_points(phantom, 0)[::97]
-    _, gradient = phantom.scene.volume.values_at(points)
+    _, gradient = phantom.volume.values_at(points)
     step = 1e-4
     for axis, offset in enumerate(step * np.eye(3)):
-        ahead, behind = (phantom.scene.volume.values_at(points + s * offset)[0] for s in (1, -1))
+        ahead, behind = (phantom.volume.values_at(points + s * offset)[0] for s in (1, -1))
         np.testing.assert_allclose(gradient[:, axis], (ahead - behind) / (2 * step), atol=1e-5)
 
 
@@ -96,22 +102,22 @@ def test_backprojected_depth_lies_on_the_surface(phantom: Phantom) -> None:
     for index in (0, 7):
         points = world_points(phantom, index)
         assert len(points) > 0.95 * 96 * 80
-        assert np.abs(phantom.scene.volume.distances_at(points)).max() < 1e-3
+        assert np.abs(distances_at(phantom.volume, points)).max() < 1e-3
 
 
 def test_nothing_lies_before_the_depth(phantom: Phantom) -> None:
-    _, surface = render_surface(phantom, 3)
+    _, surface = render_frame(phantom, 3)
     eye = phantom.poses[3][:3, 3]
     points = world_points(phantom, 3)
     for share in np.linspace(0.02, 0.98, 25):
-        value, _ = phantom.scene.volume.values_at(eye + share * (points - eye))
+        value, _ = phantom.volume.values_at(eye + share * (points - eye))
         assert value.min() > -1e-3
     assert np.nanmin(surface.depth_mm) > 3.0
 
 
 def test_frames_agree_with_each_other(phantom: Phantom) -> None:
     camera = phantom.spec.camera
-    _, other = render_surface(phantom, 9)
+    _, other = render_frame(phantom, 9)
     seen = transform(inverse(phantom.poses[9]), world_points(phantom, 2))
     pixels = camera.project(seen)
     flat = ndimage.maximum_filter(other.depth_mm, 3) - ndimage.minimum_filter(other.depth_mm, 3) < 1.0
@@ -127,28 +133,28 @@ def test_frames_agree_with_each_other(phantom: Phantom) -> None:
 
 
 def test_mesh_lies_on_the_surface_and_faces_the_camera(phantom: Phantom) -> None:
-    seen = SeenVoxels(phantom.scene.volume)
+    seen = SeenVoxels(phantom.volume)
     for index in (0, 5, 11):
-        seen.add(render_surface(phantom, index)[1].rest_mm)
+        seen.add(render_frame(phantom, index)[1].rest_mm)
     mesh = seen.mesh()
     corners = mesh.vertices[mesh.faces]
-    middle = np.abs(phantom.scene.volume.distances_at(corners.mean(1)))
-    assert np.abs(phantom.scene.volume.distances_at(mesh.vertices)).max() < 1e-3
+    middle = np.abs(distances_at(phantom.volume, corners.mean(1)))
+    assert np.abs(distances_at(phantom.volume, mesh.vertices)).max() < 1e-3
     assert middle.mean() < 0.05
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    _, gradient = phantom.scene.volume.values_at(corners.mean(1))
+    _, gradient = phantom.volume.values_at(corners.mean(1))
     assert ((normals * gradient).sum(1) > 0).mean() > 0.99
 
 
 def test_mesh_covers_what_the_cameras_see(phantom: Phantom) -> None:
     from scipy.spatial import cKDTree
 
-    seen = SeenVoxels(phantom.scene.volume)
-    seen.add(render_surface(phantom, 5)[1].rest_mm)
+    seen = SeenVoxels(phantom.volume)
+    seen.add(render_frame(phantom, 5)[1].rest_mm)
     distance, _ = cKDTree(seen.mesh().vertices).query(world_points(phantom, 5))
     # The open tube ends at the rim of the volume, where the mesh stops a voxel or two before the last ray.
-    assert np.percentile(distance, 99.9) < 1.2 * phantom.scene.volume.voxel_mm
-    assert distance.max() < 2.5 * phantom.scene.volume.voxel_mm
+    assert np.percentile(distance, 99.9) < 1.2 * phantom.volume.voxel_mm
+    assert distance.max() < 2.5 * phantom.volume.voxel_mm
 
 
 def test_depth_of_moving_tissue_lies_on_moving_tissue(breathing_colon: Phantom) -> None:
@@ -156,15 +162,15 @@ def test_depth_of_moving_tissue_lies_on_moving_tissue(breathing_colon: Phantom) 
     points = world_points(breathing_colon, 5)
     shift = displacement.at(points)
     assert np.linalg.norm(shift, axis=1).max() > 1.0
-    assert np.abs(breathing_colon.scene.volume.distances_at(points - shift)).max() < 1e-3
-    assert np.abs(breathing_colon.scene.volume.distances_at(points)).mean() > 0.1
+    assert np.abs(distances_at(breathing_colon.volume, points - shift)).max() < 1e-3
+    assert np.abs(distances_at(breathing_colon.volume, points)).mean() > 0.1
 
 
 def test_moving_mesh_agrees_with_moving_depth(breathing_colon: Phantom) -> None:
     from scipy.spatial import cKDTree
 
-    seen = SeenVoxels(breathing_colon.scene.volume)
-    seen.add(render_surface(breathing_colon, 5)[1].rest_mm)
+    seen = SeenVoxels(breathing_colon.volume)
+    seen.add(render_frame(breathing_colon, 5)[1].rest_mm)
     mesh = seen.mesh()
     points = world_points(breathing_colon, 5)
 
@@ -180,7 +186,7 @@ def test_moving_mesh_agrees_with_moving_depth(breathing_colon: Phantom) -> None:
 
 
 def test_normals_of_moving_tissue_are_those_of_its_depth(breathing_colon: Phantom) -> None:
-    _, surface = render_surface(breathing_colon, 5)
+    _, surface = render_frame(breathing_colon, 5)
     points = breathing_colon.spec.camera.rays * surface.depth_mm[..., None]
     along = np.cross(points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1])
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
@@ -202,12 +208,12 @@ def test_moving_is_the_inverse_of_the_warp() -> None:
 def test_path_keeps_clear_of_the_wall(phantom: Phantom) -> None:
     spec = PhantomSpec(scene=phantom.spec.scene, frames=60, width=32, height=32, seed=5)
     poses = camera_path(spec)
-    scene = build_scene(spec, poses)
+    volume, _ = build_scene(spec, poses)
     for displacement in (REST, breathing(2.0, 10.0, 5).at(5)):
         positions = poses[:, :3, 3] - displacement.at(poses[:, :3, 3])
-        assert scene.volume.values_at(positions)[0].min() > 5.0
+        assert volume.values_at(positions)[0].min() > 5.0
         for index in (0, 30, 59):
-            assert np.nanmin(march(scene.volume, spec.camera, poses[index], displacement).distance_mm) > 5.0
+            assert np.nanmin(march(volume, spec.camera, poses[index], displacement).distance_mm) > 5.0
 
 
 @pytest.mark.real
@@ -218,7 +224,7 @@ def test_real_paths_have_room_and_a_view(real_data: object) -> None:
         for file in files if scene == "colon" else files[::7]:
             spec = PhantomSpec(scene=scene, path_file=file, width=48, height=40)
             poses = read_poses(file)
-            volume = build_scene(spec, poses).volume
+            volume, _ = build_scene(spec, poses)
             assert volume.values_at(poses[:, :3, 3])[0].min() > 5.0, file
             for pose in poses[:: len(poses) // 3]:
                 depth = march(volume, spec.camera, pose, REST).depth_mm

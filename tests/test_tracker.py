@@ -29,7 +29,8 @@ def _sequence() -> tuple[list[Frame], np.ndarray]:
     """Frames with true depth, and their true poses relative to the first."""
     phantom, frames = prepare(SPEC), []
     for index in range(SPEC.frames or 0):
-        rgb, depth_mm = render_frame(phantom, index)
+        rgb, surface = render_frame(phantom, index)
+        depth_mm = surface.depth_mm
         valid = np.isfinite(depth_mm) & (rgb.max(-1) > 20) & (rgb.max(-1) < 240)
         frames.append(Frame(index, index / 30, rgb, SPEC.camera, valid, depth_mm))
     return frames, inverse(phantom.poses[0]) @ phantom.poses

@@ -120,8 +120,8 @@ def measure(demo: Demonstration) -> dict[str, float]:
     mesh = dict.fromkeys(("mesh_accuracy_mm", "mesh_median_mm", "mesh_completeness_mm"), float("nan"))
     if len(demo.result.mesh.faces):
         surface = compare_surfaces(demo.aligned_mesh, demo.true_mesh)
-        mesh = {"mesh_accuracy_mm": surface.accuracy.mean_mm, "mesh_median_mm": surface.accuracy.median_mm}
-        mesh |= {"mesh_completeness_mm": surface.completeness.mean_mm}
+        mesh = {"mesh_accuracy_mm": surface["accuracy_mean_mm"], "mesh_median_mm": surface["accuracy_median_mm"]}
+        mesh |= {"mesh_completeness_mm": surface["completeness_mean_mm"]}
     return {
         "frames": sim3.frames,
         "tracked": sim3.tracked,

@@ -21,8 +21,7 @@ from scopemap.benchmark.table import pd
 from scopemap.benchmark.tables import write_tables
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
-from scopemap.evaluation.correspondences import FrameMatcher
-from scopemap.evaluation.displacement import displacements
+from scopemap.evaluation.correspondences import FrameMatcher, displacements
 from scopemap.evaluation.poses import match
 from scopemap.frame import Frame, Truth
 from scopemap.io.datasets.reference import reference_trajectory

@@ -17,8 +17,7 @@ from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
 from scopemap.evaluation.correspondences import FrameMatcher
-from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthScaling
-from scopemap.evaluation.depth_sequence import DepthPairs, evaluate_depth_sequence, fit_sequence
+from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling, evaluate_depth_sequence, fit_sequence
 from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
 from scopemap.evaluation.protocols import PROTOCOLS
@@ -84,8 +83,8 @@ def pose_groups(
     for name in protocol.protocols:
         # A protocol's own fit may fail where ours does not: then it has no figures.
         with suppress(AlignmentError):
-            report = PROTOCOLS[name](estimate, reference)
-            figures[name] = report.figures | {"description": report.description, "source": report.source}
+            known = PROTOCOLS[name]
+            figures[name] = known(estimate, reference) | {"description": known.description, "source": known.source}
     return figures, matched
 
 
@@ -228,7 +227,7 @@ def _consistency(
             ),
             link,
         )
-    return {"consistency": asdict(meter.report()) | {"flow": estimator.name}}
+    return {"consistency": meter.report() | {"flow": estimator.name}}
 
 
 def flow_to_previous(

@@ -135,8 +135,8 @@ def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) ->
     unknown = [name for name in names if name not in PROTOCOLS]
     if unknown:
         raise SettingsError(f"unknown protocol '{unknown[0]}': choose from {', '.join(PROTOCOLS)}")
-    reports = {name: PROTOCOLS[name](estimate, reference) for name in names}
-    return {name: report.figures | {"description": report.description} for name, report in reports.items()}
+    chosen = [PROTOCOLS[name] for name in names]
+    return {known.name: known(estimate, reference) | {"description": known.description} for known in chosen}
 
 
 def _depths(trajectory: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> dict[str, Any]:

@@ -1,17 +1,22 @@
-"""Correspondences of two consecutive images: ORB matches, flow, and where the flow's ends have the same colour.
+"""Correspondences of two consecutive images (ORB matches, flow), and the displacement of matched points in space.
 
-They are found in the images alone, so that the depth of every method is measured on the same points and pixels.
+They are found in the images alone, so that the depth of every method is measured on the same points and pixels. The
+paper's depth-consistency experiment (arXiv 2508.11282) names ORB, consecutive frames and displacements; our form is e =
+||P_t X_t - P_{t+1} X_{t+1}|| over inlier matches, lifted with depth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
+from scopemap.geometry.se3 import transform
 from scopemap.geometry.warp import pull
 
 FEATURES = 1000
@@ -52,8 +57,7 @@ class FrameCorrespondences:
     ----------
     matches : ORB matches.
     to_previous : (H, W, 2) px, pixel p of this frame is seen at p + to_previous(p) in the previous one; None: no flow.
-    consistent : (H, W) bool, where that flow is trusted; None without flow.
-    same_colour : (H, W) bool, where moreover both images have the same colour, as OPW requires; None without flow.
+    consistent : (H, W) bool, where that flow is trusted; same_colour : where moreover both images have the same colour.
     """
 
     matches: Matches
@@ -78,11 +82,8 @@ class FrameMatcher:
     ) -> FrameCorrespondences | None:
         """Return the correspondences with the image of the call before, None at the first.
 
-        Parameters
-        ----------
-        rgb : (H, W, 3) uint8; valid : (H, W) bool, True where it shows usable tissue.
-        to_previous : (H, W, 2) px flow to the previous image, if known; the same source for all methods.
-        consistent : (H, W) bool, where the flow passed its forward-backward check; None: not checked, all count.
+        `rgb` is (H, W, 3) uint8, `valid` (H, W) bool, `to_previous` (H, W, 2) px. Without `consistent` (H, W) all flow
+        counts.
         """
         size = (self._camera.height, self._camera.width)
         check_shape("rgb", rgb, (*size, 3))
@@ -101,11 +102,7 @@ class FrameMatcher:
 
 
 def orb_features(rgb: np.ndarray, valid: np.ndarray | None = None) -> OrbFeatures:
-    """Return the 1000 strongest ORB features of an image (H, W, 3) uint8, on pixels where `valid` (H, W) bool is True.
-
-    OpenCV's defaults but for the corner threshold, which is 7 grey levels: smooth tissue has no corner above 20.
-    """
-    check_shape("rgb", rgb, (None, None, 3))
+    """Return the 1000 strongest ORB features of an image (H, W, 3) uint8 on the `valid` pixels (H, W), None: on all."""
     mask = None if valid is None else valid.astype(np.uint8)
     detector = cv2.ORB.create(nfeatures=FEATURES, fastThreshold=_FAST_THRESHOLD)
     keypoints, descriptors = detector.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), mask)
@@ -117,9 +114,8 @@ def orb_features(rgb: np.ndarray, valid: np.ndarray | None = None) -> OrbFeature
 def match_features(previous: OrbFeatures, current: OrbFeatures, camera: PinholeCamera) -> Matches:
     """Return the matches between two frames that agree with one rigid motion; none from fewer than 8 features.
 
-    Each must be the other's nearest by Hamming distance, nearer than 0.8 times the second nearest in both directions,
-    and an inlier (1 px) of the essential matrix that RANSAC finds. Sets OpenCV's random seed: the same images give the
-    same matches.
+    Mutual nearest neighbours that pass Lowe's ratio test of 0.8 both ways, and inliers (1 px) of the essential matrix.
+    Sets OpenCV's random seed: the same images give the same matches.
     """
     if min(len(previous.pixels), len(current.pixels)) < _FEWEST_MATCHES:
         return Matches(np.empty((0, 2)), np.empty((0, 2)))
@@ -145,17 +141,91 @@ def _nearest(descriptors: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np
 
 
 def have_same_colour(rgb_previous: np.ndarray, rgb_current: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: where OPW counts a pixel of the current frame.
+    """Return where OPW counts a pixel, (H, W) bool: same colour, exp(-50 |I - I_warped|) > 0.01, and flow < 250 px.
 
-    The previous image, pulled along the flow, must have its colour: exp(-50 |I - I_warped|) > 0.01, colours 0..1, and
-    the flow must be below 250 px along both axes (in the public code only where it is positive). Khan et al., WACV 2023
-    (`depth_change`).
-
-    Parameters
-    ----------
-    rgb_previous, rgb_current : (H, W, 3) uint8.
-    to_previous : (H, W, 2) px: pixel p of the current frame is seen at p + to_previous(p) in the previous one.
+    `to_previous` is (H, W, 2) px. Khan et al., WACV 2023; their code limits the flow only where it is positive.
     """
     difference = rgb_current.astype(np.float32) - pull(rgb_previous, to_previous)
     same_colour = np.einsum("hwc,hwc->hw", difference, difference) < _COLOUR_DISTANCE**2
     return same_colour & (np.abs(to_previous) < _FLOW_LIMIT_PX).all(axis=-1)
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """Matched points of one pair of frames, lifted; M counts those with depth at both ends.
+
+    Attributes
+    ----------
+    previous_mm, current_mm : (M, 3) float64, in the world if poses were given, else each in its own camera.
+    depth_mm : (M,) mean depth of the two ends.
+    """
+
+    previous_mm: np.ndarray
+    current_mm: np.ndarray
+    depth_mm: np.ndarray
+
+    @property
+    def displacement_mm(self) -> np.ndarray:
+        """Distance (M,) between the two ends."""
+        return np.asarray(np.linalg.norm(self.previous_mm - self.current_mm, axis=1))
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Distance (M,) over the point's depth."""
+        return self.displacement_mm / self.depth_mm
+
+
+def displacements(
+    matches: Matches,
+    depth_previous_mm: np.ndarray,
+    depth_current_mm: np.ndarray,
+    camera: PinholeCamera,
+    poses: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Displacements:
+    """Lift both ends of each match with its frame's depth (H, W), NaN = unknown; those without depth are left out.
+
+    The nearest pixel counts: at a fold's edge an interpolated depth would be on neither surface. `poses` are
+    T_world_camera (4, 4) of the previous and of the current frame; without them points stay in their cameras.
+    """
+    z_previous = _nearest_depth(depth_previous_mm, matches.previous_px)
+    z_current = _nearest_depth(depth_current_mm, matches.current_px)
+    previous = z_previous[:, None] * camera.unproject(matches.previous_px)
+    current = z_current[:, None] * camera.unproject(matches.current_px)
+    if poses is not None:
+        previous, current = transform(poses[0], previous), transform(poses[1], current)
+    known = np.isfinite(previous).all(axis=1) & np.isfinite(current).all(axis=1)
+    return Displacements(previous[known], current[known], ((z_previous + z_current) / 2)[known])
+
+
+def _nearest_depth(depth_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return depth (M,) float64 of the pixels nearest to positions (M, 2), NaN outside the image."""
+    height, width = depth_mm.shape
+    u, v = np.rint(pixels).astype(int).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return np.where(inside, depth_mm[v.clip(0, height - 1), u.clip(0, width - 1)], np.nan).astype(np.float64)
+
+
+def displacement_figures(pairs: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Return the figures of a sequence's displacements in mm and over depth, (2, M) per pair, M = 0 where unmatched.
+
+    pairs, matches : pairs of frames with a lifted match, and their matches.
+    mean_mm, median_mm, std_mm, relative_mean, relative_median : over all matches; NaN where there are none.
+    pair_mean_mm, pair_median_mm, pair_matches : of every pair in order.
+    """
+
+    def or_nan(statistic: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:
+        return float(statistic(values)) if len(values) else float("nan")
+
+    all_mm, all_relative = np.concatenate([*pairs, np.empty((2, 0))], axis=1).astype(float)
+    return {
+        "pairs": sum(pair.shape[1] > 0 for pair in pairs),
+        "matches": len(all_mm),
+        "mean_mm": or_nan(np.mean, all_mm),
+        "median_mm": or_nan(np.median, all_mm),
+        "std_mm": or_nan(np.std, all_mm),
+        "relative_mean": or_nan(np.mean, all_relative),
+        "relative_median": or_nan(np.median, all_relative),
+        "pair_mean_mm": tuple(or_nan(np.mean, pair[0]) for pair in pairs),
+        "pair_median_mm": tuple(or_nan(np.median, pair[0]) for pair in pairs),
+        "pair_matches": tuple(pair.shape[1] for pair in pairs),
+    }

@@ -1,12 +1,13 @@
-"""Depth maps against true depth: the field's standard errors, per image, and their mean over images.
+"""Depth maps against true depth: the field's standard errors, per image and per sequence, and the jitter of the scale.
 
 Definitions: Eigen, Puhrsch and Fergus, "Depth map prediction from a single image", NeurIPS 2014, section 4.2; average
-over images, not over pixels, as AF-SfMLearner and EndoDAC report it. Whole sequences are in `depth_sequence`.
+over images, not over pixels, as AF-SfMLearner and EndoDAC report it. A median scale per image hides flicker, so a
+sequence may have one factor, or one scale and shift in disparity (Video-Depth-Anything, arXiv 2501.12375).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from typing import Literal, get_args
 
@@ -31,6 +32,11 @@ DEPTH_RANGES_MM: dict[str, tuple[float, float]] = {
 _LEAST_DISPARITY_PER_MM = 1e-6
 # A variance below this share of the squared mean is rounding of the sums.
 _LEAST_VARIATION = 1e-12
+DepthPairs = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
+"""Gives the frames, in order, anew at every call: (predicted, true), (H, W) each, mm, NaN = unknown."""
+
+# Bins of the logarithm of depth: medians read from them are exact to 1e-5 of their value, in bounded memory.
+_LOG_LOW, _LOG_HIGH, _LOG_STEP = float(np.log(1e-4)), float(np.log(1e6)), 2e-5
 
 
 @dataclass(frozen=True)
@@ -63,12 +69,10 @@ class DepthReport:
 
     Attributes
     ----------
-    scaling : how the prediction was scaled first.
-    pixels : compared pixels; coverage : their share of the pixels with true depth, 0..1.
-    scale, shift_per_mm : what was applied to the prediction, as in `DepthFit` (1 and 0 without scaling).
-    abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g.
+    pixels, coverage : compared pixels, and their share of the pixels with true depth, 0..1.
+    scaling, scale, shift_per_mm : what was applied to the prediction, as in `DepthFit`.
+    abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g; mae_mm : mean |d - g|.
     rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
-    mae_mm : mean |d - g|.
     delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
     """
 
@@ -97,17 +101,13 @@ def evaluate_depth(
 ) -> DepthReport:
     """Return the errors of a predicted depth map (H, W) against the true one (H, W), both mm, NaN = unknown.
 
-    Compared are pixels with true depth strictly inside `truth_range_mm` and a positive prediction.
-
     Parameters
     ----------
-    predicted_mm, truth_mm : (H, W) float.
-    scaling : applied to the prediction first. `median`: the ratio of the medians over the compared pixels;
-        `scale-and-shift`: least squares in disparity over them. Both hide a wrong scale, so the report names them. Or a
-        fit found elsewhere, such as that of a whole sequence. Raises `SettingsError` for another name.
-    truth_range_mm : see `DEPTH_RANGES_MM`.
-    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and
-        Video-Depth-Anything do. Without it the far pixels of a shifted prediction dominate the mean.
+    scaling : `median`: by the ratio of the medians of the compared pixels; `scale-and-shift`: least squares in
+        disparity; or a fit found elsewhere. Raises `SettingsError` for another name.
+    truth_range_mm : true depth counts strictly inside; see `DEPTH_RANGES_MM`.
+    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and Video-Depth-
+        Anything do. Without it the far pixels of a shifted prediction dominate the mean.
     """
     d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
     coverage = len(d) / max(known, 1)
@@ -132,11 +132,7 @@ def evaluate_depth(
 def compared_depths(
     predicted_mm: np.ndarray, truth_mm: np.ndarray, truth_range_mm: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return prediction and truth (N,) float64, mm, of the comparable pixels, and the number of true depths.
-
-    Both maps are (H, W), mm, NaN = unknown. True depth counts strictly inside the range, a prediction where it is
-    positive and finite.
-    """
+    """Return prediction and truth (N,) float64, mm, of the comparable pixels, and the number of true depths."""
     check_shape("predicted_mm", predicted_mm, np.shape(truth_mm))
     nearest, farthest = truth_range_mm
     known = np.isfinite(truth_mm) & (truth_mm > nearest) & (truth_mm < farthest)
@@ -162,10 +158,9 @@ def disparity_sums(d: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 def disparity_fit(sums: np.ndarray, scaling: DepthScaling) -> DepthFit:
-    """Return the least-squares fit 1 / g = a / d + b of `disparity_sums`, which add up over frames.
+    """Return the least-squares fit 1 / g = a / d + b of `disparity_sums`, which add up over frames; identity if empty.
 
-    The identity where they are empty. A prediction without variation becomes the mean disparity of the truth. The same
-    solution as Video-Depth-Anything's (arXiv 2501.12375; `benchmark/eval`), by the normal equations.
+    A prediction without variation becomes the mean disparity of the truth. arXiv 2501.12375, by the normal equations.
     """
     count, x, y, xx, xy = sums
     if count == 0:
@@ -190,3 +185,103 @@ def mean_depth_report(reports: Sequence[DepthReport]) -> DepthReport:
     compared = table[:, 0] > 0
     errors = table[compared, 2:].mean(axis=0) if compared.any() else np.full(table.shape[1] - 2, np.nan)
     return DepthReport(scalings[0], *(float(value) for value in (*table[:, :2].mean(axis=0), *errors)))
+
+
+@dataclass(frozen=True)
+class ScaleJitter:
+    """Variation over the frames of the factor s_t = median(g / d) from prediction to truth; a global scale cancels.
+
+    Attributes
+    ----------
+    frames : frames with a factor.
+    log_std : standard deviation (by N) of ln s_t. NaN below two frames.
+    log_step : mean |ln s_{t+1} - ln s_t| over consecutive frames that both have one; NaN where there are none.
+    """
+
+    frames: int
+    log_std: float
+    log_step: float
+
+
+@dataclass(frozen=True)
+class DepthSequenceReport:
+    """Depth errors of a sequence: the `fit` of a sequence mode, each frame's report and their mean, unscaled jitter."""
+
+    scaling: DepthScaling
+    fit: DepthFit
+    mean: DepthReport
+    frames: tuple[DepthReport, ...]
+    jitter: ScaleJitter
+
+
+def evaluate_depth_sequence(
+    pairs: DepthPairs,
+    *,
+    scaling: DepthScaling = "none",
+    truth_range_mm: tuple[float, float] = (1e-3, float("inf")),
+    clip_prediction: bool = False,
+) -> DepthSequenceReport:
+    """Return the errors of a sequence of depth maps, averaged over frames.
+
+    `sequence-median`: one factor, the median of all true depths over the median of all predicted ones. `sequence-scale-
+    and-shift`: one least-squares fit in disparity. All else is as in `evaluate_depth`.
+    """
+    if scaling not in get_args(DepthScaling):
+        raise SettingsError(f"depth scaling '{scaling}': choose one of {', '.join(get_args(DepthScaling))}")
+    of_sequence = scaling in ("sequence-median", "sequence-scale-and-shift")
+    fit = fit_sequence(pairs, scaling, truth_range_mm) if of_sequence else DepthFit(scaling)
+    each: ImageScaling | DepthFit = fit if of_sequence else scaling  # type: ignore[assignment]
+    frames, scales = [], []
+    for predicted_mm, truth_mm in pairs():
+        report = evaluate_depth(
+            predicted_mm, truth_mm, scaling=each, truth_range_mm=truth_range_mm, clip_prediction=clip_prediction
+        )
+        frames.append(report)
+        scales.append(depth_scale(predicted_mm, truth_mm, truth_range_mm))
+    return DepthSequenceReport(scaling, fit, mean_depth_report(frames), tuple(frames), scale_jitter(np.array(scales)))
+
+
+def depth_scale(
+    predicted_mm: np.ndarray, truth_mm: np.ndarray, truth_range_mm: tuple[float, float] = (1e-3, float("inf"))
+) -> float:
+    """Return s = median(g / d) over the compared pixels of one frame, (H, W) mm each; NaN where there are none."""
+    d, g, _ = compared_depths(predicted_mm, truth_mm, truth_range_mm)
+    return float(np.median(g / d)) if len(d) else float("nan")
+
+
+def scale_jitter(scales: np.ndarray) -> ScaleJitter:
+    """Return the jitter of one factor per frame (N,), in order, NaN where a frame has none."""
+    logs = np.log(np.asarray(scales, dtype=np.float64))
+    known, steps = logs[np.isfinite(logs)], np.abs(np.diff(logs))
+    steps = steps[np.isfinite(steps)]
+    log_std = float(np.std(known)) if len(known) > 1 else float("nan")
+    return ScaleJitter(len(known), log_std, float(np.mean(steps)) if len(steps) else float("nan"))
+
+
+def fit_sequence(pairs: DepthPairs, scaling: DepthScaling, truth_range_mm: tuple[float, float]) -> DepthFit:
+    """Return the one fit of `sequence-median` or `sequence-scale-and-shift` in one pass over the frames.
+
+    Every compared pixel of every frame has the same weight. The identity where no pixel can be compared.
+    """
+    sums, counts = np.zeros(5), np.zeros((2, int((_LOG_HIGH - _LOG_LOW) / _LOG_STEP) + 1), dtype=np.int64)
+    for predicted_mm, truth_mm in pairs():
+        d, g, _ = compared_depths(predicted_mm, truth_mm, truth_range_mm)
+        if scaling == "sequence-scale-and-shift":
+            sums += disparity_sums(d, g)
+        else:
+            for histogram, depths_mm in zip(counts, (d, g), strict=True):
+                bins = ((np.log(depths_mm) - _LOG_LOW) / _LOG_STEP).astype(np.int64)
+                np.add.at(histogram, np.clip(bins, 0, len(histogram) - 1), 1)
+    if scaling == "sequence-scale-and-shift":
+        return disparity_fit(sums, scaling)
+    if not counts.any():
+        return DepthFit(scaling)
+    predicted, true = (_median(histogram) for histogram in counts)
+    return DepthFit(scaling, true / predicted)
+
+
+def _median(histogram: np.ndarray) -> float:
+    """Return the mean of the two middle values of depths counted by their logarithm."""
+    below = np.cumsum(histogram)
+    middle = np.searchsorted(below, [(below[-1] - 1) // 2, below[-1] // 2], side="right")
+    return float(np.mean(np.exp(_LOG_LOW + (middle + 0.5) * _LOG_STEP)))

@@ -1,9 +1,7 @@
 """The figures of tables 1 to 3 of the paper (arXiv 2508.11282, section "Evaluation Metrics"), per axis and in all.
 
-The tables settle what the text leaves open. `T_avg`, though called "per-axis", is the mean norm of the translation
-error: in all rows of table 1 RMSE^2 = T_avg^2 + std^2. Rotations are radians: they end at 3.142. The interval of the
-RPE is not given: here it is 1 frame and 10 mm of reference path. The alignment is not given: it is the caller's.
-"T < T_avg" compares a method with its own mean and cannot rank methods; the shares of `PoseReport` can.
+The tables settle what the text leaves open: `T_avg` is the mean norm of the translation error, since RMSE^2 = T_avg^2 +
+std^2, and rotations are radians. The interval of the RPE is not given: here 1 frame and 10 mm of reference path.
 """
 
 from __future__ import annotations
@@ -14,13 +12,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.evaluation.pose_errors import (
+from scopemap.evaluation.poses import (
     ErrorSummary,
+    MatchedTrajectories,
+    length_ratio,
     rotation_errors,
     rotation_errors_rad,
+    rpe_over_frames,
+    rpe_over_path,
     translation_errors_mm,
 )
-from scopemap.evaluation.poses import MatchedTrajectories, length_ratio, rpe_over_frames, rpe_over_path
 from scopemap.geometry.align import align_trajectories
 
 _PATH_MM = 10.0
@@ -30,17 +31,14 @@ def paper_figures(matched: MatchedTrajectories) -> dict[str, Any]:
     """Return the paper's figures over the tracked frames, after the alignment of `matched`.
 
     `t_` is translation, `r_` rotation; `avg`, `std`, `rmse`, `fin`, `max` are mean, standard deviation (by N), root
-    mean square, the last tracked frame's, and the largest error. Rotations are in rad (the paper's unit) and in deg.
+    mean square, the last tracked frame's, and the largest error; `below_avg_percent` the share strictly below the mean.
 
-    t_avg_mm, t_std_mm, rmse_mm, t_fin_mm, t_max_mm, t_below_avg_percent : translation; the last is the share of frames
-        strictly below the mean.
-    r_avg_, r_std_, r_rmse_, r_fin_, r_max_ with rad and deg, r_below_avg_percent : rotation.
     rpe_1_frame_, rpe_10_mm_path_ with mm, std_mm, rad, std_rad, deg, std_deg : relative error, mean and deviation.
     tlr : estimated over reference path length before the alignment; lost_percent : share of matched frames lost.
-    t_fin_origin_mm, r_fin_origin_rad, r_fin_origin_deg : end-point drift, the last tracked frame's error after aligning
-        the first tracked poses, no scale; t_fin_origin_scaled_mm : the same with the scale of the alignment.
-    t_axes_mm : statistics (`ErrorSummary`) along x, y, z of the reference's first camera, since world axes differ from
-        data set to data set; r_axes_rad, r_axes_deg : about the axes of each reference camera, `R = R_z R_y R_x`.
+    t_fin_origin_mm, r_fin_origin_rad, r_fin_origin_deg : the last error after aligning the first tracked poses, no
+        scale; t_fin_origin_scaled_mm : with the scale of the alignment.
+    t_axes_mm : statistics along x, y, z of the reference's first camera; r_axes_rad, r_axes_deg : about the axes of
+        each reference camera, `R = R_z R_y R_x`.
     """
     ok = matched.tracked
     aligned, reference = matched.aligned[ok], matched.reference[ok]

@@ -1,7 +1,7 @@
-"""Pose errors of a trajectory against the reference: association of frames, alignment, and the figures.
+"""Pose errors of a trajectory against the reference: association, alignment, absolute (APE) and relative (RPE) errors.
 
-`match` associates and aligns once. The reports take its result: `pose_report` here, the paper's figures in `paper`,
-published protocols in `protocols`.
+Poses are camera to world, (N, 4, 4) float64, mm, matched row by row. Definitions: evo's documentation and Sturm et al.,
+"A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, section IV.
 """
 
 from __future__ import annotations
@@ -12,21 +12,101 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scopemap.errors import AlignmentError
-from scopemap.evaluation.pose_errors import (
-    ErrorSummary,
-    below_percent,
-    frame_pairs,
-    path_pairs,
-    relative_errors,
-    rotation_errors_rad,
-    translation_errors_mm,
-)
 from scopemap.geometry.align import AlignMode, Similarity, align_trajectories
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.trajectory.trajectory import Trajectory, path_length_mm
 
 MIN_MATCHED = 3
 # evo's 0.01 s, and a little over, since decimal time stamps are not exact in binary.
 _MOST_GAP_S = 0.01 + 1e-9
+# A pair over a path length is kept if its path differs by at most this share (evo's `rel_delta_tol`).
+_PATH_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Statistics of non-negative errors, in their unit; NaN where there are none. `std` divides by N, as in evo."""
+
+    mean: float
+    std: float
+    rmse: float
+    final: float
+    max: float
+    below_mean_percent: float
+    median: float
+    min: float
+    sse: float
+
+    @classmethod
+    def of(cls, errors: np.ndarray) -> ErrorSummary:
+        """Summarise errors of shape (N,)."""
+        if len(errors) == 0:
+            return cls(*[float("nan")] * 9)
+        mean, squares = float(np.mean(errors)), np.square(errors)
+        return cls(
+            mean=mean,
+            std=float(np.std(errors)),
+            rmse=float(np.sqrt(np.mean(squares))),
+            final=float(errors[-1]),
+            max=float(np.max(errors)),
+            below_mean_percent=below_percent(errors, mean),
+            median=float(np.median(errors)),
+            min=float(np.min(errors)),
+            sse=float(np.sum(squares)),
+        )
+
+
+def below_percent(errors: np.ndarray, limit: float) -> float:
+    """Return the share of errors (N,) strictly below `limit`, in percent; NaN where there are none."""
+    return float(100 * np.mean(errors < limit)) if len(errors) else float("nan")
+
+
+def translation_errors_mm(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the norms of `p_i - q_i`, (N,) mm: the absolute pose error (APE) in translation."""
+    return np.asarray(np.linalg.norm(estimated[:, :3, 3] - reference[:, :3, 3], axis=1))
+
+
+def rotation_errors(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the rotations `R(Q_i)^T R(P_i)`, (N, 3, 3), from the estimated to the reference camera."""
+    return np.swapaxes(reference[:, :3, :3], 1, 2) @ estimated[:, :3, :3]
+
+
+def rotation_errors_rad(estimated: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the angles of `rotation_errors`, (N,) rad in 0..pi: the absolute pose error (APE) in rotation."""
+    return rotation_angle_rad(rotation_errors(estimated, reference))
+
+
+def relative_errors(estimated: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return translation (M,) mm and rotation (M,) rad of `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)` for pairs (M, 2) of rows.
+
+    A rigid alignment changes neither; its scale changes the translation.
+    """
+    first, second = pairs[:, 0], pairs[:, 1]
+    motion_estimated = inverse(estimated[first]) @ estimated[second]
+    motion_reference = inverse(reference[first]) @ reference[second]
+    error = inverse(motion_reference) @ motion_estimated
+    return np.linalg.norm(error[:, :3, 3], axis=1), rotation_angle_rad(error[:, :3, :3])
+
+
+def frame_pairs(count: int, step: int) -> np.ndarray:
+    """Return all row pairs (M, 2) that are `step` rows apart."""
+    first = np.arange(count - step)
+    return np.stack([first, first + step], axis=1)
+
+
+def path_pairs(positions_mm: np.ndarray, length_mm: float) -> np.ndarray:
+    """Return row pairs (M, 2) with `length_mm` of path between them, measured along `positions_mm` (N, 3).
+
+    For each row the later row that comes closest, kept within 10 %.
+    """
+    path_mm = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions_mm, axis=0), axis=1))])
+    pairs = []
+    for row in range(len(path_mm) - 1):
+        miss_mm = np.abs(path_mm[row + 1 :] - path_mm[row] - length_mm)
+        nearest = int(np.argmin(miss_mm))
+        if miss_mm[nearest] <= _PATH_TOLERANCE * length_mm:
+            pairs.append((row, row + 1 + nearest))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -35,11 +115,10 @@ class MatchedTrajectories:
 
     Attributes
     ----------
-    estimated : (N, 4, 4) as estimated, mm; lost frames hold the last tracked pose.
-    aligned : (N, 4, 4) the same after the alignment, which is fitted on the tracked frames.
-    reference : (N, 4, 4), mm.
+    estimated, reference : (N, 4, 4) mm; lost frames hold the last tracked pose. aligned : `estimated` after the
+        alignment.
     tracked : (N,) bool, False where the estimate is lost.
-    align : mode of the alignment; similarity : its result.
+    align, similarity : mode of the alignment, fitted on the tracked frames, and its result.
     reference_frames, reference_in_span : reference poses, and those between the estimate's first and last frame.
     """
 
@@ -60,24 +139,21 @@ class MatchedTrajectories:
 
 @dataclass(frozen=True)
 class PoseReport:
-    """Pose errors of one trajectory. NaN where too few frames give a figure.
+    """Pose errors of one trajectory over the tracked frames. NaN where too few frames give a figure.
 
     Attributes
     ----------
-    frames, tracked : matched frames, and those of them that are not lost. All figures but the next are over these.
-    ate_hold_rmse_mm : over all matched frames, lost ones filled with the last tracked pose.
+    frames, tracked : matched frames, and those of them that are not lost.
     align, scale : mode of the alignment, and the scale that it found.
-    ate_rmse_mm, ate_mean_mm, ate_median_mm, ate_max_mm : absolute translation error after the alignment.
+    ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
     rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
     rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
     rpe_1_mm, rpe_1_deg, rpe_10_mm, rpe_10_deg : relative error over 1 and 10 frames, all pairs, RMSE, after scaling.
-    tlr : trajectory length ratio, estimated over reference path length, before the alignment.
     rpe_10mm_path_mm, rpe_10mm_path_deg : relative error over 10 mm (within 10 %) of reference path, all pairs, RMSE.
-    ate_below_1_mm_percent, ... : share of frames with an absolute error strictly below 1, 2, 5 mm and 1, 2, 5 deg.
-    coverage, reference_frames : tracked frames over the reference poses within the estimate's span, 0..1, and the
-        number of reference poses in all; a run that ended early has full coverage and few frames.
-    longest_tracked : matched frames in the longest run without loss.
-    frames_until_loss : matched frames before the first lost one; all where none is lost.
+    tlr : estimated over reference path length, before the alignment.
+    ..._below_..._percent : share of frames with an absolute error strictly below the limit.
+    coverage : tracked frames over the reference poses within the estimate's span, 0..1; reference_frames : in all.
+    longest_tracked, frames_until_loss : matched frames in the longest run without loss, and before the first loss.
     """
 
     frames: int
@@ -134,9 +210,8 @@ def associate(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, 
 def match(
     estimate: Trajectory, reference: Trajectory, align: AlignMode, *, first: int | None = None
 ) -> MatchedTrajectories:
-    """Associate, fill lost frames with the last tracked pose, and align on the tracked frames.
+    """Associate, fill lost frames with the last tracked pose, and align on the tracked frames, or the `first` of them.
 
-    `first` fits the alignment on that many tracked frames only. Frames that are lost in the reference are left out.
     Raises `AlignmentError` where fewer than 3 tracked frames match or the fit is degenerate.
     """
     known = reference.rows(reference.tracked)

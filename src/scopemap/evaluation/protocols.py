@@ -12,16 +12,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from scopemap.errors import check_shape
-from scopemap.evaluation.pose_errors import (
+from scopemap.evaluation.poses import (
     ErrorSummary,
     frame_pairs,
+    match,
     path_pairs,
     relative_errors,
     rotation_errors_rad,
     translation_errors_mm,
 )
-from scopemap.evaluation.poses import match
 from scopemap.geometry.align import AlignMode, align_trajectories
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.trajectory.trajectory import Trajectory
@@ -34,57 +33,33 @@ _SURGCUT3R_FRAMES = 16
 
 
 @dataclass(frozen=True)
-class ProtocolReport:
-    """Figures of one protocol.
-
-    Attributes
-    ----------
-    protocol : its name, as in `PROTOCOLS`.
-    figures : value by name; every name begins with the protocol's (`-` as `_`) and ends with its unit. NaN where too
-        few frames give a figure.
-    frames, lost : frames that were used, and matched frames that were left out because they are lost.
-    description : one sentence: alignment, pairs, unit, deviations from evo.
-    source : the repository and file that define it.
-    """
-
-    protocol: str
-    figures: dict[str, float]
-    frames: int
-    lost: int
-    description: str
-    source: str
-
-
-@dataclass(frozen=True)
 class Protocol:
     """A published protocol: call it with estimate and reference.
 
     Attributes
     ----------
-    name, description, source : as in `ProtocolReport`.
-    figures : from estimated and reference camera-to-world poses, (N, 4, 4) mm, to figures without the name's prefix.
+    name : as in `PROTOCOLS`.
+    description : one sentence: alignment, pairs, unit, deviations from evo.
+    source : the repository and file that define it.
+    measure : from estimated and reference camera-to-world poses, (N, 4, 4) mm, to figures without the name's prefix.
     """
 
     name: str
     description: str
     source: str
-    figures: Callable[[np.ndarray, np.ndarray], dict[str, float]]
+    measure: Callable[[np.ndarray, np.ndarray], dict[str, float]]
 
-    def __call__(self, estimate: Trajectory, reference: Trajectory) -> ProtocolReport:
-        """Match by `poses.match`, leave lost frames out, and measure.
+    def __call__(self, estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
+        """Return the figures over the tracked frames; each name begins with the protocol's and ends with its unit.
 
-        Raises `AlignmentError` where fewer than 3 tracked frames match or a fit is degenerate.
+        NaN where too few frames give a figure. Raises `AlignmentError` where fewer than 3 tracked frames match or a fit
+        is degenerate.
         """
         matched = match(estimate, reference, "none")
         ok = matched.tracked
-        figures = self.figures(matched.estimated[ok], matched.reference[ok])
-        return self.report(figures, int(np.count_nonzero(ok)), int(np.count_nonzero(~ok)))
-
-    def report(self, figures: dict[str, float], frames: int, lost: int) -> ProtocolReport:
-        """Return the report of figures, whose names get the protocol's as a prefix."""
         prefix = self.name.replace("-", "_")
-        named = {f"{prefix}_{name}": float(value) for name, value in figures.items()}
-        return ProtocolReport(self.name, named, frames, lost, self.description, self.source)
+        figures = self.measure(matched.estimated[ok], matched.reference[ok])
+        return {f"{prefix}_{name}": float(value) for name, value in figures.items()}
 
 
 def _errors(aligned: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> dict[str, ErrorSummary]:
@@ -141,23 +116,17 @@ def _robust_pose_estimator(estimated: np.ndarray, reference: np.ndarray) -> dict
 
 def _af(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Return the figures of `T_k = w2c_{k+1} w2c_k^-1`; across a lost frame the motion spans the gap in both."""
-    return _af_relative(*(inverse(T[1:]) @ T[:-1] for T in (estimated, reference)))
+    return af_figures(*(inverse(T[1:]) @ T[:-1] for T in (estimated, reference)))
 
 
-def af_from_relative(estimated: np.ndarray, reference: np.ndarray) -> ProtocolReport:
-    """Return the AF report of relative poses, both (K, 4, 4), target frame <- source frame, mm.
+def af_figures(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Return the AF figures of relative poses, both (K, 4, 4), target frame <- source frame, mm.
 
     K poses make K - 1 windows of up to 4. The chain `c <- c T` from the identity gives positions and rotations that are
     no camera path, as T is not inverted; the published figures are made so. With positions p, q of a window of n:
     `ATE = sqrt(sum (s p - q)^2) / n`, `s = sum(p q) / sum(p p)`; `RE = mean angle(R_q R_p^-1)`, rad. `ci95` bounds the
     mean ATE by Student's t as EndoDAC does.
     """
-    check_shape("estimated", estimated, (None, 4, 4))
-    check_shape("reference", reference, (len(estimated), 4, 4))
-    return PROTOCOLS["af"].report(_af_relative(estimated, reference), len(estimated) + 1, 0)
-
-
-def _af_relative(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     windows = [slice(start, start + _AF_MOTIONS) for start in range(len(estimated) - 1)]
     errors = [_snippet_errors(_chain(estimated[window]), _chain(reference[window])) for window in windows]
     ate_mm, re_rad = np.array(errors, dtype=np.float64).reshape(-1, 2).T

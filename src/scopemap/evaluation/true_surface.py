@@ -2,13 +2,11 @@
 
 | data | the true surface | observed part |
 |---|---|---|
-| phantom | `mesh_truth.ply`: the shape at rest wherever a ray met it, and a rim of 2 voxels | `TrueSurface.seen_by` |
+| phantom | `mesh_truth.ply`: the shape at rest wherever a ray met it | `TrueSurface.seen_by` |
 | C3VD | `coverage_mesh.obj`: the whole model, world mm | in the file, face by face |
-| SCARED keyframe | `left_depth_map.tiff` or `point_cloud.obj`: points of one view | all; beyond it nothing is known |
-| 7-Scenes | none | |
+| SCARED keyframe | `left_depth_map.tiff` or `point_cloud.obj`: points of one view | all |
 
-Tissue of a phantom may breathe. The shape at rest is that of frame 0 and of every whole breath; a method that takes the
-tissue as rigid is measured against this one shape, and its errors include the breath.
+A method that takes breathing tissue as rigid is measured against the shape at rest; its errors include the breath.
 """
 
 from __future__ import annotations
@@ -21,15 +19,15 @@ import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.errors import InputError, check_shape
-from scopemap.evaluation.registration import refine
+from scopemap.errors import InputError
 from scopemap.evaluation.surface import (
-    DistanceSummary,
     Surface,
     compare_surfaces,
+    distance_figures,
     distances_mm,
     is_empty,
     normal_consistency,
+    refine,
     surface_points,
 )
 from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, visible_from
@@ -61,14 +59,9 @@ class TrueSurface:
     T_view: np.ndarray | None = None
     reach_px: float = 1.0
 
-    def __post_init__(self) -> None:
-        if self.seen is not None:
-            check_shape("TrueSurface.seen", self.seen, (len(self._mesh.faces),))
-
     @property
     def _mesh(self) -> trimesh.Trimesh:
-        if not isinstance(self.surface, trimesh.Trimesh):
-            raise ValueError("TrueSurface: points have no faces that could be seen; leave unseen points out")
+        assert isinstance(self.surface, trimesh.Trimesh), "points have no faces that could be seen"
         return self.surface
 
     @property
@@ -83,9 +76,8 @@ class TrueSurface:
     ) -> TrueSurface:
         """Return the mesh with a new `seen`: the faces whose centre some view sees (`seen_samples`).
 
-        Views are (T_world_camera (4, 4), true depth (H, W) mm). Where the tissue moves, each is compared with the mesh
-        of its own frame; `indices` are the frame numbers of the views, None: 0, 1, 2 and so on. Raises `InputError`
-        where no face is seen, and where a frame's mesh is missing or has other faces.
+        Where the tissue moves, each view is compared with the mesh of its own frame, numbered by `indices` or 0, 1, 2.
+        Raises `InputError` where no face is seen, and where a frame's mesh is missing or has other faces.
         """
 
         def centres_then(number: int) -> np.ndarray:
@@ -112,8 +104,7 @@ class TrueSurface:
 def read_true_surface(folder: Path) -> TrueSurface | None:
     """Return the true surface in the folder of a phantom, a C3VD video or a SCARED keyframe; None where there is none.
 
-    SCARED's points are in the left camera at the keyframe, which is the world of its poses. Raises `InputError` for a
-    file that cannot be read.
+    SCARED's points are in the left camera at the keyframe, the world of its poses. `InputError` for an unreadable file.
     """
     folder = Path(folder)
     if (folder / _PHANTOM).is_file():
@@ -139,19 +130,16 @@ def measure_surface(
 ) -> dict[str, float]:
     """Return every figure of a predicted surface, which the alignment of the trajectories has moved to the true world.
 
-    The names of `SurfaceReport.figures`, and `normal_consistency` (NaN unless both are meshes); with `icp` also
-    accuracy_icp_*, icp_rms_before_mm and icp_rms_after_mm (`registration.refine`). Where nothing was predicted, recall,
-    F and coverage are 0 and all else that depends on a prediction is NaN.
-
-    Against a truth of one view, only the part of the prediction is measured that the view sees on pixels with a truth.
-    This needs the `camera` of the view, at any size, rectified or not; other truths do not use it.
+    The names of `compare_surfaces`, and `normal_consistency`; with `icp` also accuracy_icp_*, icp_rms_before_mm and
+    icp_rms_after_mm. Against a truth of one view, only the part of the prediction is measured that the view, whose
+    `camera` is then needed, sees on pixels with a truth.
     """
     if truth.T_view is not None:
         if camera is None:
             raise ValueError("measure_surface: a truth of one view needs the camera of that view")
         valid = pixels_near(surface_points(truth.surface), camera, truth.T_view, radius_px=truth.reach_px)
         predicted = visible_from(predicted, camera, truth.T_view, valid)
-    figures = compare_surfaces(predicted, truth.surface, observed=truth.observed).figures
+    figures = compare_surfaces(predicted, truth.surface, observed=truth.observed)
     figures["normal_consistency"] = normal_consistency(predicted, truth.surface)
     return figures | (_icp_figures(predicted, truth.surface) if icp else {})
 
@@ -160,11 +148,10 @@ def _icp_figures(predicted: Surface, truth: Surface) -> dict[str, float]:
     before_mm = after_mm = float("nan")
     distances = np.empty(0)
     if not is_empty(predicted):
-        found = refine(predicted, truth)
-        before_mm, after_mm = found.rms_before_mm, found.rms_after_mm
-        distances = distances_mm(found.similarity.transform_points(surface_points(predicted)), truth)
+        similarity, before_mm, after_mm = refine(predicted, truth)
+        distances = distances_mm(similarity.transform_points(surface_points(predicted)), truth)
     rms = {"icp_rms_before_mm": before_mm, "icp_rms_after_mm": after_mm}
-    return DistanceSummary.of(distances).figures("accuracy_icp") | rms
+    return distance_figures("accuracy_icp", distances) | rms
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh:
@@ -180,8 +167,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
 def _read_coverage(path: Path) -> TrueSurface:
     """Read C3VD's mesh: `v x y z`, two `vt`, `f v/vt[/vn] ...`, all corners of a face with vt 1 = observed, 2 = missed.
 
-    Source: the data set's page and `RenderingModule.cpp`, `writeOBJ` (github.com/DurrLab/C3VD). Readers of OBJ give
-    texture coordinates, not their indices, and may reorder or split vertices: hence read here.
+    Source: `RenderingModule.cpp`, `writeOBJ` (github.com/DurrLab/C3VD). Readers of OBJ give no indices of `vt`.
     """
     lines = _read_lines(path)
     vertices = _numbers(path, [line[2:] for line in lines if line.startswith("v ")])

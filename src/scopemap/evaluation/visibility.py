@@ -9,9 +9,7 @@ import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.errors import check_shape
-from scopemap.evaluation.point_to_mesh import small_triangles
-from scopemap.evaluation.surface import Surface, is_empty
+from scopemap.evaluation.surface import Surface, is_empty, small_triangles
 from scopemap.geometry.se3 import inverse, transform
 
 TrueView = tuple[np.ndarray, np.ndarray]
@@ -32,16 +30,12 @@ def seen_samples(
 ) -> np.ndarray:
     """Return which points (N, 3) of a surface, true world mm, were seen by at least one view: (N,) bool.
 
-    A view sees a point that projects onto a pixel whose true depth is within 2 % of the point's own z. 2 % allows for
-    walls that slope within a pixel; a point that close behind an edge passes, too.
-
-    `moved` gives the points (N, 3) at the time of the k-th view, counted from 0, where the tissue moves. `views` may be
-    a generator; when all points are seen, no more views are taken.
+    A view sees a point that projects onto a pixel whose true depth is within 2 % of the point's own z, which allows for
+    walls that slope within a pixel. `moved` gives the points (N, 3) at the time of the k-th view, where the tissue
+    moves.
     """
-    check_shape("points_mm", points_mm, (None, 3))
     seen = np.zeros(len(points_mm), dtype=bool)
     for number, (T_world_camera, depth_mm) in enumerate(views):
-        check_shape("depth_mm", depth_mm, (camera.height, camera.width))
         unseen = np.flatnonzero(~seen)
         now = (points_mm if moved is None else moved(number))[unseen]
         rows, columns, z_mm, inside = _pixels(now, camera, T_world_camera)
@@ -58,15 +52,11 @@ def visible_from(
 ) -> Surface:
     """Return the part of a surface, world mm, that one view sees on its `valid` pixels (H, W), None: on all.
 
-    A mesh hides itself: its triangles, subdivided to 2 mm, are painted from far to near on a grid at least 1280 wide; a
-    triangle is kept unless the ray to its centre meets the triangle painted there more than 1 % nearer. Points hide
-    nothing: those in front of the camera on valid pixels are kept. A mesh gives a mesh, points give points; either may
-    be empty.
+    A mesh hides itself: its triangles, subdivided to 2 mm, are painted from far to near on a grid at least 1280 wide;
+    one is kept unless the ray to its centre meets the triangle painted there more than 1 % nearer. Points hide nothing.
     """
     usable = np.ones((camera.height, camera.width), dtype=bool) if valid is None else valid
-    check_shape("valid", usable, (camera.height, camera.width))
     if not isinstance(surface, trimesh.Trimesh):
-        check_shape("surface", surface, (None, 3))
         rows, columns, _, inside = _pixels(surface, camera, T_world_camera)
         return surface[inside[usable[rows, columns]]]
     if is_empty(surface):
@@ -84,7 +74,6 @@ def pixels_near(
     points_mm: np.ndarray, camera: CameraModel, T_world_camera: np.ndarray, *, radius_px: float
 ) -> np.ndarray:
     """Return the pixels (H, W) bool within `radius_px` of the projection of any point (N, 3), world mm."""
-    check_shape("points_mm", points_mm, (None, 3))
     hit = np.zeros((camera.height, camera.width), dtype=np.uint8)
     rows, columns, _, _ = _pixels(points_mm, camera, T_world_camera)
     hit[rows, columns] = 1
@@ -107,8 +96,8 @@ def _pixels(
 def _hidden(triangles: np.ndarray, chosen: np.ndarray, camera: CameraModel) -> np.ndarray:
     """Return which of the `chosen` (M,) triangles (F, 3, 3), in the camera and centred in the image, are hidden.
 
-    The distance of the painted triangle on the ray to a centre is that of its plane, so that neighbours on a wall seen
-    at a grazing angle do not hide each other.
+    The painted triangle's plane is compared, so that neighbours on a wall seen at a grazing angle do not hide each
+    other.
     """
     finer = -(-_PAINTED_PX // camera.width)
     grid = camera.resized(finer * camera.width, finer * camera.height)

@@ -19,13 +19,7 @@ Stretch = tuple[int, int]
 
 @dataclass(frozen=True)
 class VideoFinding(checking.Finding):
-    """One finding about a video.
-
-    Attributes
-    ----------
-    advice : what to do about it, the option in full, or "".
-    stretches : the frames that it is about; empty: the whole video.
-    """
+    """One finding: `advice` is the option in full, or ""; `stretches` are its frames, empty: the whole video."""
 
     advice: str = ""
     stretches: tuple[Stretch, ...] = ()
@@ -57,13 +51,7 @@ def worded(stretches: Sequence[Stretch]) -> str:
 
 @dataclass(frozen=True)
 class Clip:
-    """The frames that were read.
-
-    Attributes
-    ----------
-    measures : of every frame, in order. stamped : whether its time stamps are the video's own, not counted.
-    selection : the positions that were to be read.
-    """
+    """The frames that were read: their measures, whether time stamps are the video's own, and the selection."""
 
     measures: tuple[FrameMeasures, ...]
     stamped: bool

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import av
 
@@ -13,51 +13,12 @@ _FULL_RANGE = 2
 _PROGRESSIVE = 1
 
 
-@dataclass(frozen=True)
-class Container:
-    """Facts of a video file; None: not in the header.
+def read_container(media: str) -> dict[str, Any] | None:
+    """Return the facts in the header and first picture of a video, None where it cannot be opened.
 
-    Attributes
-    ----------
-    pixel_aspect : width of a pixel over its height. bits : per colour channel. full_range : whether levels use 0..255
-    (as opposed to 16..235). rotation_deg : by which a player rotates the picture. interlaced : by the header.
+    pixel_aspect : width of a pixel over its height. bits : per colour channel. full_range : whether levels use 0..255.
+    rotation_deg : by which a player rotates the picture. interlaced : by the header. A fact is None if it is not there.
     """
-
-    container: str
-    codec: str
-    width: int
-    height: int
-    rate_hz: float | None
-    pixel_aspect: float
-    pixel_format: str
-    bits: int
-    full_range: bool
-    rotation_deg: int
-    interlaced: bool
-    frames: int | None
-    length_s: float | None
-
-    def findings(self) -> list[VideoFinding]:
-        """Return what in the header is unusual."""
-        found = []
-        if abs(self.pixel_aspect - 1) > 1e-3:
-            message = f"pixels are {self.pixel_aspect:.4g} times as wide as high; runs reckon with it"
-            found.append(VideoFinding("info", "pixel-aspect", message))
-        if self.bits > 8:
-            found.append(VideoFinding("info", "bit-depth", f"{self.bits} bits per channel; runs work on 8"))
-        if self.rotation_deg:
-            message = f"players turn the picture by {self.rotation_deg} deg"
-            found.append(
-                VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see")
-            )
-        if self.interlaced:
-            message = "the header says that the pictures are interlaced"
-            found.append(VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too"))
-        return found
-
-
-def read_container(media: str) -> Container | None:
-    """Return the facts in the header and first picture of a video, None where it cannot be opened."""
     try:
         with av.open(media, "r", metadata_errors="replace") as container:
             stream = next(iter(container.streams.video), None)
@@ -67,20 +28,37 @@ def read_container(media: str) -> Container | None:
             length_s = container.duration / av.time_base if container.duration else None
             if stream.duration and stream.time_base:
                 length_s = float(stream.duration * stream.time_base)
-            return Container(
-                container=container.format.name,
-                codec=stream.codec_context.name,
-                width=first.width,
-                height=first.height,
-                rate_hz=float(stream.average_rate) if stream.average_rate else None,
-                pixel_aspect=float(stream.sample_aspect_ratio or 1),
-                pixel_format=first.format.name,
-                bits=max(component.bits for component in first.format.components),
-                full_range=first.color_range == _FULL_RANGE or first.format.name.startswith("yuvj"),
-                rotation_deg=int(first.rotation),
-                interlaced=bool(first.interlaced_frame or stream.codec_context.field_order > _PROGRESSIVE),
-                frames=stream.frames or None,
-                length_s=length_s,
-            )
+            return {
+                "container": container.format.name,
+                "codec": stream.codec_context.name,
+                "width": first.width,
+                "height": first.height,
+                "rate_hz": float(stream.average_rate) if stream.average_rate else None,
+                "pixel_aspect": float(stream.sample_aspect_ratio or 1),
+                "pixel_format": first.format.name,
+                "bits": max(component.bits for component in first.format.components),
+                "full_range": first.color_range == _FULL_RANGE or first.format.name.startswith("yuvj"),
+                "rotation_deg": int(first.rotation),
+                "interlaced": bool(first.interlaced_frame or stream.codec_context.field_order > _PROGRESSIVE),
+                "frames": stream.frames or None,
+                "length_s": length_s,
+            }
     except (av.FFmpegError, OSError, ValueError):
         return None
+
+
+def check_container(facts: dict[str, Any]) -> list[VideoFinding]:
+    """Return what in the header is unusual."""
+    found = []
+    if abs(facts["pixel_aspect"] - 1) > 1e-3:
+        message = f"pixels are {facts['pixel_aspect']:.4g} times as wide as high; runs reckon with it"
+        found.append(VideoFinding("info", "pixel-aspect", message))
+    if facts["bits"] > 8:
+        found.append(VideoFinding("info", "bit-depth", f"{facts['bits']} bits per channel; runs work on 8"))
+    if facts["rotation_deg"]:
+        message = f"players turn the picture by {facts['rotation_deg']} deg"
+        found.append(VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see"))
+    if facts["interlaced"]:
+        message = "the header says that the pictures are interlaced"
+        found.append(VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too"))
+    return found

@@ -35,14 +35,12 @@ _EDGE_PX = 2
 
 @dataclass(frozen=True)
 class Field:
-    """The field of view of a video.
+    """The field of view of a video, in shares of width and height.
 
     Attributes
     ----------
     shape : full: no border; bars: a rectangle inside borders. share : of the picture.
-    outline : (N, 2) float, x, y of all that was ever lit, shares of the picture's width and height.
-    moved : by which share of the width or height it moves in the picture.
-    box : left, top, right, bottom, shares of width and height.
+    outline : (N, 2) x, y of all that was ever lit. moved : by how much it moves. box : left, top, right, bottom.
     """
 
     shape: Shape

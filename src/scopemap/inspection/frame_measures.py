@@ -29,10 +29,10 @@ class FrameMeasures:
     Attributes
     ----------
     position : in the input, from 0, as `--frames` counts. index, time_s : from the reader.
-    blank : whether it shows nothing, or next to nothing that is not black. brightness : mean level in the field, 0-255.
-    detail : the tracker's measure of sharpness. change : mean difference from the last frame that was no repeat, grey
-    levels; infinite for the first. motion : median flow since the frame before, share of the width.
-    redness : mean red over the mean of the stronger of green and blue. clipped, dark, highlights : shares of the field.
+    blank : whether it shows next to nothing that is not black. brightness : mean level in the field, 0-255.
+    detail : the tracker's sharpness. change : mean difference from the last frame that was no repeat, grey levels.
+    motion : median flow since the frame before, share of the width.
+    redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the field.
     usable : share of the frame that a run would use.
     """
 

@@ -23,11 +23,10 @@ from scopemap.inspection.checks import (
     repeated,
 )
 from scopemap.inspection.clip import Clip, VideoFinding
-from scopemap.inspection.container import Container, read_container
+from scopemap.inspection.container import check_container, read_container
 from scopemap.inspection.field import Field, FieldWatcher
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
-from scopemap.inspection.insets import InsetWatcher
-from scopemap.inspection.overlays import Overlay, OverlayWatcher
+from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher
 from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import UNKNOWN_MAKE
@@ -50,15 +49,14 @@ class Inspection:
     Attributes
     ----------
     path : the file or folder. size : of a picture (of one view, if there are two), px. clip : figures of every picture.
-    container : facts in the file's header, None for folders. packed : layout of two views in a picture, or None.
-    field, overlays : as found. insets : left, top, right, bottom, shares of width and height.
-    findings : worst first. samples : a few views, evenly spread.
+    container : facts in the file's header, or None. packed : layout of two views in a picture, or None.
+    insets : left, top, right, bottom, shares of width and height. findings : worst first. samples : a few views.
     """
 
     path: Path
     size: tuple[int, int]
     clip: Clip
-    container: Container | None
+    container: dict[str, Any] | None
     packed: Packing | None
     field: Field
     overlays: tuple[Overlay, ...]
@@ -70,7 +68,7 @@ class Inspection:
     def facts(self) -> dict[str, Any]:
         """What the video is, and the usual shares of its pictures; what is not known is left out."""
         times_s = self.clip["time_s"]
-        facts: dict[str, Any] = {} if self.container is None else asdict(self.container)
+        facts = dict(self.container or {})
         facts |= {"width": self.size[0], "height": self.size[1], "pictures": len(self.clip)}
         facts |= {"span_s": float(times_s[-1] - times_s[0]), "usual_rate_hz": self.clip.rate_hz}
         facts |= {
@@ -104,9 +102,8 @@ def inspect(
 ) -> Inspection:
     """Read a video, a folder of images or a data set's folder once and return what was found.
 
-    `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called
-    after each. Raises `InputError` and `CalibrationError` where it cannot be opened, or holds fewer than two pictures.
-    Where reading stops later, that is a finding.
+    `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after
+    each. Raises `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
     """
     plain = InputSettings(stereo="none", skip_duplicates=False)
     # Whether there are two views comes first: the camera may be that of one.
@@ -133,8 +130,8 @@ def inspect(
     findings = [
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
         *_of_source(sequence.warnings),
-        *(container.findings() if container is not None else []),
-        *check_timing(clip, container.length_s if container is not None else None),
+        *(check_container(container) if container else []),
+        *check_timing(clip, container["length_s"] if container else None),
         *check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
         *check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),

@@ -1,8 +1,9 @@
-"""Text, logos and icons burned into the picture, inside the field of view or beside it."""
+"""Text, logos and icons burned into the picture, and pictures in the picture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -16,6 +17,13 @@ _MARGIN_SHARE, _NEAR_PX, _BLACK_PX = 0.02, 3, 9
 _JOIN_SHARE = 0.02
 _LEAST_TIMES, _LEAST_TIMES_SHARE = 12, 0.05
 _LEAST_BOX_PX = 3
+Box = tuple[int, int, int, int]
+
+# A static edge is this much stronger, on average, than the image beside it.
+_RIDGE, _RIDGE_LEVELS, _BESIDE_PX = 1.6, 4.0, 9
+_LEAST_SIDE, _LARGEST_SHARE, _COVERED = 0.08, 0.45, 0.85
+_LEAST_CHANGE, _LEAST_PICTURES, _MOST_LINES = 2.0, 12, 12
+_MOVED_PX = 0.004
 
 
 @dataclass(frozen=True)
@@ -100,3 +108,96 @@ def _places(overlays: list[Overlay]) -> str:
     middles = ((np.mean(one.box[::2]), np.mean(one.box[1::2])) for one in overlays[:4])
     named = ", ".join(f"at {x:.0%} of the width and {y:.0%} of the height" for x, y in middles)
     return named + (", ..." if len(overlays) > 4 else "")
+
+
+class InsetWatcher:
+    """Accumulates the edges of all frames in which something moves."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last: np.ndarray | None = None
+        self._across = self._down = self._change = np.zeros((0, 0), np.float32)
+        self._field: np.ndarray = np.zeros((0, 0), bool)
+
+    def add(self, item: InspectedFrame) -> None:
+        """Add the next frame."""
+        grey = cv2.cvtColor(item.small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        if self._last is None or self._last.shape != grey.shape:
+            self._count, self._last = 0, grey
+            self._across, self._down, self._change = (np.zeros_like(grey) for _ in range(3))
+        if item.measures.blank or item.measures.motion < _MOVED_PX:
+            return
+        self._count += 1
+        self._across[:, 1:] += np.abs(np.diff(grey, axis=1))
+        self._down[1:] += np.abs(np.diff(grey, axis=0))
+        self._change += cv2.absdiff(grey, self._last)
+        self._last, self._field = grey, item.field
+
+    def boxes(self) -> list[Box]:
+        """Return the insets: left, top, right, bottom in px of the small pictures, right and bottom excluded."""
+        if self._count < _LEAST_PICTURES:
+            return []
+        height, width = self._across.shape
+        upright = _lines(self._across / self._count, round(_LEAST_SIDE * height))
+        level = _lines((self._down / self._count).T, round(_LEAST_SIDE * width)).T
+        columns, rows = _strongest(upright.sum(0)), _strongest(level.sum(1))
+        across, down = (
+            list(combinations(sorted({0, *sides, end}), 2)) for sides, end in ((columns, width), (rows, height))
+        )
+        boxes = [(left, top, right, bottom) for left, right in across for top, bottom in down]
+        return _largest_first([box for box in boxes if self._is_inset(box, upright, level)])
+
+    def findings(self) -> list[VideoFinding]:
+        """Return a finding where there is an inset."""
+        boxes = self.boxes()
+        if not boxes:
+            return []
+        height, width = self._across.shape
+        places = ", ".join(
+            f"{x0 / width:.0%}-{x1 / width:.0%} of the width, {y0 / height:.0%}-{y1 / height:.0%} of the height"
+            for x0, y0, x1, y1 in boxes
+        )
+        message = f"picture in picture: {places} shows something else"
+        advice = "leave it out: --masks FOLDER of this command writes a mask, --set mask.files=FOLDER of a run reads it"
+        return [VideoFinding("warning", "inset", message, advice)]
+
+    def _is_inset(self, box: Box, upright: np.ndarray, level: np.ndarray) -> bool:
+        left, top, right, bottom = box
+        height, width = upright.shape
+        if (right - left) < _LEAST_SIDE * width or (bottom - top) < _LEAST_SIDE * height:
+            return False
+        if (right - left) * (bottom - top) > _LARGEST_SHARE * width * height:
+            return False
+        sides = [upright[top:bottom, x].mean() for x in (left, right) if 0 < x < width]
+        sides += [level[y, left:right].mean() for y in (top, bottom) if 0 < y < height]
+        if len(sides) < 2 or min(sides) < _COVERED:
+            return False
+        inner = np.s_[top + 2 : bottom - 2, left + 2 : right - 2]
+        changes = self._change[inner].mean() / self._count >= _LEAST_CHANGE
+        # Black bars at the picture's edge have straight sides, too, but show nothing.
+        return bool(changes and self._field[inner].mean() > 0.5)
+
+
+def _lines(strength: np.ndarray, least_px: int) -> np.ndarray:
+    """Return static upright edges, (H, W) bool, each at least `least_px` long and widened by a pixel."""
+    beside = cv2.blur(strength, (_BESIDE_PX, 1))
+    ridge = (strength > _RIDGE * (beside * _BESIDE_PX - strength) / (_BESIDE_PX - 1)) & (strength > _RIDGE_LEVELS)
+    closed = cv2.morphologyEx(ridge.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 1), np.uint8))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((max(3, least_px), 1), np.uint8))
+    return cv2.dilate(opened, np.ones((1, 3), np.uint8)) > 0
+
+
+def _strongest(lengths: np.ndarray) -> list[int]:
+    """Return the middles of the longest groups of lines."""
+    groups = np.split(np.flatnonzero(lengths), np.flatnonzero(np.diff(np.flatnonzero(lengths)) > 1) + 1)
+    found = sorted(((int(lengths[g].max()), int(np.round(g.mean()))) for g in groups if g.size), reverse=True)
+    return [middle for _, middle in found[:_MOST_LINES]]
+
+
+def _largest_first(boxes: list[Box]) -> list[Box]:
+    """Return boxes of which none overlaps a larger one that was kept."""
+    kept: list[Box] = []
+    for box in sorted(boxes, key=lambda b: -(b[2] - b[0]) * (b[3] - b[1])):
+        if all(box[2] <= k[0] or k[2] <= box[0] or box[3] <= k[1] or k[3] <= box[1] for k in kept):
+            kept.append(box)
+    return kept

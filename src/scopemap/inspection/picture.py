@@ -40,9 +40,8 @@ _BANDS = {
 def draw_inspection(inspection: Inspection, file: Path) -> None:
     """Draw an inspection as a PNG.
 
-    Above, frames of the video: field of view cyan, overlays yellow, pictures in the picture magenta. Below them, the
-    same as a run sees them: what its mask leaves out is tinted blue. Then figures over time, and a band for each
-    kind of finding about stretches of frames.
+    Above, frames of the video: field of view cyan, overlays yellow, pictures in the picture magenta. Below them, what
+    the mask of a run leaves out, in blue. Then figures over time, and a band for each kind of finding.
     """
     views = _chosen(inspection.samples)
     bands = [(f.code, f.stretches) for f in inspection.findings if f.stretches and f.code in _BANDS]

@@ -10,11 +10,6 @@ _SPEED_MM = 0.45
 _SWAY_FRAMES = (90.0, 170.0)
 
 
-def c3vd_line(T_world_camera: np.ndarray) -> str:
-    """Return one line of C3VD's `pose.txt`: 16 numbers, transposed, so that the translation is the last row."""
-    return ",".join(f"{value:.9g}" for value in T_world_camera.T.ravel())
-
-
 def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
     """Return a hand-like path along a winding or straight tube, (frames, 4, 4): forward, or forward and back."""
     rng = np.random.default_rng((seed, 1))
@@ -28,7 +23,8 @@ def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np
     guide = np.cumsum(heading * (stations[1] - stations[0]), axis=0)
     guide -= guide[0]
     here = progress * length
-    positions = _interpolate(here, stations, guide) + _sway(frames, loop, rng, (2.0, 2.0, 1.2))
+    positions = np.stack([np.interp(here, stations, column) for column in guide.T], -1)
+    positions += _sway(frames, loop, rng, (2.0, 2.0, 1.2))
     angles = np.stack([np.interp(here, stations, -pitch), np.interp(here, stations, yaw), 0 * here], -1)
     return _poses(positions, 0.8 * angles + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
 
@@ -74,10 +70,6 @@ def _sway(
         else:
             columns.append(amplitude * _wander(np.arange(frames), rng, frames_per_cycle))
     return np.stack(columns, -1)
-
-
-def _interpolate(x: np.ndarray, stations: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(x, stations, column) for column in values.T], -1)
 
 
 def _poses(positions: np.ndarray, rotation_vectors: np.ndarray, loop: bool) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Deformation: breathing tissue, as a smooth periodic displacement with bounded gradient.
 
-The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves. The truth is exact:
-rays are marched through the warped shape, and points of the rest surface are moved by solving p = q + u(p).
+The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves.
 """
 
 from __future__ import annotations
@@ -15,12 +14,7 @@ _FIXED_POINT_STEPS = 40
 
 @dataclass(frozen=True)
 class Displacement:
-    """The displacement of one instant.
-
-    Attributes
-    ----------
-    waves : (M, 7) float64, per wave: wave vector (rad/mm), amplitude vector (mm), phase (rad); M = 0: tissue at rest.
-    """
+    """The displacement of one instant: `waves` (M, 7) float64, wave vector (rad/mm), amplitude (mm), phase (rad)."""
 
     waves: np.ndarray
 
@@ -53,13 +47,7 @@ REST = Displacement(np.zeros((0, 7)))
 
 @dataclass(frozen=True)
 class Breathing:
-    """Breathing: waves that swell and sink together; frame 0 and every whole period are at rest.
-
-    Attributes
-    ----------
-    waves : (M, 7) float64 as in `Displacement`, at full breath.
-    period_frames : frames per breath.
-    """
+    """Waves (M, 7) as in `Displacement`, at full breath; frame 0 and every `period_frames` frames are at rest."""
 
     waves: np.ndarray
     period_frames: float

@@ -1,7 +1,6 @@
 """Lumens built around a camera path: the colon with folds and haustra, and the straight featureless tube.
 
-A lumen is a smooth union of balls strung along the path and beyond it, so the camera is always in
-free space, and the wall around it is a closed, winding tube.
+A lumen is a smooth union of balls along the path and beyond it, so the camera is always in free space.
 """
 
 from __future__ import annotations
@@ -45,7 +44,8 @@ def colon_volume(poses: np.ndarray, seed: int) -> Volume:
 
 def tube_volume(poses: np.ndarray) -> Volume:
     """Return a straight round tube, open at both ends far away, around camera poses (N, 4, 4)."""
-    positions, axis = poses[:, :3, 3], _mean_view(poses)
+    positions, axis = poses[:, :3, 3], poses[:, :3, 2].mean(0)
+    axis = axis / np.linalg.norm(axis)
     centre = positions.mean(0)
     offsets = positions - centre
     beside = offsets - np.outer(offsets @ axis, axis)
@@ -99,11 +99,6 @@ def _relief(points: np.ndarray, station: np.ndarray, seed: int) -> np.ndarray:
     return folds + wrinkles + shape + bumps
 
 
-def _mean_view(poses: np.ndarray) -> np.ndarray:
-    view = poses[:, :3, 2].mean(0)
-    return view / np.linalg.norm(view)
-
-
 def _box(points: np.ndarray, margin_mm: float) -> tuple[np.ndarray, tuple[int, int, int], float]:
     """Origin, shape and spacing of a grid around points; 1 mm, coarser only above 20 million voxels."""
     low, high = points.min(0) - margin_mm, points.max(0) + margin_mm
@@ -116,8 +111,7 @@ def _box(points: np.ndarray, margin_mm: float) -> tuple[np.ndarray, tuple[int, i
 def _balls(balls: np.ndarray, sharpness: float, outside: float, value: np.ndarray, station: np.ndarray) -> None:
     """Smooth union of balls (x, y, z, radius, station): log-sum-exp of radius minus distance, brick by brick.
 
-    The station is a wider mean than the union, or it would run in steps from ball to ball. Balls too far from a brick
-    to weigh anything in it are left out; bricks outside keep their value.
+    The station is a wider mean than the union, or it would run in steps from ball to ball.
     """
     nx, ny, nz = value.shape
     half = 0.5 * _BRICK * np.sqrt(3.0)

@@ -1,7 +1,7 @@
 """Ray marching from a camera to the surface of a volume, exact, also for tissue that moves.
 
-Sphere tracing (J. C. Hart, The Visual Computer 12, 1996) with three kinds of step: through empty cells by their
-guaranteed distance, near the surface by value over steepest slope, and at the surface by bracketed Newton steps.
+Sphere tracing (J. C. Hart, The Visual Computer 12, 1996): through empty cells by their guaranteed distance, near the
+surface by value over steepest slope, and at the surface by bracketed Newton steps.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import numpy as np
 from numba import njit, prange
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import check_shape
 from scopemap.phantom.deformation import Displacement
-from scopemap.phantom.spline import inside, spline
-from scopemap.phantom.volume import Volume
+from scopemap.phantom.volume import Volume, inside, spline
 
 _MAX_STEPS = 1000
 _NEWTON_STEP_VOXELS = 0.5
@@ -150,7 +148,6 @@ def march(
 
     Depth is exact to 1e-4 mm before rounding to float32. A camera inside tissue sees nothing (NaN).
     """
-    check_shape("T_world_camera", T_world_camera, (4, 4))
     T_grid_camera = np.array(T_world_camera, dtype=np.float64)
     T_grid_camera[:3, 3] = (T_grid_camera[:3, 3] - volume.origin_mm) / volume.voxel_mm
     rays = camera.unproject(np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1))

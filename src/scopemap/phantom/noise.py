@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from scopemap.errors import check_shape
-
 
 @njit(cache=True, nogil=True, inline="always")
 def _corner(ix: int, iy: int, iz: int, seed: int, x: float, y: float, z: float) -> float:
@@ -49,13 +47,10 @@ def _fill(points: np.ndarray, period: float, seed: int, out: np.ndarray) -> None
 
 
 def noise_at(points_mm: np.ndarray, period_mm: float, seed: int) -> np.ndarray:
-    """Return smooth noise at points.
+    """Return smooth noise (N,) float32, within -1..1, at points (N, 3); NaN points give 0.
 
-    `points_mm` (N, 3) float32 or float64; NaN points give 0. `period_mm` is the lattice spacing. The result is (N,)
-    float32, within -1..1 (standard deviation about 0.3), zero mean, twice continuously differentiable, equal for
-    equal points and seed on every machine.
+    `period_mm` is the lattice spacing. The standard deviation is about 0.3; equal on every machine.
     """
-    check_shape("points_mm", points_mm, (None, 3))
     out = np.empty(len(points_mm), np.float32)
     _fill(np.ascontiguousarray(points_mm, dtype=np.float64), float(period_mm), int(seed), out)
     return out

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import lumen_path, sweep_path
-from scopemap.phantom.cavity import laparoscopy_volume
-from scopemap.phantom.deformation import REST, Breathing, Displacement, breathing
+from scopemap.phantom.cavity import Tint, laparoscopy_volume
+from scopemap.phantom.deformation import Breathing, breathing
 from scopemap.phantom.lumen import colon_volume, tube_volume
 from scopemap.phantom.march import SurfaceBuffers, march
-from scopemap.phantom.shading import AppearanceBuffers, develop, disturb, exposure_for, shade, vignette
+from scopemap.phantom.shading import develop, disturb, exposure_for, shade, vignette
 from scopemap.phantom.spec import DEFAULT_FRAMES, PhantomSpec
 from scopemap.phantom.texture import Appearance
 from scopemap.phantom.volume import Volume
@@ -24,28 +23,19 @@ _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 
 
 @dataclass(frozen=True)
-class PhantomScene:
-    """Shape and appearance of the tissue at rest."""
-
-    volume: Volume
-    appearance: Appearance
-
-
-@dataclass(frozen=True)
 class Phantom:
     """A scene with the path through it, ready to be rendered frame by frame.
 
     Attributes
     ----------
-    spec : what it was made from.
-    scene : tissue at rest.
+    volume, appearance : shape and appearance of the tissue at rest. breath : how it moves.
     poses : (N, 4, 4) float64, camera to world, mm.
-    breath : how the tissue moves.
     exposure : gain of every frame; None: each frame has its own.
     """
 
     spec: PhantomSpec
-    scene: PhantomScene
+    volume: Volume
+    appearance: Appearance
     poses: np.ndarray
     breath: Breathing
     exposure: float | None
@@ -57,10 +47,10 @@ def prepare(spec: PhantomSpec) -> Phantom:
     Raises `InputError` where the path file cannot be used or holds fewer poses than the frames wanted.
     """
     poses = camera_path(spec)
-    scene = build_scene(spec, poses)
+    volume, appearance = build_scene(spec, poses)
     breath = breathing(spec.breath_mm if spec.deform else 0.0, spec.breath_frames, spec.seed)
-    radiance = light(scene, spec.camera, poses[0])[0]
-    return Phantom(spec, scene, poses, breath, None if spec.auto_exposure else exposure_for(radiance))
+    phantom = Phantom(spec, volume, appearance, poses, breath, None)
+    return phantom if spec.auto_exposure else replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
 
 
 def camera_path(spec: PhantomSpec) -> np.ndarray:
@@ -78,41 +68,32 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
     return poses[: spec.frames]
 
 
-def build_scene(spec: PhantomSpec, poses: np.ndarray) -> PhantomScene:
-    """Return the scene of `spec` built around the poses (N, 4, 4)."""
+def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearance]:
+    """Return shape and appearance of the scene of `spec`, built around the poses (N, 4, 4)."""
+    if spec.scene == "tube":
+        return tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed)
+    base: np.ndarray | Tint
     if spec.scene == "colon":
-        return PhantomScene(colon_volume(poses, spec.seed), Appearance(_COLON_RGB, spec.texture, spec.gloss, spec.seed))
-    if spec.scene == "laparoscopy":
-        volume, tint = laparoscopy_volume(poses, spec.seed)
-        return PhantomScene(volume, Appearance(tint, spec.texture, spec.gloss, spec.seed))
-    return PhantomScene(tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed))
+        volume, base = colon_volume(poses, spec.seed), _COLON_RGB
+    else:
+        volume, base = laparoscopy_volume(poses, spec.seed)
+    return volume, Appearance(base, spec.texture, spec.gloss, spec.seed)
 
 
-def light(
-    scene: PhantomScene, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement = REST
-) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return linear light (H, W, 3) float32 behind the lens, before exposure, and the surface that it came from."""
-    surface = march(scene.volume, camera, T_world_camera, displacement)
-    footprint = surface.distance_mm / np.float32(camera.fx)
-    appearance = scene.appearance
-    rest = surface.rest_mm
-    look = AppearanceBuffers(
-        appearance.albedo(rest, footprint), appearance.ripple(rest, footprint), appearance.film(rest)
-    )
-    return shade(surface, look, camera) * vignette(camera), surface
+def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Return linear light (H, W, 3) float32 of a frame before exposure, and the surface that it came from."""
+    camera, look = phantom.spec.camera, phantom.appearance
+    surface = march(phantom.volume, camera, phantom.poses[index], phantom.breath.at(index))
+    rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.fx)
+    albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
+    return shade(surface, albedo, ripple, look.film(rest), camera) * vignette(camera), surface
 
 
-def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return frame `index` as sRGB (H, W, 3) uint8 and its true depth (H, W) float32, mm, NaN where nothing is hit."""
-    rgb, surface = render_surface(phantom, index)
-    return rgb, surface.depth_mm
-
-
-def render_surface(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return frame `index` as sRGB (H, W, 3) uint8 and the surface that it shows."""
+def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Return frame `index` as sRGB (H, W, 3) uint8 and the surface that it shows, with its true depth."""
     spec = phantom.spec
-    linear, surface = light(phantom.scene, spec.camera, phantom.poses[index], phantom.breath.at(index))
+    linear, surface = light(phantom, index)
     gain = exposure_for(linear) if phantom.exposure is None else phantom.exposure
     rng = np.random.default_rng((spec.seed, 4, index))
-    kinds = {event.kind for event in spec.events if event.covers(index)}
+    kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
     return develop(disturb(linear * np.float32(gain), kinds, rng), spec.noise, rng), surface

@@ -5,8 +5,6 @@ The light is at the camera: irradiance falls as cosine over squared distance, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -27,33 +25,22 @@ _BLUR_PX = 13
 _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
 
 
-@dataclass(frozen=True)
-class AppearanceBuffers:
-    """Buffers of the tissue's appearance in each pixel.
+def shade(
+    surface: SurfaceBuffers, albedo: np.ndarray, ripple: np.ndarray, film: np.ndarray, camera: PinholeCamera
+) -> np.ndarray:
+    """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen.
 
-    Attributes
-    ----------
-    albedo : (H, W, 3) float32 linear RGB, 0..1.
-    ripple : (H, W, 3) float32, tilt of the fluid film, about -1..1.
-    film : (H, W) float32, strength of specular reflection, >= 0.
+    `albedo` (H, W, 3) linear RGB, `ripple` (H, W, 3) tilt of the fluid film, `film` (H, W) strength of reflection.
     """
-
-    albedo: np.ndarray
-    ripple: np.ndarray
-    film: np.ndarray
-
-
-def shade(surface: SurfaceBuffers, look: AppearanceBuffers, camera: PinholeCamera) -> np.ndarray:
-    """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen."""
     towards = -camera.rays / np.linalg.norm(camera.rays, axis=-1, keepdims=True)
     light = 1.0 / surface.distance_mm[..., None] ** 2
     cosine = np.clip((surface.normal * towards).sum(-1, keepdims=True), 0, 1)
-    radiance = look.albedo * cosine * light
-    if look.film.any():
-        wet = surface.normal + _FILM_TILT * look.ripple
+    radiance = albedo * cosine * light
+    if film.any():
+        wet = surface.normal + _FILM_TILT * ripple
         wet /= np.linalg.norm(wet, axis=-1, keepdims=True)
         mirrored = np.clip((wet * towards).sum(-1, keepdims=True), 0, 1) ** _HIGHLIGHT_SHARPNESS
-        radiance = radiance + look.film[..., None] * _HIGHLIGHT_STRENGTH * mirrored * light
+        radiance = radiance + film[..., None] * _HIGHLIGHT_STRENGTH * mirrored * light
     return np.nan_to_num(radiance, nan=0.0, posinf=0.0).astype(np.float32)
 
 

@@ -28,10 +28,6 @@ class Event:
     first: int
     last: int
 
-    def covers(self, index: int) -> bool:
-        """Return whether frame `index` is disturbed."""
-        return self.first <= index <= self.last
-
 
 @dataclass(frozen=True)
 class PhantomSpec:
@@ -98,11 +94,6 @@ class PhantomSpec:
         """The pinhole camera: square pixels, principal point at the centre of the image."""
         focal = 0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2)
         return PinholeCamera(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, self.width, self.height)
-
-    @property
-    def max_depth_mm(self) -> float:
-        """Depth from which the 16-bit depth files hold the value for "clipped"."""
-        return 65535 * self.depth_scale_mm
 
     def with_settings(self, settings: dict[str, Any]) -> PhantomSpec:
         """Return a copy with settings given as values or text, such as {"fov_deg": "70"}; raises `SettingsError`."""

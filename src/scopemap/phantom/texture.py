@@ -1,7 +1,6 @@
 """Appearance of tissue: mottled albedo, vessels, and the fluid film that breaks up highlights.
 
-All are functions of the rest point, so that they move with the tissue, and fade where a pixel is too coarse for them,
-so that they do not flicker.
+All are functions of the rest point, so that they move with the tissue, and fade where a pixel is too coarse for them.
 """
 
 from __future__ import annotations
@@ -28,9 +27,7 @@ class Appearance:
     Attributes
     ----------
     base : colour of all tissue, linear RGB (3,), or the colours in space.
-    texture : strength of mottling and vessels, 0 = uniform.
-    gloss : strength of highlights, 0 = none.
-    seed : of the pattern.
+    texture, gloss : strength of mottling and vessels, and of highlights; 0 = none. seed : of the pattern.
     """
 
     base: np.ndarray | Tint

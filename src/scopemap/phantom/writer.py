@@ -7,29 +7,76 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
 import trimesh
+from scipy import ndimage
+from skimage.measure import marching_cubes
 
 from scopemap.errors import InputError
-from scopemap.phantom.camera_path import c3vd_line
-from scopemap.phantom.render import Phantom, prepare, render_surface
+from scopemap.phantom.render import Phantom, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.truth_mesh import SeenVoxels
+from scopemap.phantom.volume import Volume
 
 CLIPPED = 65535
 _OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
+_NEWTON_STEPS = 4
+_SEEN_MARGIN_VOXELS = 2
+_RIM_VOXELS = 4
+
+
+@dataclass
+class SeenVoxels:
+    """The voxels of the volume's surface that the cameras have seen, frame by frame."""
+
+    volume: Volume
+    voxels: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.voxels = np.zeros(self.volume.coefficients.shape, bool)
+
+    def add(self, rest_mm: np.ndarray) -> None:
+        """Mark the voxels of rest points (H, W, 3); NaN points are ignored."""
+        points = rest_mm.reshape(-1, 3)
+        cells = ((points[np.isfinite(points[:, 0])] - self.volume.origin_mm) / self.volume.voxel_mm).astype(int)
+        self.voxels[tuple(cells.T)] = True
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Return the true surface at rest where it was seen, with a rim of 2 voxels."""
+        return surface_mesh(self.volume, ndimage.binary_dilation(self.voxels, iterations=_SEEN_MARGIN_VOXELS))
+
+
+def surface_mesh(volume: Volume, where: np.ndarray) -> trimesh.Trimesh:
+    """Return the surface inside the voxels `where` (X, Y, Z) bool, world mm, vertices on it to 1e-4 mm.
+
+    Faces are counter-clockwise seen from the camera. Raises `InputError` where there is no surface in these voxels.
+    """
+    # The spline is defined where the whole neighbourhood of a voxel is inside the grid.
+    defined = np.zeros(where.shape, bool)
+    defined[(slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3] = True
+    where = where & defined
+    values = volume.coefficients
+    for axis in range(3):
+        values = ndimage.convolve1d(values, np.array([1, 4, 1]) / 6, axis=axis, mode="nearest")
+    if not where.any() or values[where].min() > 0 or values[where].max() < 0:
+        raise InputError("no tissue is in sight of the camera path: nothing to make a true mesh of")
+    vertices, faces, _, _ = marching_cubes(values, 0.0, mask=where, gradient_direction="descent")
+    points = vertices.astype(np.float64) * volume.voxel_mm + volume.origin_mm
+    for _ in range(_NEWTON_STEPS):
+        value, gradient = volume.values_at(points)
+        shift = -(value / (gradient**2).sum(1))[:, None] * gradient
+        points = points + np.clip(np.nan_to_num(shift), -0.5 * volume.voxel_mm, 0.5 * volume.voxel_mm)
+    return trimesh.Trimesh(points, faces.astype(np.int64), process=False)
 
 
 def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
     """Render the phantom of `spec` into `folder`, calling `progress(frames done, frames in all)` after each frame.
 
-    A folder that holds an earlier phantom is written anew; one that holds anything else is refused. Raises
-    `InputError` for that, for a folder that cannot be written, and for a path file that cannot be used.
+    Raises `InputError` for a folder that holds other files or cannot be written, and for an unusable path file.
     """
     folder = Path(folder)
     _check_free(folder)
@@ -37,11 +84,13 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
     try:
         _clear(folder)
         _write_description(phantom, folder / "phantom.json")
-        (folder / "pose.txt").write_text("".join(c3vd_line(T) + "\n" for T in phantom.poses), encoding="utf-8")
+        # C3VD's lines: 16 numbers, transposed, so that the translation is the last row.
+        rows = phantom.poses.transpose(0, 2, 1).reshape(-1, 16)
+        np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
         _write_camera(spec, folder / "camera.yaml")
-        seen = SeenVoxels(phantom.scene.volume)
+        seen = SeenVoxels(phantom.volume)
         for index in range(len(phantom.poses)):
-            rgb, surface = render_surface(phantom, index)
+            rgb, surface = render_frame(phantom, index)
             seen.add(surface.rest_mm)
             _write_image(folder / f"{index:04d}_color.png", rgb[..., ::-1])
             _write_image(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
@@ -109,6 +158,6 @@ def _write_description(phantom: Phantom, file: Path) -> None:
         "spec": spec,
         "frames": len(phantom.poses),
         "exposure": phantom.exposure,
-        "voxel_mm": phantom.scene.volume.voxel_mm,
+        "voxel_mm": phantom.volume.voxel_mm,
     }
     file.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
