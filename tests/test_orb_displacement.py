@@ -10,7 +10,6 @@ from plane_scene import CAMERA, EVERYWHERE, SIX_PIXELS_MM, View, pose, see, true
 
 from scopemap.evaluation.correspondences import (
     Matches,
-    OrbFeatures,
     displacement_figures,
     displacements,
     match_features,
@@ -102,17 +101,9 @@ def test_matching_is_the_same_every_time() -> None:
 def test_every_match_is_mutual_and_clear_as_opencv_s_own_matcher_finds_it() -> None:
     a, b = orb_features(START.rgb), orb_features(ASIDE.rgb)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forth = {
-        m.queryIdx: m.trainIdx
-        for m, n in matcher.knnMatch(a.descriptors, b.descriptors, 2)
-        if m.distance < 0.8 * n.distance
-    }
-    back = {
-        m.queryIdx: m.trainIdx
-        for m, n in matcher.knnMatch(b.descriptors, a.descriptors, 2)
-        if m.distance < 0.8 * n.distance
-    }
-    mutual = {(*a.pixels[i], *b.pixels[j]) for i, j in forth.items() if back.get(j) == i}
+    forth = {m.queryIdx: m.trainIdx for m, n in matcher.knnMatch(a[1], b[1], 2) if m.distance < 0.8 * n.distance}
+    back = {m.queryIdx: m.trainIdx for m, n in matcher.knnMatch(b[1], a[1], 2) if m.distance < 0.8 * n.distance}
+    mutual = {(*a[0][i], *b[0][j]) for i, j in forth.items() if back.get(j) == i}
     matches = match_features(a, b, CAMERA)
     rows = {tuple(row) for row in np.hstack([matches.previous_px, matches.current_px])}
     assert rows <= mutual
@@ -126,7 +117,7 @@ def test_what_does_not_move_as_the_scene_is_no_match() -> None:
     # The camera moves along x: no point of a rigid scene moves along y.
     current_px[:40, 1] += rng.choice([-12, -6, 6, 12], 40)
     descriptors = rng.integers(0, 256, (200, 32), dtype=np.uint8)
-    matches = match_features(OrbFeatures(previous_px, descriptors), OrbFeatures(current_px, descriptors), CAMERA)
+    matches = match_features((previous_px, descriptors), (current_px, descriptors), CAMERA)
     assert np.abs(matches.current_px - matches.previous_px)[:, 1].max() < 1
     assert len(matches.current_px) == 160
 
@@ -134,14 +125,14 @@ def test_what_does_not_move_as_the_scene_is_no_match() -> None:
 def test_no_feature_lies_where_nothing_is_valid() -> None:
     valid = EVERYWHERE.copy()
     valid[:, 100:] = False
-    pixels = orb_features(START.rgb, valid).pixels
+    pixels = orb_features(START.rgb, valid)[0]
     assert len(pixels) > 20
     assert pixels[:, 0].max() < 100
 
 
 def test_images_without_texture_have_no_features_and_no_matches() -> None:
     blank = orb_features(np.full_like(START.rgb, 90))
-    assert blank.pixels.shape == (0, 2)
+    assert blank[0].shape == (0, 2)
     assert len(match_features(blank, orb_features(START.rgb), CAMERA).current_px) == 0
     nothing = displacements(match_features(blank, blank, CAMERA), START.depth_mm, START.depth_mm, CAMERA)
     assert nothing.displacement_mm.shape == (0,)
@@ -149,13 +140,13 @@ def test_images_without_texture_have_no_features_and_no_matches() -> None:
 
 def test_fewer_than_eight_features_match_nothing() -> None:
     features = orb_features(START.rgb)
-    few = OrbFeatures(features.pixels[:7], features.descriptors[:7])
+    few = features[0][:7], features[1][:7]
     assert len(match_features(few, few, CAMERA).current_px) == 0
 
 
 def test_smooth_tissue_has_features_too() -> None:
     faint = cv2.GaussianBlur(START.rgb, (0, 0), 1.0) // 4 + 90
-    assert len(orb_features(faint).pixels) > 100
+    assert len(orb_features(faint)[0]) > 100
     assert len(cv2.ORB.create(1000).detect(cv2.cvtColor(faint, cv2.COLOR_RGB2GRAY))) < 30
 
 

@@ -16,7 +16,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
-from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, visible_from
+from scopemap.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.datasets.c3vd import CAMERA
 from scopemap.io.opening import open_sequence
@@ -132,12 +132,13 @@ def test_a_phantoms_surface_was_seen_but_for_its_rim(tiny: Path) -> None:
     assert isinstance(truth.surface, trimesh.Trimesh)
     assert truth.frames == ()
     assert truth.observed is None
-    known = truth.seen_by(sequence.camera, iter(views_of(tiny)))
+    known = truth.seen_by(sequence.camera, dict(enumerate(views_of(tiny))))
     assert isinstance(known.observed, trimesh.Trimesh)
     assert 0.5 < known.observed.area / truth.surface.area < 0.98
-    expected = seen_samples(truth.surface.triangles_center, sequence.camera, views_of(tiny))
+    centres = truth.surface.triangles_center
+    expected = np.any([seen_points(centres, sequence.camera, view) for view in views_of(tiny)], axis=0)
     np.testing.assert_array_equal(known.seen, expected)
-    fewer = truth.seen_by(sequence.camera, views_of(tiny)[:1])
+    fewer = truth.seen_by(sequence.camera, {0: views_of(tiny)[0]})
     assert known.seen is not None
     assert fewer.seen is not None
     assert not (fewer.seen & ~known.seen).any()
@@ -148,15 +149,14 @@ def test_of_tissue_that_breathes_each_view_is_asked_about_its_own_shape(breathin
     assert truth is not None
     assert len(truth.frames) == 3
     # Frame 1 is at full breath: against the shape at rest less of it seems to be seen.
-    moving = truth.seen_by(sequence.camera, views[1:2], indices=[1])
-    still = replace(truth, frames=()).seen_by(sequence.camera, views[1:2])
+    moving = truth.seen_by(sequence.camera, {1: views[1]})
+    still = replace(truth, frames=()).seen_by(sequence.camera, {1: views[1]})
     assert moving.seen is not None
     assert still.seen is not None
     assert moving.seen.mean() > still.seen.mean() + 0.02
-    # Without indices the views are frames 0, 1, 2.
-    assert truth.seen_by(sequence.camera, views).seen.mean() >= moving.seen.mean()  # type: ignore[union-attr]
+    assert truth.seen_by(sequence.camera, dict(enumerate(views))).seen.mean() >= moving.seen.mean()  # type: ignore[union-attr]
     with pytest.raises(InputError, match="frame 7 is not among the 3 mesh files"):
-        truth.seen_by(sequence.camera, views[:1], indices=[7])
+        truth.seen_by(sequence.camera, {7: views[0]})
 
 
 def test_views_that_belong_to_another_scene_are_noticed(tiny: Path) -> None:
@@ -164,7 +164,7 @@ def test_views_that_belong_to_another_scene_are_noticed(tiny: Path) -> None:
     assert truth is not None
     metres = [(T, depth / 1000) for T, depth in views_of(tiny)]
     with pytest.raises(InputError, match="no view shows any"):
-        truth.seen_by(sequence.camera, metres)
+        truth.seen_by(sequence.camera, dict(enumerate(metres)))
 
 
 def test_the_truth_itself_scores_full_marks() -> None:

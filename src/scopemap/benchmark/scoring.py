@@ -135,7 +135,7 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
         and truth.T_world_camera is not None
         and truth.depth_mm is not None
     }
-    return surface.seen_by(sequence.camera, views.values(), indices=list(views)) if views else surface
+    return surface.seen_by(sequence.camera, views) if views else surface
 
 
 def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:

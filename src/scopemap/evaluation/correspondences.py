@@ -32,13 +32,8 @@ _RNG_SEED = 0
 _COLOUR_DISTANCE = 255 * np.log(1e2) / 50
 _FLOW_LIMIT_PX = 250.0
 
-
-@dataclass(frozen=True)
-class OrbFeatures:
-    """ORB features of one image: `pixels` (N, 2) float64, px; `descriptors` (N, 32) uint8."""
-
-    pixels: np.ndarray
-    descriptors: np.ndarray
+OrbFeatures = tuple[np.ndarray, np.ndarray]
+"""ORB features of one image: pixels (N, 2) float64, px, and descriptors (N, 32) uint8."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +102,8 @@ def orb_features(rgb: np.ndarray, valid: np.ndarray | None = None) -> OrbFeature
     detector = cv2.ORB.create(nfeatures=FEATURES, fastThreshold=_FAST_THRESHOLD)
     keypoints, descriptors = detector.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), mask)
     if descriptors is None:
-        return OrbFeatures(np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8))
-    return OrbFeatures(np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64), descriptors)
+        return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
+    return np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64), descriptors
 
 
 def match_features(previous: OrbFeatures, current: OrbFeatures, camera: PinholeCamera) -> Matches:
@@ -117,13 +112,13 @@ def match_features(previous: OrbFeatures, current: OrbFeatures, camera: PinholeC
     Mutual nearest neighbours that pass Lowe's ratio test of 0.8 both ways, and inliers (1 px) of the essential matrix.
     Sets OpenCV's random seed: the same images give the same matches.
     """
-    if min(len(previous.pixels), len(current.pixels)) < _FEWEST_MATCHES:
+    if min(len(previous[0]), len(current[0])) < _FEWEST_MATCHES:
         return Matches(np.empty((0, 2)), np.empty((0, 2)))
-    to_current, distinct = _nearest(previous.descriptors, current.descriptors)
-    to_previous, distinct_back = _nearest(current.descriptors, previous.descriptors)
+    to_current, distinct = _nearest(previous[1], current[1])
+    to_previous, distinct_back = _nearest(current[1], previous[1])
     rows = np.arange(len(to_current))
     mutual = np.flatnonzero(distinct & distinct_back[to_current] & (to_previous[to_current] == rows))
-    previous_px, current_px = previous.pixels[mutual], current.pixels[to_current[mutual]]
+    previous_px, current_px = previous[0][mutual], current[0][to_current[mutual]]
     inliers = None
     if len(mutual) >= _FEWEST_MATCHES:
         cv2.setRNGSeed(_RNG_SEED)

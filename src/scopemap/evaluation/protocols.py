@@ -1,7 +1,7 @@
 """Published pose protocols by name, each as its authors compute it.
 
-Published figures can be compared only under the protocol that they were made with, and protocols differ by factors: one
-trajectory may have 0.05 under AF and 3 mm under evo. So every figure carries its protocol's name.
+Published figures compare only under the protocol that they were made with: one trajectory may have 0.05 under AF and 3
+mm under evo. So every figure carries its protocol's name.
 """
 
 from __future__ import annotations
@@ -101,10 +101,7 @@ def _oneslam(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def _robust_pose_estimator(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return ATE RMSE and mean RPE after SE3.
-
-    Its later versions leave out frames whose pose repeats the one before; here lost frames are left out.
-    """
+    """Return ATE RMSE and mean RPE after SE3; its later versions leave out repeated poses."""
     aligned, _ = align_trajectories(estimated, reference, "se3")
     errors = _errors(aligned, reference, frame_pairs(len(aligned), 1))
     return {
@@ -168,10 +165,7 @@ def least_squares_scale(positions: np.ndarray, reference: np.ndarray) -> float:
 
 
 def _surgcut3r(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return the figures in the given worlds, and with both worlds moved to the first camera (`first_camera_...`).
-
-    Without rotation both worlds must have the same axes. SCARED's have, as its world is the first camera.
-    """
+    """Return the figures in the given worlds (of equal axes: no rotation is fitted) and in those of the first cameras."""
     moved = _aligned_first_position(*(inverse(T[0]) @ T for T in (estimated, reference)))
     return _aligned_first_position(estimated, reference) | {f"first_camera_{k}": v for k, v in moved.items()}
 
@@ -195,10 +189,7 @@ def _aligned_first_position(estimated: np.ndarray, reference: np.ndarray) -> dic
 
 
 def _simcol(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return medians after one least-squares scale between *relative* translations; the challenge prints cm, here mm.
-
-    Motions chained from the identity are the path seen from its own first camera.
-    """
+    """Return medians after one least-squares scale between *relative* translations; the challenge prints cm, here mm."""
     estimated, reference = (inverse(T[0]) @ T for T in (estimated, reference))
     steps, true_steps = ((inverse(T[:-1]) @ T[1:])[:, :3, 3] for T in (estimated, reference))
     scale = least_squares_scale(steps, true_steps)
@@ -214,20 +205,12 @@ def _simcol(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def _world_to_camera(T_world_camera: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrices of a world that is the first camera.
-
-    Their translation `-R^T c` is not the camera's position and depends on the choice of world, so figures on them
-    cannot be compared with evo's.
-    """
+    """Return world-to-camera matrices, world = first camera; their translation `-R^T c` depends on the choice of world."""
     return inverse(T_world_camera) @ T_world_camera[0]
 
 
 def _endogslam(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return the mean residual of world-to-camera translations after SE3; the published "ATE RMSE" is this mean.
-
-    Their loader makes the reference relative to its first frame (`relative_pose=True`), where the estimate begins, too.
-    `as_stored` takes the worlds as the trajectories have them. Both papers use 7 of 8 frames of C3VD; here all count.
-    """
+    """Return the mean residual of world-to-camera translations after SE3; both papers use 7 of 8 frames of C3VD."""
 
     def mean_mm(matrices: np.ndarray, truth: np.ndarray) -> float:
         return ErrorSummary.of(translation_errors_mm(align_trajectories(matrices, truth, "se3")[0], truth)).mean
@@ -239,10 +222,7 @@ def _endogslam(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]
 
 
 def _free_surgs(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return Sim3 figures of world-to-camera matrices taken as poses, as its validation does on SCARED.
-
-    `c2w_...` are the same on camera-to-world poses, to which the words "ATE" and "RPE" belong.
-    """
+    """Return Sim3 figures of world-to-camera matrices taken as poses, and (`c2w_`) of camera-to-world poses."""
     figures: dict[str, float] = {}
     worlds = {"": (_world_to_camera(estimated), _world_to_camera(reference)), "c2w_": (estimated, reference)}
     for prefix, (matrices, truth) in worlds.items():

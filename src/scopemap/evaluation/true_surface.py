@@ -11,7 +11,7 @@ A method that takes breathing tissue as rigid is measured against the shape at r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from scopemap.evaluation.surface import (
     refine,
     surface_points,
 )
-from scopemap.evaluation.visibility import TrueView, pixels_near, seen_samples, visible_from
+from scopemap.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
 from scopemap.io.decoding import read_decoded
 
 _PHANTOM, _PHANTOM_FRAMES = "mesh_truth.ply", "mesh_truth"
@@ -71,20 +71,16 @@ class TrueSurface:
             return None if self.T_view is None else self.surface
         return trimesh.Trimesh(self._mesh.vertices, self._mesh.faces[self.seen], process=False)
 
-    def seen_by(
-        self, camera: CameraModel, views: Iterable[TrueView], *, indices: Sequence[int] | None = None
-    ) -> TrueSurface:
-        """Return the mesh with a new `seen`: the faces whose centre some view sees (`seen_samples`).
+    def seen_by(self, camera: CameraModel, views: Mapping[int, TrueView]) -> TrueSurface:
+        """Return the mesh with a new `seen`: the faces whose centre some view, by its frame's number, sees.
 
-        Where the tissue moves, each view is compared with the mesh of its own frame, numbered by `indices` or 0, 1, 2.
-        Raises `InputError` where no face is seen, and where a frame's mesh is missing or has other faces.
+        Where the tissue moves, each view is compared with the mesh of its own frame. Raises `InputError` where no face
+        is seen, and where a frame's mesh is missing or has other faces.
         """
-
-        def centres_then(number: int) -> np.ndarray:
-            return np.asarray(self._mesh_of_frame(number if indices is None else indices[number]).triangles_center)
-
-        centres = np.asarray(self._mesh.triangles_center)
-        seen = seen_samples(centres, camera, views, moved=centres_then if self.frames else None)
+        seen = np.zeros(len(self._mesh.faces), dtype=bool)
+        for index, view in views.items():
+            mesh = self._mesh_of_frame(index) if self.frames else self._mesh
+            seen |= seen_points(np.asarray(mesh.triangles_center), camera, view)
         if not seen.any():
             raise InputError(
                 "no view shows any of the true surface: check that camera, poses and depth belong to it and are in mm"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-
 import cv2
 import numpy as np
 import trimesh
@@ -21,29 +19,18 @@ _PAINTED_PX = 1280
 _NEARER = 0.01
 
 
-def seen_samples(
-    points_mm: np.ndarray,
-    camera: CameraModel,
-    views: Iterable[TrueView],
-    *,
-    moved: Callable[[int], np.ndarray] | None = None,
-) -> np.ndarray:
-    """Return which points (N, 3) of a surface, true world mm, were seen by at least one view: (N,) bool.
+def seen_points(points_mm: np.ndarray, camera: CameraModel, view: TrueView) -> np.ndarray:
+    """Return which points (N, 3) of a surface, true world mm, one view sees, (N,) bool.
 
-    A view sees a point that projects onto a pixel whose true depth is within 2 % of the point's own z, which allows for
-    walls that slope within a pixel. `moved` gives the points (N, 3) at the time of the k-th view, where the tissue
-    moves.
+    A point is seen if it projects onto a pixel whose true depth is within 2 % of the point's own z, which allows for
+    walls that slope within a pixel.
     """
+    T_world_camera, depth_mm = view
     seen = np.zeros(len(points_mm), dtype=bool)
-    for number, (T_world_camera, depth_mm) in enumerate(views):
-        unseen = np.flatnonzero(~seen)
-        now = (points_mm if moved is None else moved(number))[unseen]
-        rows, columns, z_mm, inside = _pixels(now, camera, T_world_camera)
-        true_mm = depth_mm[rows, columns]
-        # Unknown depth is NaN and matches nothing.
-        seen[unseen[inside]] = np.abs(z_mm - true_mm) <= _TOLERANCE * true_mm
-        if seen.all():
-            break
+    rows, columns, z_mm, inside = _pixels(points_mm, camera, T_world_camera)
+    true_mm = depth_mm[rows, columns]
+    # Unknown depth is NaN and matches nothing.
+    seen[inside] = np.abs(z_mm - true_mm) <= _TOLERANCE * true_mm
     return seen
 
 
