@@ -106,8 +106,8 @@ def evaluate_depth(
     scaling : `median`: by the ratio of the medians of the compared pixels; `scale-and-shift`: least squares in
         disparity; or a fit found elsewhere. Raises `SettingsError` for another name.
     truth_range_mm : true depth counts strictly inside; see `DEPTH_RANGES_MM`.
-    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and Video-Depth-
-        Anything do. Without it the far pixels of a shifted prediction dominate the mean.
+    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and
+        Video-Depth-Anything do. Without it the far pixels of a shifted prediction dominate the mean.
     """
     d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
     coverage = len(d) / max(known, 1)
@@ -223,8 +223,8 @@ def evaluate_depth_sequence(
 ) -> DepthSequenceReport:
     """Return the errors of a sequence of depth maps, averaged over frames.
 
-    `sequence-median`: one factor, the median of all true depths over the median of all predicted ones. `sequence-scale-
-    and-shift`: one least-squares fit in disparity. All else is as in `evaluate_depth`.
+    `sequence-median`: one factor, the median of all true depths over the median of all predicted ones.
+    `sequence-scale-and-shift`: one least-squares fit in disparity. All else is as in `evaluate_depth`.
     """
     if scaling not in get_args(DepthScaling):
         raise SettingsError(f"depth scaling '{scaling}': choose one of {', '.join(get_args(DepthScaling))}")

@@ -165,7 +165,7 @@ def least_squares_scale(positions: np.ndarray, reference: np.ndarray) -> float:
 
 
 def _surgcut3r(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return the figures in the given worlds (of equal axes: no rotation is fitted) and in those of the first cameras."""
+    """Return the figures in the given worlds (of equal axes: nothing is rotated) and in those of the first cameras."""
     moved = _aligned_first_position(*(inverse(T[0]) @ T for T in (estimated, reference)))
     return _aligned_first_position(estimated, reference) | {f"first_camera_{k}": v for k, v in moved.items()}
 
@@ -189,7 +189,7 @@ def _aligned_first_position(estimated: np.ndarray, reference: np.ndarray) -> dic
 
 
 def _simcol(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Return medians after one least-squares scale between *relative* translations; the challenge prints cm, here mm."""
+    """Return medians, mm (the challenge prints cm), after one least-squares scale between *relative* translations."""
     estimated, reference = (inverse(T[0]) @ T for T in (estimated, reference))
     steps, true_steps = ((inverse(T[:-1]) @ T[1:])[:, :3, 3] for T in (estimated, reference))
     scale = least_squares_scale(steps, true_steps)
@@ -205,7 +205,7 @@ def _simcol(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def _world_to_camera(T_world_camera: np.ndarray) -> np.ndarray:
-    """Return world-to-camera matrices, world = first camera; their translation `-R^T c` depends on the choice of world."""
+    """Return world-to-camera matrices, world = first camera; their translation `-R^T c` depends on this choice."""
     return inverse(T_world_camera) @ T_world_camera[0]
 
 
