@@ -1,8 +1,7 @@
 """Numbered files of a data set, in a folder or in a tar archive, read one at a time.
 
 An archive is never unpacked to disk: its members are found while it is read on, and only regular files with a number in
-their own name are read, into memory. Where `indexed_gzip` (the extra `datasets`) is installed, going back in a
-compressed archive costs at most 32 MB of decompression; without it the archive is decompressed from its start again.
+their own name are read, into memory. Going back in a compressed archive decompresses it from its start again.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import re
 import tarfile
 import threading
 from contextlib import AbstractContextManager
-from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
@@ -19,7 +17,6 @@ from scopemap.io.decoding import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
 _ARCHIVES = (".tar.gz", ".tar")
-_SPACING_BYTES, _BUFFER_BYTES = 32 << 20, 1 << 20
 
 
 class FolderFiles:
@@ -71,7 +68,7 @@ class ArchiveFiles:
     def _advance(self) -> None:
         """Look at the next member."""
         with self._reporting():
-            self._tar = self._tar or _opened(self.path)
+            self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115
             member = self._tar.next()
             if member is None:
                 self._complete = True
@@ -124,12 +121,3 @@ def _number_of(name: str, prefix: str, suffixes: tuple[str, ...]) -> int | None:
     path = PurePosixPath(name)
     match = re.fullmatch(re.escape(prefix) + r"\D*(\d{1,12})", path.stem)
     return int(match[1]) if match and path.suffix.lower() in suffixes else None
-
-
-def _opened(path: Path) -> tarfile.TarFile:
-    if path.suffix == ".tar" or find_spec("indexed_gzip") is None:
-        return tarfile.open(path)
-    from indexed_gzip import IndexedGzipFile
-
-    stream = IndexedGzipFile(str(path), spacing=_SPACING_BYTES, buffer_size=_BUFFER_BYTES)
-    return tarfile.open(fileobj=stream, mode="r:")
