@@ -146,7 +146,7 @@ def _with(value: float, place: tuple[int, int]) -> np.ndarray:
         (_kitti(np.ones((4, 4))), "line 3"),
         (_kitti(_with(np.nan, (0, 0))), "line 3"),
         (_kitti(_with(np.inf, (1, 3))), "line 3"),
-        ("", "trajectory"),
+        ("", "it holds no pose"),
         ("\0\1\2" * 99, "line 1"),
     ],
 )

@@ -102,7 +102,7 @@ class RosBag(SourceDefaults):
             self._take_camera(reader)
         # A count that the files have no room for is the claim of a damaged bag.
         files = self._storage.iterdir() if self._storage.is_dir() else [self._storage]
-        self.count: int | None = min(self._topic.total, sum(file.stat().st_size for file in files))
+        self.count: int | None = min(self._topic.total, sum(file.stat().st_size for file in files if file.is_file()))
         self._depth_topic = self._aligned()
         clock = "stamps in the headers" if self._stamped else "when they were recorded, as headers hold no stamp"
         self.notes += [f"time stamps: {clock}", "poses in a bag (odometry, tf) are not used"]
