@@ -160,7 +160,6 @@ class ImageFolder(SourceDefaults):
         return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
 
     def _image(self, file: Path) -> np.ndarray | None:
-        """Return an image as (h, w, 3) uint8 RGB, None where it cannot be read."""
         return read_image(file)
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
@@ -170,7 +169,6 @@ class ImageFolder(SourceDefaults):
         return depth_of_levels(file, self._depth_levels(file), self.depth_code, self.depth_scale_mm)
 
     def _depth_levels(self, file: Path) -> np.ndarray | None:
-        """Return a depth image as it is stored, None where it cannot be read."""
         return read_decoded(file)
 
     def _time_s(self, number: int) -> float:

@@ -144,7 +144,6 @@ def open_source(path: Path | str, *, dataset: str | None = None, settings: Input
 
 @contextmanager
 def _errors_of_the_system(path: Path | str) -> Iterator[None]:
-    """Turn errors of the operating system into an `InputError`."""
     try:
         yield
     except PermissionError as error:

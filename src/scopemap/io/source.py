@@ -144,7 +144,6 @@ class SourceDefaults:
             )
 
     def _warn(self, message: str) -> None:
-        """Add a warning, once."""
         if message not in self.warnings:
             self.warnings.append(message)
 

@@ -191,7 +191,6 @@ def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
 
 
 def _record(checkpoint: Checkpoint, revision: str) -> None:
-    """Write what was pulled, and its hashes, to the lock file."""
     folder, place = weights_folder(), weights_folder() / checkpoint.place
     if place.is_dir():
         found = [

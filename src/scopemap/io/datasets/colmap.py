@@ -85,7 +85,6 @@ class ColmapFolder(ImageFolder):
 
 
 def _model(path: Path) -> tuple[Path, Path] | None:
-    """Return the files (cameras, images) of the first model in its usual places, or None."""
     return next((files for place in _MODELS if (files := model_files(path / place)) is not None), None)
 
 

@@ -126,7 +126,6 @@ class Dicom(SourceDefaults):
             self._warn("by its header notes, perhaps a patient's name, are burned into the images")
 
     def _in_folder(self, path: Path) -> list[Header]:
-        """Return the headers of the one series in a folder, sorted."""
         headers = []
         for file in _files(path):
             try:
@@ -153,7 +152,6 @@ class Dicom(SourceDefaults):
 
 
 def _is_dicom(file: Path) -> bool:
-    """Whether a file is DICOM by its magic word, and not the directory of a medium."""
     return file.name.upper() != "DICOMDIR" and first_bytes(file, _PREAMBLE + len(_MAGIC))[_PREAMBLE:] == _MAGIC
 
 

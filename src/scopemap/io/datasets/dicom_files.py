@@ -181,7 +181,6 @@ def _reporting(path: Path) -> AbstractContextManager[None]:
 
 
 def _is_mpeg(syntax: str) -> bool:
-    """Whether a UID is one of MPEG-2, MPEG-4 or HEVC (PS3.5, A.4.5 to A.4.8)."""
     part = syntax.removeprefix("1.2.840.10008.1.2.4.").removesuffix(".1")
     return syntax.startswith("1.2.840.10008.1.2.4.") and part.isdecimal() and 100 <= int(part) <= 108
 
@@ -207,7 +206,6 @@ def _fragments(stream: BinaryIO) -> list[tuple[int, int]]:
 
 
 def _native_bytes(fields: Any) -> int:
-    """Return the bytes of one image that is not compressed."""
     from pydicom.pixels.utils import get_expected_length
 
     return int(get_expected_length(fields)) // int(fields.NumberOfFrames)
@@ -228,7 +226,6 @@ def _check_decoder(file: Path, syntax: str) -> None:
 
 
 def _packed(header: Header) -> Iterator[bytes]:
-    """Yield the bytes of each image, as they are in the file."""
     from pydicom.encaps import generate_frames
 
     with header.path.open("rb") as stream:
@@ -247,7 +244,6 @@ def _packed(header: Header) -> Iterator[bytes]:
 
 
 def _rgb(header: Header, content: bytes) -> np.ndarray:
-    """Return the image (rows, columns, 3) uint8 in the bytes of one frame."""
     from pydicom.encaps import encapsulate
     from pydicom.pixels import get_decoder
     from pydicom.pixels.utils import as_pixel_options

@@ -93,7 +93,6 @@ def _poses_file(path: Path) -> Path | None:
 
 
 def _read_rows(file: Path) -> np.ndarray:
-    """Return the rows (N, 17) float64 of an LLFF file."""
     try:
         # Mapped, a header that claims more than the file holds is refused before any memory is taken.
         array = np.load(file, mmap_mode="r", allow_pickle=False)

@@ -149,7 +149,6 @@ def _frame_files(path: Path) -> list[Path]:
 
 
 def _find_poses(folder: Path) -> Path | None:
-    """Return the file of poses in `folder`, which need not exist, or None."""
     # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
     files = [file for pattern in _POSE_FILES for file in sorted(folder.glob(pattern))]
     return next((file for file in files if file.is_file() and not file.name.startswith((".", "~"))), None)

@@ -66,7 +66,6 @@ class ArchiveFiles:
             return sorted(self._found)
 
     def _advance(self) -> None:
-        """Look at the next member."""
         with self._reporting():
             self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115
             member = self._tar.next()

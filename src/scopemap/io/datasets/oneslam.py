@@ -100,7 +100,6 @@ class OneSlamFolder(ImageFolder):
         return table.unit("mm")[0]
 
     def _read_mask(self) -> np.ndarray | None:
-        """Return where mask.bmp shows tissue, (h, w) bool, None where there is no such file."""
         file = self.path / _MASK
         if not file.is_file():
             return None

@@ -82,7 +82,6 @@ class PosedVideo(SourceDefaults):
         self.camera_source = f"calibration of the data set, {file.name}{rescaled_note(camera, fitted)}"
 
     def _beyond(self) -> int:
-        """Return the number of poses of frames that the video does not have."""
         return sum(self.count is not None and number >= self.count for number in self.poses)
 
 

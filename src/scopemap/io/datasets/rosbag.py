@@ -183,7 +183,6 @@ class RosBag(SourceDefaults):
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        """Open the bag with the reader of `rosbags` for its version."""
         from rosbags import rosbag1, rosbag2
 
         with self._reporting():
@@ -217,7 +216,6 @@ class RosBag(SourceDefaults):
             yield _Message(connection.topic, bag_ns, fields)
 
     def _as_far_as_read(self, reader: Any, topics: list[str]) -> Iterator[_Message]:
-        """Yield messages up to where the bag breaks off; a warning says so."""
         read = 0
         try:
             for message in self._messages(reader, topics):
@@ -231,7 +229,6 @@ class RosBag(SourceDefaults):
         return reporting(f"reading {self.path}: the bag is damaged or was not closed; {advice}")
 
     def _size(self, reader: Any) -> tuple[int, int]:
-        """Return height and width of the first image that can be decoded."""
         fault = "it holds no message"
         for message in self._as_far_as_read(reader, [self._topic.name]):
             try:
@@ -306,7 +303,6 @@ class RosBag(SourceDefaults):
             self.camera, self.camera_source = self.calibration.camera, self.calibration.source
 
     def _aligned(self) -> _Topic | None:
-        """Return the depth topic that is aligned to the images, by its name."""
         depths = [topic for topic in self._topics.values() if is_depth(topic.encoding)]
         aligned = [
             topic
@@ -328,7 +324,6 @@ def _storages_in(folder: Path) -> list[Path]:
 
 
 def _storage_of(path: Path) -> Path:
-    """Return what `rosbags` opens: a file, or a folder with `metadata.yaml`."""
     if not path.is_dir() or (path / _METADATA).is_file():
         return path
     files = _storages_in(path)

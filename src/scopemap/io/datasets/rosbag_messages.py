@@ -122,7 +122,6 @@ def calibration_of(info: Any, size: tuple[int, int], rectified: bool, topic: str
 
 
 def _bare(encoding: str) -> str:
-    """Return an encoding without the compression that a format adds."""
     return encoding.split(";")[0].strip()
 
 

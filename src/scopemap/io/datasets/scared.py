@@ -100,7 +100,7 @@ class ScaredKeyframe(SourceDefaults):
         return VideoFile(video)
 
     def _read_frame_data(self) -> None:
-        """Read all poses, time stamps and the calibration; a file that cannot be used is a warning."""
+        """Read all poses and time stamps; a file that cannot be used is a warning."""
         files = find_numbered(self.path, _FRAME_DATA, "frame_data", (".json",))
         frames = []
         for number in files.numbers() if files is not None else []:
@@ -247,7 +247,6 @@ class _ArchivedImages(ImageFolder):
 
 
 def _keyframe(path: Path) -> Path:
-    """Return the keyframe's folder, also where its `data` was named."""
     return path.parent if path.name == "data" and (path.parent / _CALIBRATION).is_file() else path
 
 

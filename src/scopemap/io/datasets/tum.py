@@ -128,7 +128,6 @@ def read_stamped(file: Path) -> NumberTable:
 
 
 def _read_list(file: Path) -> list[tuple[float, str]]:
-    """Return (time stamp, name) of each image in a list, in its order."""
     listed: dict[float, str] = {}
     for number, line in enumerate(text_lines(file), start=1):
         fields = line.split()
