@@ -67,7 +67,7 @@ def test_depth_alone_can_be_compared(name: str, tmp_path: Path) -> None:
     settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
     reconstruct(open_sequence(folder), Config.load(settings=settings), out=run)
     if name not in KNOWS_DEPTH_ONLY:
-        with pytest.raises(InputError, match="knows the true depth of no frame"):
+        with pytest.raises(InputError, match="has no true depth of the frames"):
             _figures(run, "--truth", folder, "--depth", "median")
         return
     depth = _figures(run, "--truth", folder, "--depth", "median")["depth"]
@@ -101,7 +101,7 @@ def test_without_true_poses_it_says_what_can_be_compared(name: str, tmp_path: Pa
     assert read_reference(folder) is None
     estimate = tmp_path / "estimate.tum"
     estimate.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 1 0 0 0 0 1\n")
-    with pytest.raises(InputError, match=r"knows no true poses; .*--depth median"):
+    with pytest.raises(InputError, match=r"has no true poses; .*--depth median"):
         _figures(estimate, "--truth", folder)
 
 

@@ -205,7 +205,7 @@ def test_prepare_refuses_what_is_in_the_way(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
     for overwrite in (False, True):
-        with pytest.raises(InputError, match="a file of that name is in the way"):
+        with pytest.raises(InputError, match="a file has that name"):
             prepare_folder(file, overwrite=overwrite)
         with pytest.raises(InputError, match="cannot write a run to"):
             prepare_folder(file / "inside", overwrite=overwrite)

@@ -55,7 +55,7 @@ def test_a_run_never_overwrites_what_it_reads(folder: Path, tmp_path: Path, sour
     reconstruct(open_sequence(folder), with_true_depth(folder), out=out)
     kept = sorted(out.rglob("*"))
     config = with_true_depth(out / "depth") if source == "depth" else with_true_depth(folder)
-    with pytest.raises(InputError, match=r"its input .* lies there"):
+    with pytest.raises(InputError, match=r"its input .* is in it"):
         reconstruct(open_sequence(folder), config, out=out if source == "depth" else folder, overwrite=True)
     assert sorted(out.rglob("*")) == kept
 

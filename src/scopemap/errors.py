@@ -1,6 +1,6 @@
-"""One root error, few kinds, and the shape check that public doors use.
+"""One root error, few kinds, and the shape check of public functions.
 
-A message says what was being done, what was found, and what to do about it. The command line prints a known error as
+A message names the action, the finding and the remedy. The command line prints a known error as
 one line and exits with code 1; anything else is a bug and keeps its traceback.
 """
 

@@ -21,10 +21,10 @@ from scopemap.pipeline import Estimators
 def create_estimators(config: Config, sequence: Sequence) -> Estimators:
     """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do."""
     networks, folder = config.networks, files_folder(config.depth)
-    beside = folder is not None and folder.resolve() == sequence.path.resolve()
+    in_input = folder is not None and folder.resolve() == sequence.path.resolve()
     depth = create_depth(
         config.depth,
-        sequence.depth_rectifier if beside else sequence.rectifier,
+        sequence.depth_rectifier if in_input else sequence.rectifier,
         networks.device,
         sequence.depth_scale_mm,
         calibrated=sequence.calibrated,
@@ -54,7 +54,7 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
 
 
 def estimators_provenance(estimators: Estimators) -> dict[str, str]:
-    """Return names, versions and hashes of the estimators, and what fixed the scale of depth."""
+    """Return names, versions and hashes of the estimators, and the source of the depth scale."""
     parts = estimators.depth.provenance()
     others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance] = {
         "flow": estimators.flow,

@@ -1,6 +1,6 @@
 """Frame: the data type that flows through all stages. Truth: known poses and depth, for evaluation only.
 
-A stage takes a Frame and returns a new one (`dataclasses.replace`); nothing is changed in place.
+A stage takes a Frame and returns a new one (`dataclasses.replace`); frames are never changed in place.
 """
 
 from __future__ import annotations

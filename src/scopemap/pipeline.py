@@ -46,7 +46,7 @@ class Estimators:
 
 @dataclass(frozen=True)
 class Percept:
-    """Results that need no motion: `frame` is masked, with raw depth; `anchored`: it fixed the scale of depth."""
+    """Results that need no motion: `frame` is masked, with raw depth; `anchored`: it determined the depth scale."""
 
     frame: Frame
     kind: DepthKind

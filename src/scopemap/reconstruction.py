@@ -1,7 +1,7 @@
-"""What a run gives back, and the folder it is kept in.
+"""The result of a run, and the folder it is written to.
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
-      depth/000000.png (16 bit, depth/depth.json has the scale)  maps/1 (the same of what could not be joined), ...
+      depth/000000.png (16 bit, depth/depth.json has the scale)  maps/1 (the same for submaps that are not merged), ...
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ _OWN_FILES = (
     *("config.toml", "provenance.json"),
 )
 _OWN_FOLDERS = ("depth", "pictures", "maps")
-# What tells a run's folder from any other: the first is written last, the second first.
+# Files by which a run's folder is recognised: the first is written last, the second first.
 _MARKS = ("provenance.json", "depth/depth.json")
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One line of frames.csv: what is known of a frame besides its pixels.
+    """One row of frames.csv: the results for a frame besides its images.
 
     `depth_scale` is MAPIS' factor of its depth, times the back end's.
     """
@@ -92,7 +92,7 @@ def _skipped_row(frame: SkippedFrame) -> list[str]:
 def records_of(submap: Submap, records: list[FrameRecord]) -> list[FrameRecord]:
     """Return the records with corrected poses and scales; frames of other submaps are lost in this one.
 
-    A lost frame repeats the last pose that is known, before the first one the first.
+    A lost frame repeats the last tracked pose; those before the first tracked frame repeat the first.
     """
     first = next(record for record in records if record.index in submap.frames)
     last, out, started = _corrected(submap, first).T_world_camera, list[FrameRecord](), False
@@ -128,12 +128,12 @@ class Reconstruction:
     mesh : world mm, vertex colours; may be empty. config : the resolved settings.
     provenance : what the result depends on and what was assumed: input, camera, scale, weights, versions, machine,
         time.
-    source_camera : the camera of the input's images, as they lie in it; None where it is not kept. With `camera` it
-        tells where a pixel was before (`camera.source_pixel`).
+    source_camera : the camera of the input's images before rectification; None where it is not kept. With it
+        `camera.source_pixel` gives the pixel before rectification.
     skipped : frames that were read and not used.
     focal_sigma_px : standard deviation of the focal length of `camera` where it is an estimate, or None.
-    others : what else was reconstructed, each in a world and in millimetres of its own, since nothing tells how it lies
-        to this; most frames first.
+    others : the other submaps, each with its own world and scale, since their relative pose is unknown; most
+        frames first.
     """
 
     camera: PinholeCamera
@@ -148,7 +148,7 @@ class Reconstruction:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses with their status; a lost frame repeats the last pose that is known."""
+        """The poses with their status; a lost frame repeats the last tracked pose."""
         records = self.records
         return Trajectory(
             np.array([record.index for record in records], dtype=np.int64),
@@ -163,7 +163,7 @@ class Reconstruction:
         return [record for record in self.records if record.track.status == "lost"]
 
     def save(self, folder: Path) -> None:
-        """Write everything but the depth maps, which a `DepthWriter` writes while they pass by.
+        """Write everything but the depth maps, which a `DepthWriter` writes frame by frame.
 
         Raises `InputError` where the folder cannot be written.
         """
@@ -254,7 +254,7 @@ def _unit_for(largest_mm: float) -> float:
 def prepare_folder(folder: Path, *, overwrite: bool) -> None:
     """Make an empty folder for a run; with `overwrite` an earlier run's files in it are removed, nothing else.
 
-    Raises `InputError` if something is in the way, or if the folder to overwrite holds no run.
+    Raises `InputError` if a file has that name, or if the folder to overwrite holds no run.
     """
     folder = Path(folder)
     try:
@@ -265,12 +265,12 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> None:
 
 def _make_empty(folder: Path, *, overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"cannot write a run to {folder}: a file of that name is in the way")
+        raise InputError(f"cannot write a run to {folder}: a file has that name")
     if folder.is_dir() and any(folder.iterdir()):
         if not overwrite:
             raise InputError(f"cannot write a run to {folder}: it is not empty; name another folder or use --overwrite")
         if not any((folder / mark).is_file() for mark in _MARKS):
-            raise InputError(f"will not overwrite {folder}: what it holds is no run; name another folder")
+            raise InputError(f"will not overwrite {folder}: it holds no run; name another folder")
         for name in _OWN_FILES:
             (folder / name).unlink(missing_ok=True)
         for name in _OWN_FOLDERS:

@@ -52,7 +52,7 @@ def reconstruct(
 
     Parameters
     ----------
-    sequence : what `open_sequence` gave.
+    sequence : from `open_sequence`.
     config : settings, by default the preset `default`.
     out : folder for the result; None keeps it in memory, without depth maps.
     overwrite : replace an earlier run there.
@@ -88,7 +88,7 @@ def reconstruct(
 
 @dataclass
 class _Run:
-    """One run: the pipeline, and what is collected on the way."""
+    """One run: the pipeline, and the results collected from it."""
 
     sequence: Sequence
     config: Config
@@ -192,15 +192,15 @@ def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
     kind, _, folder = config.depth.backend.partition(":")
     for source in [sequence.path, *([Path(folder)] if kind == "files" else [])]:
         if source.resolve().is_relative_to(out.resolve()):
-            raise InputError(f"cannot write a run to {out}: its input {source} lies there; name another folder")
+            raise InputError(f"cannot write a run to {out}: its input {source} is in it; name another folder")
 
 
 def _with_best_camera(
     sequence: Sequence, config: Config, estimators: Estimators, clock: _Clock
 ) -> tuple[Sequence, list[str]]:
-    """Give an unknown camera the focal length that `input.focal` asks for, with notes on what the motion tells."""
-    unasked = config.input.focal == "auto" and sequence.focal_is_stated
-    if sequence.calibrated or unasked or config.input.focal == "assume":
+    """Give an unknown camera the focal length by `input.focal`, with notes on the estimation."""
+    is_stated = config.input.focal == "auto" and sequence.focal_is_stated
+    if sequence.calibrated or is_stated or config.input.focal == "assume":
         return sequence, []
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if config.input.focal == "auto" and network is not None:
@@ -221,7 +221,7 @@ def _with_networks_focal(sequence: Sequence, network: DepthEstimator) -> Sequenc
 def _with_exponent(
     sequence: Sequence, config: Config, estimators: Estimators, clock: _Clock
 ) -> tuple[Config, list[str]]:
-    """Put a number where the settings ask for a fitted exponent, with a note of what was found; else change nothing."""
+    """Put a number where the settings ask for a fitted exponent, with a note on the fit; else change nothing."""
     if config.depth.exponent != "fit":
         return config, []
     fit = clock.timed("depth exponent", fit_exponent, sequence, config, estimators.depth)

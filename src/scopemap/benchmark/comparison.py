@@ -70,7 +70,7 @@ def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Un
         return FinishedRun(replace(result, figures=figures, facts=facts), path, lambda: frames)
     estimate, reference = read_trajectory(path, unit=unit), read_reference(truth, unit=unit)
     if reference is None:
-        raise InputError(f"comparing {path}: {truth} knows no true poses")
+        raise InputError(f"comparing {path}: {truth} has no true poses")
     figures = pose_groups(estimate, reference, protocol, protocol.align)[0]
     return FinishedRun(replace(result, figures=figures, facts=facts | {"convention": estimate.source}), path)
 

@@ -39,7 +39,7 @@ from scopemap.report.depth_figures import DepthScene, draw_depth_change
 from scopemap.report.mesh_figures import draw_reconstruction
 from scopemap.trajectory.formats.opening import read_trajectory
 
-_MOST_DEPTHS = 6
+_MAX_DEPTHS = 6
 _WORLD = {"reference": "world, true poses", "estimated": "world, own poses"}
 
 
@@ -141,7 +141,7 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
     """Draw the depth of the two frames in the middle, and the 3D points of ORB's matches between them."""
     (previous, true_previous), (current, true_current) = _middle(frames)
     depths = {}
-    for run in runs[:_MOST_DEPTHS]:
+    for run in runs[:_MAX_DEPTHS]:
         reader = DepthReader(run.folder)
         before, now = reader.read(previous.index), reader.read(current.index)
         if before is not None and now is not None and before.shape == now.shape == previous.valid.shape:

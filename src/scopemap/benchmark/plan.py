@@ -71,7 +71,7 @@ class SequencePlan(_Part):
     Attributes
     ----------
     name : for tables; before the path of each sequence that a pattern finds.
-    path : below the data folder. A pattern finds folders and videos, with `dataset` only those that its reader knows.
+    path : below the data folder. A pattern finds folders and videos, with `dataset` only those of its reader.
     phantom : settings of a `PhantomSpec` instead of a path; its `path_file` is below the data folder, its `seed` is
         added to the benchmark's.
     dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].

@@ -202,7 +202,7 @@ def _peak_memory_mb() -> float:
 def source_commit() -> str:
     """Return the commit of the source tree of this package, "+" where it was changed; "" where it is in none."""
     try:
-        # The package may be installed inside another project's repository, whose commits say nothing of it.
+        # The package may be installed inside another project's repository, whose commits are unrelated.
         _git("ls-files", "--error-unmatch", Path(__file__).name)
         return _git("describe", "--always", "--abbrev=10", "--dirty=+", "--exclude=*")
     except (OSError, subprocess.CalledProcessError):

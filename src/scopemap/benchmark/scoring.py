@@ -35,7 +35,7 @@ from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 
 _CONSISTENCY_PX = 1.0
-_MOST_VIEWS = 40
+_MAX_VIEWS = 40
 
 
 def score(
@@ -126,7 +126,7 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
     if surface is None or (surface.seen is not None and whole_clip) or surface.T_view is not None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
-    chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MOST_VIEWS))]}
+    chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]}
     views = {
         truth.index: (truth.T_world_camera, truth.depth_mm)
         for frame, truth in sequence
@@ -155,7 +155,7 @@ def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consis
     if scaling is not None:
         figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}))
         if not figures:
-            raise InputError(f"{truth} knows the true depth of no frame that {run} holds depth of")
+            raise InputError(f"{truth} has no true depth of the frames with depth in {run}")
     if consistency:
         figures |= _consistency(depth, sequence, read_trajectory(run), protocol)
     return figures

@@ -1,7 +1,7 @@
 """Table: figures of methods with the best ones marked, as Markdown, CSV and LaTeX (booktabs).
 
-Rows are a data frame. Its columns are texts, the figures by their keys ("poses.ate_rmse_mm"), what is printed behind a
-figure's "±" ("poses.ate_rmse_mm ±"), "failure" (empty where the method came to an end) and "competes" (whether figures
+Rows are a data frame. Its columns are texts, the figures by their keys ("poses.ate_rmse_mm"), the spread printed after
+"±" ("poses.ate_rmse_mm ±"), "failure" (empty where the method came to an end) and "competes" (whether figures
 of the row may be the best).
 """
 
@@ -100,7 +100,7 @@ class Table:
 
     Attributes
     ----------
-    name : of its files. title, caption : for readers; the caption says how the figures were measured.
+    name : of its files. title, caption : for readers; the caption describes how the figures were measured.
     texts : names of the columns of text. figures : the other columns. rows : see the module's docstring.
     compete_within : columns of `rows`; values compete where these are equal.
     """

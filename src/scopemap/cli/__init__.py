@@ -32,8 +32,8 @@ app.add_typer(models.app, name="models")
 app.add_typer(datasets.app, name="datasets")
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         from scopemap import __version__
 
         typer.echo(f"scopemap {__version__}")

@@ -25,7 +25,7 @@ def bench(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for runs, tables and figures; continues what is there.")
+        Path | None, typer.Option(help="Folder for runs, tables and figures; continues an earlier call.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the plan's paths.")] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
@@ -36,7 +36,7 @@ def bench(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run a benchmark's plan, or what is left of it, and write its tables and figures."""
+    """Run a benchmark's plan, or the rest of it, and write its tables and figures."""
     from scopemap.benchmark.plan import read_plan
 
     if plan is None:

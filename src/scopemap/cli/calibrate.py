@@ -53,9 +53,9 @@ def calibrate(
     model: Annotated[
         ModelChoice, typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen.")
     ] = ModelChoice.AUTO,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Calibration to write; its picture goes beside it.")] = Path(
-        "calibration.yaml"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Calibration to write; its picture is written to the same folder.")
+    ] = Path("calibration.yaml"),
     frames: Annotated[
         str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
     ] = None,
@@ -76,7 +76,7 @@ def calibrate(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate the camera with a board held before it; the file serves every command as --camera."""
+    """Calibrate the camera from images of a board; the file is for --camera of every command."""
     picture = _prepared(out, overwrite)
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
     selection, reading = parse_slice(frames) if frames else None, _reading(settings or [])
@@ -173,4 +173,4 @@ def _print(done: CameraCalibration) -> None:
     )
     tried = sorted(done.held_out_px.items(), key=lambda item: item[1])
     errors = [f"{form.described} " + (f"{error:.3f} px" if error < inf else "impossible") for form, error in tried]
-    typer.echo("error in views held out: " + "; ".join(errors))
+    typer.echo("error in held-out views: " + "; ".join(errors))

@@ -24,7 +24,7 @@ from scopemap.errors import InputError, ScopemapError
 if TYPE_CHECKING:
     from scopemap.io.datasets.checking import Finding
 
-app = typer.Typer(help="Data sets: list what is read, check one.", no_args_is_help=True)
+app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
 
 _ASKED = "Whether "
 
@@ -34,7 +34,7 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the data sets that are read, in the order in which they are recognised."""
     from scopemap.io.opening import DATASETS
 
-    # A reader's module says what the data set is, its `recognises` what it is told by; nothing is kept in two places.
+    # The docstrings of a reader's module and of its `recognises` are the only description of a data set.
     rows = [
         {
             "name": name,
@@ -67,7 +67,7 @@ def check(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Read a data set once and say what is wrong with its frames, camera, poses and depth; exit code 1 with errors."""
+    """Read a data set once and report errors in its frames, camera, poses and depth; exit code 1 with errors."""
     from scopemap.config import Config
     from scopemap.io.datasets.checking import check as findings_of
     from scopemap.io.datasets.checking import refusal

@@ -90,7 +90,7 @@ def evaluate(
     reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:
         if not (depth or consistency):
-            raise InputError(f"{truth} knows no true poses; if it knows depth: --depth median compares that alone")
+            raise InputError(f"{truth} has no true poses; if it has depth: --depth median compares that alone")
         show(_depths(trajectory, truth, depth, consistency=consistency), form)
         return
     matched = match(estimate, reference, align, first=align_first)

@@ -71,7 +71,7 @@ class OutputForm(Enum):
 
 
 def show(figures: dict[str, Any], form: OutputForm) -> None:
-    """Print the figures of a trajectory, if any, and of the groups that stand beside them as dictionaries."""
+    """Print the figures of a trajectory, if any, and of the groups of further measures as dictionaries."""
     if form is OutputForm.JSON:
         typer.echo(json.dumps(without_nan(figures), indent=2))
     elif form is OutputForm.CSV:

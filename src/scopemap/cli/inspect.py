@@ -50,7 +50,7 @@ def inspect(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Read a video once and show what was found in it: format, timing, field of view, overlays, bad stretches.
+    """Read a video once and show what was found in it: format, timing, field of view, overlays, bad segments.
 
     That takes as long as decoding, plus some 20 ms for each frame: for a video of 2 h more than an hour, ::10 of it a
     fraction.

@@ -39,7 +39,7 @@ def verify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Hash weights anew and compare them with what is pinned or was recorded."""
+    """Hash weights anew and compare them with the pinned or recorded hashes."""
     there = [row.name for row in weights.overview() if row.state != "missing"]
     names = [name] if name else there
     faults = {each: fault for each in names if (fault := _fault(each))}

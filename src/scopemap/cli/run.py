@@ -134,8 +134,8 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
     elif not quiet:
         for line in summary_lines(result):
             typer.echo(line)
-        beside = ", maps/" if result.others else ""
-        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv{beside}")
+        submaps = ", maps/" if result.others else ""
+        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv{submaps}")
 
 
 def summary_lines(result: Reconstruction) -> list[str]:

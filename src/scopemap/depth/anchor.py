@@ -1,7 +1,7 @@
 """The metric anchor: converts a depth estimate of any kind to millimetres, fitted on the first frame and then fixed.
 
 METHOD section MAPIS-Depth, steps 1-4. Only the scale (and the shift of a disparity) is fitted, once. A scale that
-changes from frame to frame is estimated by the consistency stage (mapis.py), which knows the camera motion.
+changes from frame to frame is estimated by the consistency stage (mapis.py), which has the camera motion.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class DepthAnything:
     def from_folder_or_hub(cls, model: str = "", device: str = "auto") -> DepthAnything:
         """Return the estimator with the weights `model`: a local folder, a pulled hub id, or "" = the pinned Small.
 
-        Never downloads. Raises `WeightsError` that says what to pull.
+        Never downloads. Raises `WeightsError` with the name to pull.
         """
         from transformers import DepthAnythingForDepthEstimation
 
@@ -60,7 +60,7 @@ class DepthAnything:
             outputs = self._network(inputs["pixel_values"].to(self._device))
         size = (frame.camera.height, frame.camera.width)
         result = self._processor.post_process_depth_estimation(outputs, target_sizes=[size])[0]
-        # Bicubic enlargement undershoots zero beside strong edges.
+        # Bicubic enlargement undershoots zero at strong edges.
         values = np.maximum(result["predicted_depth"].float().cpu().numpy(), 0.0)
         return DepthEstimate(values * MM_PER_M, "depth") if self._metric else DepthEstimate(values, "disparity")
 

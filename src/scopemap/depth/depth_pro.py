@@ -21,7 +21,7 @@ class DepthPro:
     """A Depth Pro network and its image processor behind the `DepthEstimator` contract.
 
     The network gives canonical inverse depth c and a field of view; depth is f / (W c) with the focal length f and the
-    width W in px (paper, section 3.2). `use_known_focal` takes f from the frame's camera instead of the network: say
+    width W in px (paper, section 3.2). `use_known_focal` takes f from the frame's camera instead of the network: set
     False where the camera is itself a guess.
     """
 
@@ -49,7 +49,7 @@ class DepthPro:
     def from_folder_or_hub(cls, model: str = "", device: str = "auto", *, use_known_focal: bool = True) -> DepthPro:
         """Return the estimator with the weights `model`: a local folder, a pulled hub id, or "" = Apple's own.
 
-        Never downloads. Raises `WeightsError` that says what to pull.
+        Never downloads. Raises `WeightsError` with the name to pull.
         """
         from transformers import DepthProForDepthEstimation
 

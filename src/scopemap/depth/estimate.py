@@ -1,4 +1,4 @@
-"""The contracts of depth estimators and of perceptual distances."""
+"""The protocols of depth estimators and of perceptual distances."""
 
 from __future__ import annotations
 

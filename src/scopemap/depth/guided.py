@@ -47,19 +47,19 @@ def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: fl
     return np.where(known, gain * image + offset, np.nan).astype(np.float32)
 
 
-def filled(image: np.ndarray, known: np.ndarray, reach_px: int) -> np.ndarray:
+def filled(image: np.ndarray, known: np.ndarray, max_distance_px: int) -> np.ndarray:
     """Fill unknown pixels from the nearest known ones, window by growing window.
 
     image : (H, W) float32.
     known : (H, W) bool.
-    reach_px : pixels farther than this (along rows or columns) from every known one stay NaN.
+    max_distance_px : pixels farther than this (along rows or columns) from every known one stay NaN.
 
     Returns (H, W) float32.
     """
     result = np.where(known, image, np.nan).astype(np.float32)
     radius_px = 1
-    while radius_px < 2 * reach_px and np.isnan(result).any():
-        means = masked_mean(image, known, min(radius_px, reach_px))
+    while radius_px < 2 * max_distance_px and np.isnan(result).any():
+        means = masked_mean(image, known, min(radius_px, max_distance_px))
         result = np.where(np.isnan(result), means, result)
         radius_px *= 2
     return result

@@ -27,7 +27,7 @@ _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "
 
 
 def create_perceptual(name: str = "auto", device: str = "auto") -> PerceptualDistance:
-    """Return the distance "lpips", "structure", or with "auto" lpips if its weights are at hand, else structure.
+    """Return the distance "lpips", "structure", or with "auto" lpips if its weights are present, else structure.
 
     Raises `SettingsError` for an unknown name and `WeightsError` where lpips lacks its weights.
     """

@@ -48,7 +48,7 @@ def load_pretrained(model_class: type[PreTrainedModel], model: str) -> tuple[Any
 
 
 def _is_local(model: str) -> bool:
-    """Return whether `model` is a folder; a name of the registry never is, whatever lies in the working directory."""
+    """Return whether `model` is a folder; a name of the registry is never taken for a folder."""
     return model not in REGISTRY and Path(model).is_dir()
 
 

@@ -1,7 +1,7 @@
 """Depth from near-field shading: an estimator that needs no weights.
 
 In endoscopy the lamp sits at the camera and is the only light, so brightness falls with the square of the distance
-along the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue turns away
+along the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away
 from the lamp the farther it is down a lumen, which makes it darker still, and light bounces between the walls, which
 makes it brighter: the exponent is therefore a setting, chosen on real frames (benchmarks/depth_without_download.py).
 """
@@ -31,7 +31,7 @@ _REACH_SHARE = 0.1
 # Deviation of log brightness in a window above which it is taken for shape, not for texture.
 _EDGE_LOG = 0.8
 # A frame with less usable tissue cannot fix the scale: the next one is tried.
-_LEAST_SHARE = 0.02
+_MIN_SHARE = 0.02
 
 
 class ShadingDepth:
@@ -57,7 +57,7 @@ class ShadingDepth:
         distance = relative_distance(frame, unit_z, self._settings.advanced.shading_exponent)
         if self._scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
-            if seen.size >= _LEAST_SHARE * distance.size:
+            if seen.size >= _MIN_SHARE * distance.size:
                 self._scale_mm = self._settings.shading_median_mm / float(np.median(seen))
         scale_mm = np.nan if self._scale_mm is None else self._scale_mm
         return DepthEstimate((scale_mm * distance * unit_z).astype(np.float32), "depth")

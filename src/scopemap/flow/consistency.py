@@ -1,4 +1,4 @@
-"""Flow in both directions between two frames, and where the two agree."""
+"""Flow in both directions between two frames, with the forward-backward consistency check."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Flow:
     Attributes
     ----------
     to_previous : (H, W, 2) float32, px: pixel p of the current frame is seen at p + to_previous(p) in the previous.
-    to_current : (H, W, 2) float32, px: the same from the previous frame to the current.
-    consistent : (H, W) bool on the current frame's grid: True where there and back again ends where it began.
+    to_current : (H, W, 2) float32, px: from the previous frame to the current.
+    consistent : (H, W) bool on the current frame's grid: True where the forward-backward error is small.
     """
 
     to_previous: np.ndarray
@@ -30,9 +30,9 @@ class Flow:
 def pair_flow(
     estimator: FlowEstimator, rgb_previous: np.ndarray, rgb_current: np.ndarray, consistency_px: float
 ) -> Flow:
-    """Return the flow between two (H, W, 3) uint8 frames, both ways, checked against each other.
+    """Return the forward and backward flow between two (H, W, 3) uint8 frames, with their consistency check.
 
-    `consistency_px` is the largest distance between a pixel and where both flows, one after the other, take it.
+    consistency_px : largest forward-backward error.
     """
     check_shape("rgb_previous", rgb_previous, (None, None, 3))
     check_shape("rgb_current", rgb_current, rgb_previous.shape)
@@ -41,6 +41,6 @@ def pair_flow(
 
 
 def agree(forth: np.ndarray, back: np.ndarray, consistency_px: float) -> np.ndarray:
-    """Return (H, W) bool: True where `forth` (H, W, 2) stays in the image and `back`, taken there, undoes it."""
+    """Return (H, W) bool: True where the flow `forth` (H, W, 2) stays in the image and is consistent with `back`."""
     error_px = np.linalg.norm(forth + pull(back, forth), axis=-1)
     return error_px <= consistency_px

@@ -50,7 +50,7 @@ class KeyframeMatcher:
         self._points_mm = np.zeros((0, 3))
 
     def set_keyframe(self, keyframe: Frame | None) -> None:
-        """Detect the corners of a frame with depth, which replace those of the last one; None: there are none."""
+        """Detect the corners of a frame with depth, which replace those of the last keyframe; None: no keyframe."""
         self._keyframe = keyframe
         if keyframe is None:
             return
@@ -74,11 +74,11 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     """Return pixels (n, 2) int x, y: the strongest corner with depth of each cell of `cell_px` x `cell_px`.
 
     The strength is the smaller eigenvalue of the structure tensor (Shi and Tomasi, CVPR 1994). Every whole cell with
-    usable tissue gives one unless it is constant: where corners are few, edges and shades are better than nothing.
+    usable tissue gives one unless it is constant: edges and shading are used where corners are few.
     """
     assert frame.depth_mm is not None
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    # On brightness relative to its surround: distant tissue is dark, not featureless.
+    # On brightness relative to its surround: distant tissue is dark, not without texture.
     level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
     usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
@@ -104,12 +104,12 @@ def match_corners(
     """
     start = corners.astype(np.float32)
     pixel = start + flows[0][corners[:, 1], corners[:, 0]]
-    returned = pixel + sample_flow(flows[1], pixel)
+    backward = pixel + sample_flow(flows[1], pixel)
     height, width = valid.shape
     nearest = np.clip(np.rint(pixel).astype(int), 0, [width - 1, height - 1])
     inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(1)
     good = inside & valid[nearest[:, 1], nearest[:, 0]]
-    good &= np.linalg.norm(returned - start, axis=1) <= consistency_px
+    good &= np.linalg.norm(backward - start, axis=1) <= consistency_px
     matched = np.flatnonzero(good)
     return matched, pixel[matched].astype(np.float64)
 
@@ -117,7 +117,7 @@ def match_corners(
 def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside.
 
-    Not OpenCV's remap, which refuses no points and very many.
+    OpenCV's remap is not used: it fails for no points and for more than 32767.
     """
     height, width = flow.shape[:2]
     inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)

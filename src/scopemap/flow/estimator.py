@@ -1,4 +1,4 @@
-"""The contract of optical flow estimators."""
+"""The protocol of optical flow estimators."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTO
 
 @dataclass(frozen=True)
 class _Entry:
-    """What is small of a frame, where its images begin in the file, and how many bytes each takes."""
+    """Small data of a frame, the offset of its images in the file, and their sizes in bytes."""
 
     index: int
     time_s: float
@@ -38,7 +38,7 @@ class _Entry:
 
 
 class FrameStore:
-    """Stores frames with depth in one unnamed file, which is made with the first frame and gone with the store.
+    """Stores frames with depth in one unnamed file, which is created with the first frame and deleted with the store.
 
     folder : where that file is; None: the system's temporary folder.
     """

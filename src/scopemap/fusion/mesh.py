@@ -1,6 +1,6 @@
 """The mesh: marching cubes on the distance field, chunk by chunk, welded, without floaters; PLY and GLB files.
 
-A chunk is 64^3 cells, so it needs one sample more on each side, which it shares with its neighbour; a vertex lies on a
+A chunk is 64^3 cells, so it needs one sample more on each side, which it shares with its neighbour; a vertex is on a
 grid edge, and the edge's address welds the chunks exactly.
 """
 
@@ -21,7 +21,7 @@ from scopemap.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
 
 _CHUNK_BLOCKS = 8
 _CHUNK = _CHUNK_BLOCKS * BLOCK
-# Keeps every vertex off the grid corners, where the edge it lies on would be ambiguous.
+# Keeps every vertex off the grid corners, where its edge would be ambiguous.
 _SMALLEST_DISTANCE_VOXELS = 1e-3
 # A cell's diagonal is sqrt(3) voxels, and a distance changes by no more than the step: twice that is a depth edge, not
 # a surface. Without the limit, walls of the truncation's depth would grow behind every fold's silhouette.
@@ -146,13 +146,13 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
         raise ValueError("writing a GLB: the mesh has a texture; give it vertex colours")
     srgb = np.asarray(visual.vertex_colors)[:, :3] / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    turned = trimesh.Trimesh(
+    rotated = trimesh.Trimesh(
         mesh.vertices @ T_GLTF_WORLD[:3, :3].T,
         mesh.faces,
         vertex_colors=np.round(255 * linear).astype(np.uint8),
         process=False,
     )
-    return trimesh.exchange.gltf.export_glb(trimesh.Scene(turned), tree_postprocessor=_matt)
+    return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), tree_postprocessor=_matt)
 
 
 def _matt(tree: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ BLOCK = 8
 KEY_OFFSET = 1 << 20
 _KEY_MASK = (1 << 21) - 1
 _RECENT = 1 << 15
-_NORMAL_REACH_PX = 3
+_SLOPE_STEP_PX = 3
 _COLOUR_BAND_VOXELS = 2.0
 _FIRST_CAPACITY = 256
 # Share of the truncation behind the surface from which on a voxel counts less and less.
@@ -69,10 +69,10 @@ def _slope(inverse_depth: np.ndarray, row: int, col: int, along_columns: bool, l
     here, total, sides = inverse_depth[row, col], 0.0, 0
     size = inverse_depth.shape[1] if along_columns else inverse_depth.shape[0]
     position = col if along_columns else row
-    for step in (-_NORMAL_REACH_PX, _NORMAL_REACH_PX):
+    for step in (-_SLOPE_STEP_PX, _SLOPE_STEP_PX):
         if 0 <= position + step < size:
             there = inverse_depth[row, col + step] if along_columns else inverse_depth[row + step, col]
-            if abs(there - here) <= largest_step * _NORMAL_REACH_PX * here:
+            if abs(there - here) <= largest_step * _SLOPE_STEP_PX * here:
                 total += (there - here) / step
                 sides += 1
     return total / sides if sides else np.nan
@@ -139,7 +139,7 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     pieces = int(np.ceil(4.0 * grid.truncation_mm / block_mm))
     piece_mm = 2.0 * grid.truncation_mm / pieces
     footprint = 1.5 / min(camera.fx, camera.fy)
-    # Arrays read out of a tuple are counted references: once, not at every pixel.
+    # Outside the loop: numba counts references of arrays that are read from a tuple.
     R, per_mm = camera.R, 1.0 / grid.voxel_mm
     origin = -R.T @ camera.t
     recent = np.full(_RECENT, -1, np.int64)
@@ -206,7 +206,7 @@ def _integrate_block(
     camera: TsdfCamera,
     grid: Grid,
 ) -> None:
-    # Arrays read out of a tuple are counted references: once, not at every voxel.
+    # Outside the loop: numba counts references of arrays that are read from a tuple.
     tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
     inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
     R, t, truncation = camera.R, camera.t, grid.truncation_mm
@@ -256,9 +256,9 @@ def integrate_blocks(
     """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
 
     The distance of a voxel is the one to the tangent plane of the surface that its pixel sees. Voxels farther behind
-    the surface than the truncation, measured along the optical axis, are not known and stay untouched; towards there
-    the weight falls to 0 (Oleynikova et al., IROS 2017, eq. 6), so that whoever sees past a thin fold overrules whoever
-    sees its front. Changes `voxels`.
+    the surface than the truncation, measured along the optical axis, stay unchanged; towards there
+    the weight falls to 0 (Oleynikova et al., IROS 2017, eq. 6), so that views past a thin fold outweigh views of
+    its front. Changes `voxels`.
     """
     for n in prange(len(slots)):
         _integrate_block(voxels, slots[n], corners[n], surface, rgb, camera, grid)
@@ -269,7 +269,7 @@ class VoxelBlocks:
 
     Attributes
     ----------
-    voxels : storage of at least `len(self) + 1` blocks; slot 0 is a block that nothing is ever written to.
+    voxels : storage of at least `len(self) + 1` blocks; slot 0 is always an empty block.
     """
 
     def __init__(self) -> None:

@@ -44,7 +44,7 @@ class Similarity:
 
     @property
     def line_ratio(self) -> float:
-        """Second over first singular value; below 1e-3 the path is nearly a line and the turn about it is weak.
+        """Second over first singular value; below 1e-3 the rotation about the (nearly straight) path is uncertain.
 
         NaN where nothing was fitted.
         """
@@ -98,7 +98,7 @@ def _refuse_degenerate(singular_values: np.ndarray, magnitude: float) -> None:
     if rank < 2:
         values = ", ".join(f"{value:.3g}" for value in singular_values)
         raise AlignmentError(
-            f"cannot fit a rotation: the positions lie {'on one line' if rank else 'in one place'} (singular values of "
+            f"cannot fit a rotation: the positions are {'on one line' if rank else 'in one place'} (singular values of "
             f"their covariance: {values}); align by 'origin' or 'none' instead"
         )
 
@@ -110,7 +110,7 @@ def align_trajectories(
 
     Both are (N, 4, 4) float64 camera-to-world, mm, matched row by row. `none` moves nothing, `origin` puts the first
     poses onto each other, `se3` and `sim3` fit the positions (`umeyama`), `scale` takes the scale of the `sim3` fit and
-    neither turns nor shifts. `first` fits the first rows only (evo's `--n_to_align`) and moves all. Raises
+    neither rotates nor translates. `first` fits the first rows only (evo's `--n_to_align`) and moves all. Raises
     `AlignmentError` where the fit is degenerate, `mode` is unknown, or `first` is given to a mode that fits nothing.
     """
     check_shape("estimated", estimated, (None, 4, 4))

@@ -205,7 +205,7 @@ class CameraBlock(NamedTuple):
 class SchurModel:
     """Model of a cost of camera unknowns and points, in this order; see `least_squares.Model`.
 
-    cost : at the state. build : returns the blocks, called once and only where a step is asked for. free : (F,) numbers
+    cost : at the state. build : returns the blocks, called once and only where a step is needed. free : (F,) numbers
     of the camera unknowns that may change. cameras, points : how many unknowns there are of either.
     """
 
@@ -222,7 +222,7 @@ class SchurModel:
 
     @cached_property
     def gradient(self) -> np.ndarray:
-        """First derivative (cameras + points,); 0 of what is fixed."""
+        """First derivative (cameras + points,); 0 for fixed unknowns."""
         own, points = np.zeros(self.cameras), np.zeros(self.points)
         for block in self.blocks[0]:
             own[block.columns] += block.scores.sum(0)

@@ -1,7 +1,7 @@
-"""How far depth can be trusted, pixel by pixel: its standard deviation as a share of it, and the weight that follows.
+"""Relative standard deviation of depth per pixel, and the weight that follows from it.
 
-Shares, not millimetres, since an error of predicted depth grows with depth. What nothing is said of (no sigma at all,
-or NaN) is NaN as a share and 1 as a weight: who says nothing counts like the image's median pixel.
+Shares, not millimetres, since an error of predicted depth grows with depth. An unknown sigma (None or NaN)
+is NaN as a share and 1 as a weight, that of the image's median pixel.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from scopemap.errors import check_shape
 
 # A sigma of 0 or of infinity must not make weights infinite or undefined.
-_LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1e3
+_MIN_SHARE, _MAX_SHARE = 1e-4, 1e3
 
 
 def sigma_share(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray:
@@ -25,16 +25,16 @@ def sigma_share(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray
     with np.errstate(invalid="ignore"):
         known = (depth_mm > 0) & (sigma_mm >= 0)
         share = np.divide(sigma_mm, depth_mm, out=np.full(np.shape(depth_mm), np.nan, np.float32), where=known)
-    return np.clip(share, _LEAST_SHARE, _LARGEST_SHARE)
+    return np.clip(share, _MIN_SHARE, _MAX_SHARE)
 
 
 def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: float) -> np.ndarray:
-    """Return how much each pixel's depth should count against the image's median pixel, (H, W) float32, positive.
+    """Return the weight of each pixel's depth relative to the image's median pixel, (H, W) float32, positive.
 
     (f^2 + m^2) / (f^2 + s^2) with s the pixel's share of `sigma_share`, m its median over the image and f the
-    `floor_share`: the relative error that every pixel has anyhow, by what sigma does not tell of. That is the inverse
+    `floor_share`: the minimum relative error of every pixel. That is the inverse
     variance of both errors together, 1 at the median: sigma in proportion to depth changes nothing, and neither does
-    any sigma where f is large. 1 where nothing is said.
+    any sigma where f is large. 1 where sigma is unknown.
     """
     share = sigma_share(depth_mm, sigma_mm)
     known = np.isfinite(share)
@@ -45,9 +45,9 @@ def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: 
 
 
 def faded_share(carried: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
-    """Return the share of a depth that comes from the frame before, (H, W) float32: old certainty fades.
+    """Return the relative sigma of a depth from the previous frame, (H, W) float32, after one frame of growth.
 
-    Per frame, variance grows by `fading` (0..1) of what it lies below the current frame's; it never shrinks. NaN where
+    Per frame, variance grows by `fading` (0..1) of its difference to the current frame's; it never shrinks. NaN where
     `carried` is; unchanged where `current` is NaN.
     """
     excess = np.maximum(np.nan_to_num(current**2 - carried**2, nan=0.0), 0.0)

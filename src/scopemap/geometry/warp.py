@@ -63,7 +63,7 @@ def moved_depth(
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:
     """Smooth depth (H, W) float32 within surfaces, not across edges; NaN pixels stay NaN and do not count.
 
-    OpenCV's filter knows no missing values: they are put far beyond any range weight, so they reach no neighbour.
+    OpenCV's filter has no missing values: they are set far beyond any range weight, so they affect no neighbour.
     """
     known = np.isfinite(depth_mm)
     if sigma_px <= 0 or not known.any():

@@ -74,7 +74,7 @@ class StoredMasks(Protocol):
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about the masks that were asked for so far."""
+        """Warnings about the masks read so far."""
         ...
 
     def covered(self, index: int) -> np.ndarray | None:
@@ -87,7 +87,7 @@ class StoredMasks(Protocol):
 
 
 class Masker:
-    """Narrows `Frame.valid` to usable tissue; the field of view is learnt from the frames it has seen so far.
+    """Narrows `Frame.valid` to usable tissue; the field of view is estimated from all frames so far.
 
     files : masks of pixels that show no tissue, or None.
     """

@@ -11,11 +11,11 @@ import numpy as np
 _CHANNEL = 1
 # Camera motion is detected in a small copy without its local mean, divided into parts; grey levels of 255.
 _SMALL_SIDE_PX, _LOCAL_PX, _PARTS = 60, 9, (8, 6)
-_TEXTURE, _ALIKE, _LEAST_PARTS, _MOVED_SHARE = 1.0, 0.94, 12, 0.7
-_LEAST_COUNT, _MEMORY, _LOOK_EVERY = 12, 40, 4
+_TEXTURE, _ALIKE, _MIN_PARTS, _MOVED_SHARE = 1.0, 0.94, 12, 0.7
+_MIN_COUNT, _MEMORY, _LOOK_EVERY = 12, 40, 4
 # Edge threshold, grey levels; share of an edge that may change on average and in one image (video coding changes it).
 _EDGE, _STILL_SHARE, _NOW_SHARE = 40, 0.1, 0.25
-_RIM_PX, _CLOSING_PX, _GROW_PX, _LEAST_PX, _LARGEST_SHARE = 2, 5, 2, 6, 0.25
+_RIM_PX, _CLOSING_PX, _GROW_PX, _MIN_PX, _MAX_SHARE = 2, 5, 2, 6, 0.25
 # The surroundings of a static edge must change (grey levels after noise removal) or be uniform, nearly all of them.
 _CALM_PX, _NEAR_PX, _FAR_PX, _CHANGED, _PLAIN, _AROUND_SHARE = 5, 4, 8, 1.5, 2.0, 0.7
 # An overlay has disappeared where this share of its edge pixels differs (half of them belong to the surroundings).
@@ -80,7 +80,7 @@ class OverlayFinder:
         elif _has_moved(self._last, detail):
             self._last = detail
             self._learn(level)
-            if self.count >= _LEAST_COUNT and self.count % _LOOK_EVERY == 0:
+            if self.count >= _MIN_COUNT and self.count % _LOOK_EVERY == 0:
                 self._found = self._overlays(level, field if outside is None else field | outside)
         return None if self._found is None else self._found.shown(level)
 
@@ -101,7 +101,7 @@ class OverlayFinder:
         # An overlay that has just disappeared must not persist in the running mean.
         still &= cv2.absdiff(level.astype(np.float32), self._mean) <= _NOW_SHARE * contrast
         still &= cv2.erode(field.astype(np.uint8), _square(_RIM_PX), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-        if np.count_nonzero(still) < _LEAST_PX:
+        if np.count_nonzero(still) < _MIN_PX:
             return None
         still &= _stands_alone(still, (self._calm_change >= _CHANGED) | (contrast <= _PLAIN))
         mask = _grown(still)
@@ -132,14 +132,14 @@ def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
 def _has_moved(before: np.ndarray, now: np.ndarray) -> bool:
     """Whether the texture of most parts has changed, by correlation, which is independent of illumination."""
     textured = _in_parts(np.abs(now)) >= _TEXTURE
-    if np.count_nonzero(_in_parts(np.abs(before)) >= _TEXTURE) < _LEAST_PARTS:
+    if np.count_nonzero(_in_parts(np.abs(before)) >= _TEXTURE) < _MIN_PARTS:
         # After a black picture the next textured one counts.
-        return bool(np.count_nonzero(textured) >= _LEAST_PARTS)
+        return bool(np.count_nonzero(textured) >= _MIN_PARTS)
     textured &= _in_parts(np.abs(before)) >= _TEXTURE
     parts = np.count_nonzero(textured)
     power = np.sqrt(_in_parts(before * before) * _in_parts(now * now))
     moved = _in_parts(before * now) < _ALIKE * power
-    return bool(parts >= _LEAST_PARTS and np.count_nonzero(moved & textured) >= _MOVED_SHARE * parts)
+    return bool(parts >= _MIN_PARTS and np.count_nonzero(moved & textured) >= _MOVED_SHARE * parts)
 
 
 def _in_parts(values: np.ndarray) -> np.ndarray:
@@ -171,10 +171,10 @@ def _grown(still: np.ndarray) -> np.ndarray | None:
     for contour in contours:
         x, y, width, height = cv2.boundingRect(contour)
         box = np.s_[y : y + height, x : x + width]
-        if np.count_nonzero(still[box]) < _LEAST_PX:
+        if np.count_nonzero(still[box]) < _MIN_PX:
             continue
         found[box] = np.maximum(found[box], closed[box])
-        if cv2.contourArea(contour) <= _LARGEST_SHARE * still.size:
+        if cv2.contourArea(contour) <= _MAX_SHARE * still.size:
             cv2.drawContours(found, [contour], -1, 1, cv2.FILLED)
     grown = cv2.dilate(found, _square(_GROW_PX)) > 0
     return grown if grown.any() else None

@@ -176,7 +176,7 @@ def outside_views(
 def render_mesh(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
     """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
 
-    Both sides of a triangle are drawn; triangles that reach behind the camera are left out.
+    Both sides of a triangle are drawn; triangles partly behind the camera are left out.
     """
     camera = view.camera
     picture = np.full((camera.height, camera.width, 3), 255, np.uint8)

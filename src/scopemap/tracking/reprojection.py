@@ -78,12 +78,12 @@ def _projected(
     points_mm: np.ndarray, camera: PinholeCamera, T: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Projected pixels (N, 2), their derivatives by ln depth (N, 2), and which points (N,) are in front."""
-    turned = points_mm @ T[:3, :3].T
-    moved = turned + T[:3, 3]
+    rotated = points_mm @ T[:3, :3].T
+    moved = rotated + T[:3, 3]
     in_front = moved[:, 2] > 1e-3 * np.linalg.norm(moved, axis=1)
     moved[~in_front] = [0.0, 0.0, 1.0]
     focal, xy = np.array([camera.fx, camera.fy]), moved[:, :2] / moved[:, 2:]
-    along = focal * (turned[:, :2] - xy * turned[:, 2:]) / moved[:, 2:]
+    along = focal * (rotated[:, :2] - xy * rotated[:, 2:]) / moved[:, 2:]
     return focal * xy + [camera.cx, camera.cy], along, in_front
 
 

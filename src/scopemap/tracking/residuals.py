@@ -1,24 +1,23 @@
-"""The residuals of tracking and their normal equations, fused: one pass over the pixels, nothing per pixel is stored.
+"""Photometric and point-to-plane residuals of tracking, and their normal equations, in one pass over the pixels.
 
 For a reference pixel p with depth, X = depth * ray(p) and X' = T_current_reference X, each channel c of the images has
 
     r_c(p) = C_c(project(X')) - (gain * L(p) * R_c(p) + bias),      L(p) = ((cos' / cos) (|X| / |X'|)^2)^gamma
 
 R, C are the reference and the current image; C is sampled bilinearly, and its gradient is the exact derivative of that
-interpolation, so that Jacobians agree with finite differences. L predicts how a point dims as the lamp, which moves
-with the camera, moves away and aside (cos: of incidence; gamma: of the image's tone curve). With the tangent plane
-m . X = 1 it is cos' / cos = (1 + m . R^T t) |X| / |X'|, and m is read off the gradient of inverse depth. A locally
-normalised channel is blind to light: it has neither gain nor bias nor fall-off. Parameters of the normal equations, in
+interpolation, so that Jacobians agree with finite differences. L is the change of brightness by the lamp, which
+moves with the camera (cos: of incidence; gamma: of the image's tone curve). With the tangent plane m . X = 1 it is
+cos' / cos = (1 + m . R^T t) |X| / |X'|; m follows from the gradient of inverse depth. A locally normalised channel
+is independent of illumination: it has neither gain nor bias nor L. Parameters of the normal equations, in
 this order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference,
 gain, bias.
 
-Where the current depth D is measured, too, a geometric residual joins them, the distance from X' to the tangent plane
-of D where it lands, over `unit_mm` (point to plane: Chen and Medioni, 1992, with projective data association):
+Where the current depth D is measured, a geometric residual is added: the distance from X' to the tangent plane of D
+at project(X'), over `unit_mm` (point to plane: Chen and Medioni, 1992, with projective data association):
 
     r_d(p) = (D(project(X')) - z') / (|grad (D(project(X')) - z')| unit_mm)
 
-One thread on purpose: a pass is a few milliseconds of work at most, the other core has the networks to do, and waking
-threads some fifty times a frame was many times slower than one thread on a busy machine.
+The kernels use one thread: a pass takes a few milliseconds, and starting threads fifty times a frame costs more.
 """
 
 from __future__ import annotations
@@ -29,16 +28,16 @@ import numpy as np
 from numba import njit
 
 PARAMETERS = 8
-_ONE_SURFACE = 0.1  # relative spread of four neighbouring depths that is still one surface
-_SAME_PLACE = 0.1  # relative difference of depths that may be the same tissue
+_MAX_SURFACE_SPREAD = 0.1  # of four neighbouring depths on one surface, relative
+_MAX_DEPTH_DIFFERENCE = 0.1  # of associated points, relative
 
 
 class View(NamedTuple):
-    """One image of one pyramid level as the kernels want it.
+    """One image of one pyramid level, the input of the kernels.
 
     Attributes
     ----------
-    channels : (C, H, W) float32, of which `Loss` says how each is compared.
+    channels : (C, H, W) float32; `Loss` has the parameters of each.
     weight : (H, W) float32, 0 where a pixel must not be used; the current image's 0 or 1.
     slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = parallel to the image,
     or unknown.
@@ -54,14 +53,14 @@ class View(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """How residuals of each channel count: 0.5 (r/s)^2 for |r| <= threshold * s, linear beyond (Huber).
+    """Robust loss of each channel: 0.5 (r/s)^2 for |r| <= threshold * s, linear beyond (Huber).
 
     Attributes
     ----------
     sigma : (C,) float64, robust standard deviation s of each channel's residuals. threshold : in units of s.
-    share : (C,) float64, how much each channel counts.
+    share : (C,) float64, weight of each channel.
     lit : (C,) bool, whether gain, bias and the lamp apply to the channel. gamma : exponent of the lamp, 0 = no lamp.
-    depth_sigma, depth_share : the same of the geometric residual; share 0: none.
+    depth_sigma, depth_share : sigma and weight of the geometric residual; share 0: none.
     """
 
     sigma: np.ndarray
@@ -89,15 +88,15 @@ class NormalEquations(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _lifted(depth_mm, K, row, column):  # type: ignore[no-untyped-def]
-    """Point X of a reference pixel; K: its intrinsics."""
+def _unprojected(depth_mm, K, row, column):  # type: ignore[no-untyped-def]
+    """Point X of a reference pixel; K: intrinsics."""
     depth = float(depth_mm[row, column])
     return depth * (column - K[2]) / K[0], depth * (row - K[3]) / K[1], depth
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _land(point, T, G, usable):  # type: ignore[no-untyped-def]
-    """Where a point X lands: X', its place (in its cell; the cell's column and row), weight there (0 = nowhere).
+def _projected(point, T, G, usable):  # type: ignore[no-untyped-def]
+    """Return X', its projection (offset in its cell; the cell's column and row), and the weight there (0 = outside).
 
     G, usable : intrinsics and weights of the current image.
     """
@@ -105,7 +104,7 @@ def _land(point, T, G, usable):  # type: ignore[no-untyped-def]
     x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
     y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
     z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * Z + T[2, 3]
-    # Fails where depth is unknown, too.
+    # Also false where depth is NaN.
     if not z >= 1e-3 * Z > 0.0:
         return (x, y, z), (0.0, 0.0, 0, 0), 0.0
     u, v = G[0] * x / z + G[2], G[1] * y / z + G[3]
@@ -131,16 +130,16 @@ def _bilinear(image, c, place):  # type: ignore[no-untyped-def]
 def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
     """Return L of a point X with slope (a, b) that is now at X', and -d ln L / dX' for translations.
 
-    The lamp sits in the camera's centre: turning changes nothing.
+    The lamp is in the camera's centre: rotations change nothing.
     """
     (X, Y, Z), (x, y, z), (a, b) = point, moved, slope
-    # The plane m, turned to the current camera, and 1 + m . R^T t, the lift off it.
+    # The plane R m in the current camera, and 1 + m . R^T t.
     c = (1.0 - a * X - b * Y) / Z
     mx = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
     my = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
     mz = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
     lift = 1.0 + mx * T[0, 3] + my * T[1, 3] + mz * T[2, 3]
-    if not 0.3 < lift < 3.0:  # a plane seen from its edge or from behind: its tilt says nothing
+    if not 0.3 < lift < 3.0:  # a plane seen from its edge or from behind: ignore its tilt
         mx, my, mz, lift = 0.0, 0.0, 0.0, 1.0
     square = x * x + y * y + z * z
     nearer = (X * X + Y * Y + Z * Z) / square
@@ -151,15 +150,16 @@ def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _gap(depth, moved, place, G):  # type: ignore[no-untyped-def]
+def _plane_distance(depth, moved, place, G):  # type: ignore[no-untyped-def]
     """Distance of X' from the tangent plane of the current depth (1, H, W), mm, its derivative; NaN across an edge."""
     (x, y, z), (_, _, i, j) = moved, place
     d00, d10 = float(depth[0, j, i]), float(depth[0, j, i + 1])
     d01, d11 = float(depth[0, j + 1, i]), float(depth[0, j + 1, i + 1])
     nearest, farthest = min(d00, d10, d01, d11), max(d00, d10, d01, d11)
-    # The comparison fails where any of them is unknown.
+    # Also false where any depth is NaN.
     if not (
-        farthest - nearest < _ONE_SURFACE * nearest and abs(d00 + d11 + d10 + d01 - 4.0 * z) < 4.0 * _SAME_PLACE * z
+        farthest - nearest < _MAX_SURFACE_SPREAD * nearest
+        and abs(d00 + d11 + d10 + d01 - 4.0 * z) < 4.0 * _MAX_DEPTH_DIFFERENCE * z
     ):
         return np.nan, (0.0, 0.0, 0.0)
     D, du, dv = _bilinear(depth, 0, place)
@@ -172,7 +172,7 @@ def _gap(depth, moved, place, G):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: ignore[no-untyped-def]
     """Return the geometric residual (H, W) float32 on the reference's grid, NaN where there is none."""
-    # Arrays read out of a tuple are counted references: once, not at every pixel.
+    # Outside the loop: numba counts references of arrays that are read from a tuple.
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
     current_mm, usable, G = np.expand_dims(current.depth_mm, 0), current.weight, current.intrinsics
     h, w = weights.shape
@@ -180,9 +180,9 @@ def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: 
     for row in range(h):
         for column in range(w):
             if weights[row, column] > 0.0:
-                moved, place, there = _land(_lifted(depth_mm, K, row, column), T, G, usable)
+                moved, place, there = _projected(_unprojected(depth_mm, K, row, column), T, G, usable)
                 if there > 0.0:
-                    out[row, column] = _gap(current_mm, moved, place, G)[0] / unit_mm
+                    out[row, column] = _plane_distance(current_mm, moved, place, G)[0] / unit_mm
     return out
 
 
@@ -198,8 +198,8 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
         for column in range(w):
             if not weights[row, column] > 0.0:
                 continue
-            point = _lifted(depth_mm, K, row, column)
-            moved, place, there = _land(point, T, G, usable)
+            point = _unprojected(depth_mm, K, row, column)
+            moved, place, there = _projected(point, T, G, usable)
             if not there > 0.0:
                 continue
             lamp, _ = _light(point, moved, (slope[row, column, 0], slope[row, column, 1]), T, gamma)
@@ -221,15 +221,15 @@ def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _turned(moved, g):  # type: ignore[no-untyped-def]
-    """Derivative by a rotation of the camera's frame, from the derivative g by X'."""
+def _rotation_derivative(moved, g):  # type: ignore[no-untyped-def]
+    """Derivative by rotation, x' cross g, from the derivative g by X'."""
     (x, y, z), (gx, gy, gz) = moved, g
     return y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _add(hessian, gradient, J, r, information, count):  # type: ignore[no-untyped-def]
-    """Add the first of residuals r (N,), derivatives (8, N): reordered sums over a whole row run in vectors."""
+    """Add the first `count` residuals r (N,) with derivatives J (8, N); fastmath vectorises the sums."""
     for k in range(PARAMETERS):
         total = 0.0
         for n in range(count):
@@ -253,27 +253,27 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
     hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     total_cost = total_weight = 0.0
     # The residuals of a row of pixels.
-    most = (channels + 1) * w
-    J, r, information = np.zeros((PARAMETERS, most)), np.zeros(most), np.zeros(most)
+    size = (channels + 1) * w
+    J, r, information = np.zeros((PARAMETERS, size)), np.zeros(size), np.zeros(size)
     for row in range(h):
         n = 0
         for column in range(w):
             if not weights[row, column] > 0.0:
                 continue
-            point = _lifted(depth_mm, K, row, column)
-            moved, place, there = _land(point, T, G, usable)
+            point = _unprojected(depth_mm, K, row, column)
+            moved, place, there = _projected(point, T, G, usable)
             weight = there * float(weights[row, column])
             if not weight > 0.0:
                 continue
             total_weight += weight
             x, y, z = moved
             if loss.depth_share > 0.0:
-                gap, normal = _gap(current_mm, moved, place, G)
+                gap, normal = _plane_distance(current_mm, moved, place, G)
                 if np.isfinite(gap):
                     r[n] = gap / unit_mm
                     cost, information[n] = _huber(r[n], loss.depth_sigma, loss.threshold, loss.depth_share * weight)
                     total_cost += cost
-                    J[0, n], J[1, n], J[2, n] = _turned((x / unit_mm, y / unit_mm, z / unit_mm), normal)
+                    J[0, n], J[1, n], J[2, n] = _rotation_derivative((x / unit_mm, y / unit_mm, z / unit_mm), normal)
                     J[3, n], J[4, n], J[5, n] = normal
                     J[6, n], J[7, n] = 0.0, 0.0
                     n += 1
@@ -292,7 +292,7 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
                 total_cost += cost
                 gx, gy = du * G[0] / z, dv * G[1] / z
                 gz = -(gx * x + gy * y) / z
-                J[0, n], J[1, n], J[2, n] = _turned(moved, (gx, gy, gz))
+                J[0, n], J[1, n], J[2, n] = _rotation_derivative(moved, (gx, gy, gz))
                 J[3, n], J[4, n] = unit_mm * (gx + k * dims[0]), unit_mm * (gy + k * dims[1])
                 J[5, n] = unit_mm * (gz + k * dims[2])
                 n += 1

@@ -18,7 +18,7 @@ from scopemap.tracking.residuals import PARAMETERS, Loss, View, depth_residuals,
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
 _INLIER = 0.5
-_LEAST_SIGMA = 1e-3  # keeps flat images from dividing by zero
+_MIN_SIGMA = 1e-3  # avoids division by zero in flat images
 _MIN_DEPTH_SIGMA = 1e-3  # of the distance to measured depth, share of the keyframe's mean depth
 _GREY_SHARE = 0.3  # weight of the grey channel against the normalised one
 _RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth
@@ -83,7 +83,7 @@ def judge(
     compared = np.isfinite(residuals[-1])
     used, expected = residuals[-1][compared], reference[0].channels[-1][compared]
     usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
-    sigma = robust_sigma(used, _LEAST_SIGMA)
+    sigma = robust_sigma(used, _MIN_SIGMA)
     if not used.size:
         return Alignment(motion, sigma, 0.0, 0.0, 0.0, 0.0, iterations)
     inliers, observed = float(np.mean(np.abs(used) < _INLIER)), expected + used
@@ -107,14 +107,14 @@ def _align_level(
     reference: View, current: View, motion: Motion, settings: TrackingSettings, rotation_only: bool, unit_mm: float
 ) -> tuple[Motion, int]:
     start = _residuals(reference, current, motion, settings)
-    loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _LEAST_SIGMA) for r in start]), settings)
+    loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _MIN_SIGMA) for r in start]), settings)
     if settings.advanced.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
         gaps = gaps[np.isfinite(gaps)]
         if gaps.size:
             sigma = robust_sigma(gaps, _MIN_DEPTH_SIGMA)
             loss = loss._replace(depth_sigma=sigma, depth_share=settings.advanced.depth_weight)
-    least_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
+    min_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
         [0, 1, 2]
         + ([] if rotation_only else [3, 4, 5])
@@ -123,8 +123,8 @@ def _align_level(
 
     def linearise(state: Motion) -> DenseModel:
         equations = normal_equations(reference, current, *state, loss, unit_mm)
-        # A mean over few pixels can be small: a step that walks out of the overlap is no improvement.
-        cost = equations.cost if equations.weight > least_weight else np.inf
+        # A mean over few pixels can be small: a step out of the overlap is no improvement.
+        cost = equations.cost if equations.weight > min_weight else np.inf
         return DenseModel(cost, equations.gradient[free], equations.hessian[np.ix_(free, free)])
 
     def retract(state: Motion, step: np.ndarray) -> Motion:

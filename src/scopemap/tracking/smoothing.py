@@ -2,7 +2,7 @@
 
 METHOD section WEMA: x_reg = s (alpha x_i + beta x_{i-1} + gamma x_{i-2}) + (1 - s) x_i, s = 1 - exp(-i omega). Poses
 do not add: the mean is taken in the tangent space at the newest pose. The earlier poses are the estimated ones, and
-nothing is fed back to the tracker. A mean over the past lags behind a moving camera (BENCHMARK.md measures it).
+the tracker does not use the smoothed poses. The mean lags behind a moving camera (see BENCHMARK.md).
 """
 
 from __future__ import annotations

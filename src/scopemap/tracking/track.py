@@ -1,4 +1,4 @@
-"""Track: what tracking says about one frame; FrameTracker: whatever can say it."""
+"""Track: the tracking result of one frame; FrameTracker: the protocol of trackers."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Status = Literal["initial", "ok", "lost"]
 
 @dataclass(frozen=True)
 class Track:
-    """Where the camera was, how that is known, or why it is not.
+    """Tracking result of one frame: its pose, or the reason why it is lost.
 
     Attributes
     ----------
     index : number of the frame.
     status : "initial" for the frame that fixes the world of its map, "ok", or "lost".
     reason : one phrase; for a lost frame, what was wrong.
-    T_world_camera : (4, 4) float64; a lost frame repeats the last pose that is known.
+    T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose.
     keyframe : number of the frame it was aligned to.
     residual : robust standard deviation of the photometric residual, NaN if there was none.
     inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
@@ -43,10 +43,10 @@ class Track:
 
 
 class FrameTracker(Protocol):
-    """Says where the camera was, frame by frame, in order; `Tracker` is ours, the baselines' follow the same calls."""
+    """Protocol of trackers, which take frames in order: `Tracker` and the baselines' trackers."""
 
     def track(self, frame: Frame) -> Track:
-        """Return the pose of a frame, whose `depth_mm` is what is known of its depth so far, or say why there is none.
+        """Return the pose of a frame, whose `depth_mm` is its raw depth, or the reason why it is lost.
 
         The first usable frame is "initial" and fixes the world.
         """

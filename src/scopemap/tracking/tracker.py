@@ -102,7 +102,7 @@ class Tracker:
     def adopt(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
 
-        `measured` tells that the depth, and so its slope, is measured, not predicted.
+        measured : whether the depth is measured, not predicted; only then tangent planes are taken from it.
         """
         if frame.depth_mm is None or frame.T_world_camera is None:
             raise ValueError("a keyframe needs a depth and a pose")
@@ -164,7 +164,7 @@ class Tracker:
     def _is_obscured(self, sharpness: float, alignment: Alignment) -> bool:
         """Whether an image is too unsharp for its alignment to be reliable."""
         least = self.settings.min_sharpness
-        # Below half of it not even agreement is evidence: smoke fits smoke.
+        # Below half of it inliers are no evidence: smoke fits smoke.
         return sharpness < (least if alignment.inlier_share < _DOUBTFUL_INLIER_SHARE else least / 2)
 
     def _is_accepted(self, keyframe: Keyframe, alignment: Alignment) -> bool:

@@ -46,7 +46,7 @@ SETTINGS = TrackingSettings(
         gain_bias=False,
     ),
 )
-"""What is left of our tracker; all other settings are without effect on it or say when an image is empty."""
+"""Settings of our tracker for this method; all others have no effect or only detect empty images."""
 
 
 def create_endo_depth_and_motion() -> FrameTracker:
