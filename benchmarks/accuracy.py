@@ -64,8 +64,8 @@ PHOTOMETRIC: dict[str, dict[str, Any]] = {
 # ... and of the back end, with all of the front end.
 BACK_END: dict[str, dict[str, Any]] = {
     "no loops": {"mapping.min_loop_inliers": 0},
-    "links to the keyframe before only": {"mapping.gaps": (1,)},
-    "depth of keyframes hardly adjusted": {"mapping.scale_sigma": 1e-3},
+    "links to the keyframe before only": {"mapping.advanced.keyframe_gaps": (1,)},
+    "depth of keyframes hardly adjusted": {"mapping.advanced.scale_sigma": 1e-3},
     "back end, but no corners while tracking": {"tracking.advanced.corner_depth_sigma": 0.0},
 }
 
@@ -143,7 +143,7 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
         for variant, changes in {
             "as tracked": TRACKED,
             "default": {},
-            "always adjusted": {"mapping.max_sigma_px": 99.0, "mapping.max_depth_change": 9.0},
+            "always adjusted": {"mapping.advanced.max_sigma_px": 99.0, "mapping.advanced.max_depth_change": 9.0},
         }.items():
             yield Run(f"{name}, {variant}", source, "sim3", LIGHT | NO_SURFACE | changes)
 
@@ -178,8 +178,7 @@ def row(run: Run, out: Path | None) -> str:
 
         moved = result.mesh.copy()
         moved.vertices = matched.similarity.transform_points(moved.vertices)
-        figures = compare_surfaces(moved, trimesh.load_mesh(mesh_file))
-        surface = f"{figures['accuracy_mean_mm']:.2f}"
+        surface = f"{compare_surfaces(moved, trimesh.load_mesh(mesh_file)).accuracy.mean_mm:.2f}"
     rotation = f"{report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f}"
     ten = "" if report.rpe_10_mm != report.rpe_10_mm else f"{report.rpe_10_mm:.3f} / {report.rpe_10_deg:.3f}"
     tracked = f"{report.tracked} of {report.frames}"

@@ -40,7 +40,7 @@ from scopemap.reconstruction import DepthReader
 HEADER = "| run | ATE | depth, one scale | depth, medians | mesh to truth | truth to mesh |\n|---|---|---|---|---|---|"
 VARIANTS: dict[str, dict[str, Any]] = {
     "as tracked": {"mapping.method": "none"},
-    "depth only scaled": {"mapping.depth_step_sigma": 0.0},
+    "depth only scaled": {"mapping.advanced.depth_step_sigma": 0.0},
     "default": {},
 }
 _CLIPPED_MM = 99.9

@@ -1,4 +1,4 @@
-"""Bundle adjustment: exact data give back exact poses, scales and depths; bad data do little harm."""
+"""Bundle adjustment: exact data recover exact poses, scales and depths; outliers do little harm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
 
 
 def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Observations]:
-    """True poses (camera from world), points with true depth, and where they are truly seen."""
+    """True poses (camera from world), points with true depth, and their exact observations."""
     twists = [np.append(rng.normal(0, 0.02, 3), [1.5 * k, 0.6 * np.sin(k), 0.8 * k]) for k in range(KEYFRAMES)]
     T = np.stack([inverse(se3_exp(twist)) for twist in twists])
     T = T @ inverse(T[0])
@@ -32,13 +32,15 @@ def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Observations]:
                 x = transform(T[t] @ inverse(T[h]), depth * ray)
                 seen.append((p, t, *(FOCAL_PX * x[:2] / x[2])))
     table = np.array(seen)
-    sightings = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
-    return T, Points(host, pixels, np.log(depth_mm), np.full(len(host), 0.1)), sightings
+    observations = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return T, Points(host, pixels, np.log(depth_mm), np.full(len(host), 0.1)), observations
 
 
-def _tracked(T: np.ndarray, rng: np.random.Generator, turn: float = 0.02, way: float = 0.8) -> np.ndarray:
+def _tracked(
+    T: np.ndarray, rng: np.random.Generator, rotation_rad: float = 0.02, translation_mm: float = 0.8
+) -> np.ndarray:
     """True poses with errors; the first is kept."""
-    errors = [se3_exp(rng.normal(0, [turn] * 3 + [way] * 3)) for _ in T[1:]]
+    errors = [se3_exp(rng.normal(0, [rotation_rad] * 3 + [translation_mm] * 3)) for _ in T[1:]]
     return np.stack([T[0], *(error @ pose for error, pose in zip(errors, T[1:], strict=True))])
 
 
@@ -47,22 +49,22 @@ def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(rotation_angle_rad(off[:, :3, :3]).max()), float(np.linalg.norm(off[:, :3, 3], axis=1).max())
 
 
-def test_exact_sightings_and_depths_give_back_exact_poses() -> None:
+def test_exact_observations_and_depths_recover_exact_poses() -> None:
     rng = np.random.default_rng(0)
-    T, points, sightings = _world(rng)
+    T, points, observations = _world(rng)
     found = adjust(
-        Problem(_tracked(T, rng), points, sightings, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX)
+        Problem(_tracked(T, rng), points, observations, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX)
     )
-    turn, way = _pose_errors(found.state.T_camera_world, T)
-    assert turn < 1e-4
-    assert way < 1e-2
+    rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
+    assert rotation_rad < 1e-4
+    assert translation_mm < 1e-2
     assert np.abs(found.state.log_depth - points.log_depth).max() < 1e-3
     assert found.sigma_px == pytest.approx(0.1)  # its floor
 
 
 def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
     rng = np.random.default_rng(1)
-    T, points, sightings = _world(rng)
+    T, points, observations = _world(rng)
     wrong = replace(
         points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=np.full(len(points.host), 0.02)
     )
@@ -70,7 +72,7 @@ def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
         Problem(
             _tracked(T, rng),
             wrong,
-            sightings,
+            observations,
             Priors(scale=0.3, rotation_rad=10, translation_share=10),
             LINE,
             FOCAL_PX,
@@ -80,23 +82,23 @@ def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
     assert _pose_errors(found.state.T_camera_world, T)[0] < 2e-3
 
 
-def test_a_fifth_of_wild_sightings_does_little_harm() -> None:
+def test_a_fifth_of_outliers_does_little_harm() -> None:
     rng = np.random.default_rng(2)
-    T, points, sightings = _world(rng)
-    pixel = sightings.pixel + rng.normal(0, 0.3, sightings.pixel.shape)
+    T, points, observations = _world(rng)
+    pixel = observations.pixel + rng.normal(0, 0.3, observations.pixel.shape)
     wild = rng.random(len(pixel)) < 0.2
     pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
     tracked = _tracked(T, rng)
     noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
-    found = adjust(Problem(tracked, noisy, replace(sightings, pixel=pixel), Priors(), LINE, FOCAL_PX))
-    turn, way = _pose_errors(found.state.T_camera_world, T)
-    turn_before, way_before = _pose_errors(tracked, T)
-    assert turn < 0.2 * turn_before
-    assert way < 0.3 * way_before
+    found = adjust(Problem(tracked, noisy, replace(observations, pixel=pixel), Priors(), LINE, FOCAL_PX))
+    rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
+    rotation_before, translation_before = _pose_errors(tracked, T)
+    assert rotation_rad < 0.2 * rotation_before
+    assert translation_mm < 0.3 * translation_before
     assert found.sigma_px == pytest.approx(0.3, rel=0.6)
 
 
-def test_without_sightings_nothing_changes() -> None:
+def test_without_observations_nothing_changes() -> None:
     rng = np.random.default_rng(3)
     T, points, _ = _world(rng)
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
@@ -105,30 +107,30 @@ def test_without_sightings_nothing_changes() -> None:
     assert found.iterations == 0
 
 
-def test_where_no_sighting_says_anything_the_tracked_motion_stays() -> None:
+def test_the_tracked_motion_stays_where_there_are_no_observations() -> None:
     rng = np.random.default_rng(4)
-    T, points, sightings = _world(rng)
-    # Nobody sees anything of the last two keyframes, nor they of others.
-    known = (sightings.keyframe < 4) & (points.host[sightings.point] < 4)
-    some = Observations(sightings.point[known], sightings.keyframe[known], sightings.pixel[known])
+    T, points, observations = _world(rng)
+    # The last two keyframes share no observation with the others.
+    known = (observations.keyframe < 4) & (points.host[observations.point] < 4)
+    some = Observations(observations.point[known], observations.keyframe[known], observations.pixel[known])
     tracked = _tracked(T, rng)
     found = adjust(Problem(tracked, points, some, Priors(), LINE, FOCAL_PX)).state.T_camera_world
     np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
     np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
 
 
-def test_how_certain_a_depth_is_follows_from_the_way_between_its_views() -> None:
+def test_depth_uncertainty_follows_from_the_baseline() -> None:
     rng = np.random.default_rng(8)
-    pixels, depth_mm, way_mm = rng.uniform([-70, -54], [70, 54], (50, 2)), rng.uniform(25, 60, 50), 4.0
+    pixels, depth_mm, baseline_mm = rng.uniform([-70, -54], [70, 54], (50, 2)), rng.uniform(25, 60, 50), 4.0
     rays = np.column_stack([pixels / FOCAL_PX, np.ones(50)])
-    T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, -way_mm, 0, 0]))])
-    moved = depth_mm[:, None] * rays - [way_mm, 0, 0]
+    T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, -baseline_mm, 0, 0]))])
+    moved = depth_mm[:, None] * rays - [baseline_mm, 0, 0]
     seen = FOCAL_PX * moved[:, :2] / moved[:, 2:]
-    # The last point is seen by nobody else.
+    # No other keyframe observes the last point.
     points = Points(np.zeros(50, int), pixels, np.log(depth_mm), np.full(50, 0.1))
     found = adjust(
         Problem(T, points, Observations(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1], FOCAL_PX)
     )
-    # A pixel moves by fx way / depth, and the floor of a pixel's deviation is 0.1.
-    np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (FOCAL_PX * way_mm), rtol=0.02)
+    # A pixel moves by fx baseline / depth, and the floor of a pixel's deviation is 0.1.
+    np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (FOCAL_PX * baseline_mm), rtol=0.02)
     assert np.isinf(found.log_depth_sigma[49])

@@ -1,4 +1,4 @@
-"""The focal length from motion: exact on made-up points, spreads that hold, silence where nothing can be told."""
+"""Focal length from motion: exact on synthetic points, honest deviations, none where it is undetermined."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from scopemap.calibration.focal_length import (
     FocalEstimate,
     Window,
     WindowFit,
-    adjusted,
+    adjust_window,
+    combine,
     focal_from_motion,
-    together,
     windows_of,
     with_focal_from_motion,
 )
@@ -33,7 +33,7 @@ from scopemap.io.sequence import Sequence
 from scopemap.runner import reconstruct
 
 HALF_PX = 160.0
-SWAY_DEG, WAY = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)
+ROTATION_DEG, TRANSLATION = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)
 
 
 def _window(
@@ -41,10 +41,10 @@ def _window(
     *,
     seed: int = 0,
     noise_px: float = 0.0,
-    turn_deg: tuple[float, float, float] = SWAY_DEG,
-    way: tuple[float, float, float] = WAY,
+    rotation_deg: tuple[float, float, float] = ROTATION_DEG,
+    translation: tuple[float, float, float] = TRANSLATION,
     depths: tuple[float, float] = (0.6, 1.8),
-    bend: float = 0.0,
+    distortion: float = 0.0,
 ) -> Window:
     """200 points before a camera that turns and moves on, seen in 7 partners; its median depth is about 1."""
     rng = np.random.default_rng(seed)
@@ -53,19 +53,19 @@ def _window(
     point = np.concatenate([pixel / focal, np.ones((200, 1))], 1) * rng.uniform(*depths, (200, 1))
     seen = []
     for share in np.arange(1, 8) / 7:
-        moved = point @ so3_exp(np.radians(turn_deg) * share).T + share * np.array(way)
+        moved = point @ so3_exp(np.radians(rotation_deg) * share).T + share * np.array(translation)
         seen.append(focal * moved[:, :2] / moved[:, 2:])
-    everywhere = _bent(np.stack(seen, 1), bend)
+    everywhere = _distorted(np.stack(seen, 1), distortion)
     everywhere += rng.normal(0, noise_px, everywhere.shape)
     everywhere[rng.random(everywhere.shape[:2]) < 0.1] = np.nan
-    return Window(_bent(pixel, bend), everywhere, HALF_PX)
+    return Window(_distorted(pixel, distortion), everywhere, HALF_PX)
 
 
-def _bent(straight: np.ndarray, bend: float) -> np.ndarray:
-    """Pixels that x (1 + bend |x|^2 / h^2) makes straight, by fixed-point iteration."""
+def _distorted(straight: np.ndarray, distortion: float) -> np.ndarray:
+    """Pixels that x (1 + distortion |x|^2 / h^2) makes straight, by fixed-point iteration."""
     pixel = straight.copy()
     for _ in range(50):
-        pixel = straight / (1 + bend * (pixel**2).sum(-1, keepdims=True) / HALF_PX**2)
+        pixel = straight / (1 + distortion * (pixel**2).sum(-1, keepdims=True) / HALF_PX**2)
     return pixel
 
 
@@ -79,16 +79,16 @@ ASSUMED_PX = focal_of(70.0, int(2 * HALF_PX))
 
 @pytest.mark.parametrize("fov_deg", [45.0, 70.0, 90.0, 115.0])
 def test_without_noise_the_focal_length_is_exact(fov_deg: float) -> None:
-    fit = adjusted(_window(fov_deg), ASSUMED_PX)
+    fit = adjust_window(_window(fov_deg), ASSUMED_PX)
     assert abs(_error(fit, fov_deg)) < 2e-3
     assert fit is not None
-    assert fit.tilt_deg == pytest.approx(math.hypot(*SWAY_DEG[:2]), rel=0.05)
+    assert fit.tilt_deg == pytest.approx(math.hypot(*ROTATION_DEG[:2]), rel=0.05)
     assert fit.residual_px < 0.05
 
 
 @pytest.mark.parametrize("fov_deg", [60.0, 95.0])
-def test_a_lens_that_bends_does_not_change_the_focal_length(fov_deg: float) -> None:
-    fit = adjusted(_window(fov_deg, bend=0.25), ASSUMED_PX)
+def test_distortion_does_not_bias_the_focal_length(fov_deg: float) -> None:
+    fit = adjust_window(_window(fov_deg, distortion=0.25), ASSUMED_PX)
     assert abs(_error(fit, fov_deg)) < 0.02
     assert fit is not None
     assert fit.distortion == pytest.approx(0.25, abs=0.02)
@@ -97,13 +97,13 @@ def test_a_lens_that_bends_does_not_change_the_focal_length(fov_deg: float) -> N
 def test_pixels_need_not_be_square() -> None:
     window = _window(80.0)
     squeezed = Window(window.start * [1, 0.8], window.seen * [1, 0.8], HALF_PX, aspect=0.8)
-    assert abs(_error(adjusted(squeezed, ASSUMED_PX), 80.0)) < 2e-3
+    assert abs(_error(adjust_window(squeezed, ASSUMED_PX), 80.0)) < 2e-3
 
 
-def test_the_deviation_covers_the_error_of_noise() -> None:
+def test_the_standard_deviation_covers_the_error_by_noise() -> None:
     scores = []
     for seed in range(10):
-        fit = adjusted(_window(75.0, seed=seed, noise_px=0.3), ASSUMED_PX)
+        fit = adjust_window(_window(75.0, seed=seed, noise_px=0.3), ASSUMED_PX)
         assert fit is not None
         assert 1e-3 < fit.deviation < 0.1
         assert fit.residual_px == pytest.approx(0.3, rel=0.25)
@@ -111,16 +111,16 @@ def test_the_deviation_covers_the_error_of_noise() -> None:
     assert 0.3 < np.sqrt(np.mean(np.square(scores))) < 1.8
 
 
-def test_outliers_do_not_carry_it_away() -> None:
+def test_outliers_do_little_harm() -> None:
     window = _window(75.0, noise_px=0.1)
     wrong = np.random.default_rng(1).random(window.seen.shape[:2]) < 0.1
     seen = np.where(wrong[..., None], window.seen + 15.0, window.seen)
-    assert abs(_error(adjusted(dataclasses.replace(window, seen=seen), ASSUMED_PX), 75.0)) < 0.03
+    assert abs(_error(adjust_window(dataclasses.replace(window, seen=seen), ASSUMED_PX), 75.0)) < 0.03
 
 
-def test_a_rotation_alone_tells_it() -> None:
-    fits = [adjusted(_window(85.0, seed=s, noise_px=0.2, way=(0, 0, 0)), ASSUMED_PX) for s in range(3)]
-    estimate = together([fit for fit in fits if fit is not None], 2 * HALF_PX)
+def test_pure_rotation_determines_the_focal_length() -> None:
+    fits = [adjust_window(_window(85.0, seed=s, noise_px=0.2, translation=(0, 0, 0)), ASSUMED_PX) for s in range(3)]
+    estimate = combine([fit for fit in fits if fit is not None], 2 * HALF_PX)
     assert estimate.reason == ""
     assert abs(math.log(estimate.focal_px / focal_of(85.0, int(2 * HALF_PX)))) < 2 * estimate.share
 
@@ -128,29 +128,29 @@ def test_a_rotation_alone_tells_it() -> None:
 @pytest.mark.parametrize(
     "motion",
     [
-        {"turn_deg": (0, 0, 0), "way": (0.02, 0.03, -0.5)},  # along the axis
-        {"turn_deg": (0, 0, 0), "way": (0.4, 0.1, 0.0)},  # sideways
-        {"turn_deg": (0, 0, 25.0), "way": (0, 0, -0.2)},  # rolling
-        {"turn_deg": (0, 0, 0), "way": (0.2, 0.1, 0.0), "depths": (1.0, 1.0)},  # along a wall
-        {"turn_deg": (0, 0, 0), "way": (0, 0, 0)},  # at rest
+        {"rotation_deg": (0, 0, 0), "translation": (0.02, 0.03, -0.5)},  # along the axis
+        {"rotation_deg": (0, 0, 0), "translation": (0.4, 0.1, 0.0)},  # sideways
+        {"rotation_deg": (0, 0, 25.0), "translation": (0, 0, -0.2)},  # rolling
+        {"rotation_deg": (0, 0, 0), "translation": (0.2, 0.1, 0.0), "depths": (1.0, 1.0)},  # along a wall
+        {"rotation_deg": (0, 0, 0), "translation": (0, 0, 0)},  # at rest
     ],
     ids=["forward", "sideways", "roll", "wall", "rest"],
 )
-def test_motion_that_does_not_turn_the_axis_tells_nothing(motion: dict) -> None:
-    fits = [adjusted(_window(100.0, seed=seed, noise_px=0.25, **motion), ASSUMED_PX) for seed in range(3)]
-    estimate = together([fit for fit in fits if fit is not None], 2 * HALF_PX)
+def test_motion_without_tilt_does_not_determine_it(motion: dict) -> None:
+    fits = [adjust_window(_window(100.0, seed=seed, noise_px=0.25, **motion), ASSUMED_PX) for seed in range(3)]
+    estimate = combine([fit for fit in fits if fit is not None], 2 * HALF_PX)
     assert estimate.reason or estimate.share > 0.15
 
 
-# ---- what windows say together
+# ---- combination of windows
 
 
 def _fit(fov_deg: float, deviation: float = 0.01, tilt_deg: float = 10.0) -> WindowFit:
     return WindowFit(math.log(focal_of(fov_deg, 320)), deviation, 0.2, tilt_deg, 0.0)
 
 
-def test_windows_err_together_so_many_are_not_much_better_than_two() -> None:
-    two, many = (together([_fit(80.0)] * count, 320.0) for count in (2, 20))
+def test_windows_have_a_common_error_so_many_are_little_better_than_two() -> None:
+    two, many = (combine([_fit(80.0)] * count, 320.0) for count in (2, 20))
     assert two.fov_deg == pytest.approx(80.0)
     assert two.windows == 2
     assert many.share == pytest.approx(0.04, abs=0.005)
@@ -158,30 +158,30 @@ def test_windows_err_together_so_many_are_not_much_better_than_two() -> None:
     assert two.sigma_px == pytest.approx(two.share * two.focal_px)
 
 
-def test_windows_that_disagree_widen_the_spread() -> None:
-    alike, torn = together([_fit(80.0)] * 4, 320.0), together([_fit(60.0), _fit(100.0)] * 2, 320.0)
-    assert torn.share > 3 * alike.share
+def test_windows_that_disagree_increase_the_deviation() -> None:
+    similar, different = combine([_fit(80.0)] * 4, 320.0), combine([_fit(60.0), _fit(100.0)] * 2, 320.0)
+    assert different.share > 3 * similar.share
 
 
-def test_the_less_the_axis_tilts_the_less_is_told() -> None:
-    assert together([_fit(80.0, tilt_deg=1.0)] * 5, 320.0).share == pytest.approx(0.4, rel=0.05)
-    assert "two are needed" in together([_fit(80.0, tilt_deg=0.01)] * 5, 320.0).reason
-    assert "two are needed" in together([_fit(80.0)], 320.0).reason
+def test_less_tilt_increases_the_deviation() -> None:
+    assert combine([_fit(80.0, tilt_deg=1.0)] * 5, 320.0).share == pytest.approx(0.4, rel=0.05)
+    assert "two are needed" in combine([_fit(80.0, tilt_deg=0.01)] * 5, 320.0).reason
+    assert "two are needed" in combine([_fit(80.0)], 320.0).reason
 
 
 @pytest.mark.parametrize("fov_deg", [15.0, 165.0])
-def test_what_is_no_endoscope_is_no_estimate(fov_deg: float) -> None:
-    assert "no endoscope" in together([_fit(fov_deg)] * 3, 320.0).reason
+def test_an_impossible_field_of_view_is_no_estimate(fov_deg: float) -> None:
+    assert "no endoscope" in combine([_fit(fov_deg)] * 3, 320.0).reason
 
 
-def test_two_deviations_are_a_difference() -> None:
+def test_a_difference_is_two_standard_deviations() -> None:
     estimate = FocalEstimate(100.0, 0.05, 90.0, 3)
     assert estimate.differs_from(112.0)
     assert estimate.differs_from(89.0)
     assert not estimate.differs_from(108.0)
 
 
-# ---- pictures
+# ---- images
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clips") / "turning", 100.0, 48)
 
 
-def test_pictures_of_a_turning_camera_tell_it(turning: Path) -> None:
+def test_the_focal_length_is_estimated_from_images_of_a_rotating_camera(turning: Path) -> None:
     sequence = open_sequence(turning)
     estimate = focal_from_motion(sequence, Config())
     assert estimate.reason == ""
@@ -200,7 +200,7 @@ def test_pictures_of_a_turning_camera_tell_it(turning: Path) -> None:
     assert window.half_width_px == SIZE[0] / 2
 
 
-def test_a_large_working_size_is_looked_at_small(tmp_path: Path) -> None:
+def test_a_large_working_size_is_reduced(tmp_path: Path) -> None:
     folder = write_clip(tmp_path / "clip", 80.0, 12)
     for file in folder.iterdir():
         cv2.imwrite(str(file), cv2.resize(cv2.imread(str(file)), None, fx=3, fy=3))
@@ -211,7 +211,7 @@ def test_a_large_working_size_is_looked_at_small(tmp_path: Path) -> None:
     assert at_large.fov_deg == pytest.approx(at_usual.fov_deg, rel=0.02)
 
 
-def test_a_run_takes_it_and_writes_down_its_spread(turning: Path, tmp_path: Path) -> None:
+def test_a_run_uses_the_estimate_and_saves_its_deviation(turning: Path, tmp_path: Path) -> None:
     config = Config.load(settings={"depth.backend": "shading", "networks.flow": "none", "fusion.enabled": False})
     result = reconstruct(open_sequence(turning), config, out=tmp_path / "out")
     truth_px = focal_of(100.0)
@@ -247,8 +247,8 @@ def test_a_camera_at_rest_stays_as_assumed(still: Sequence, focal: str) -> None:
     result = reconstruct(still, config)
     assert result.camera == still.camera
     assert result.provenance["camera"]["focal_sigma_px"] is None
-    told = [note for note in result.provenance["notes"] if note.startswith("focal length: assumed")]
-    assert len(told) == (focal == "auto")
+    notes = [note for note in result.provenance["notes"] if note.startswith("focal length: assumed")]
+    assert len(notes) == (focal == "auto")
     assert ("focal length" in result.provenance["seconds"]) == (focal == "auto")
 
 
@@ -256,31 +256,31 @@ ESTIMATES = {
     "clear": FocalEstimate(84.0, 0.04, 100.0, 5),
     "wide": FocalEstimate(84.0, 0.2, 100.0, 5),
     "agrees": FocalEstimate(140.0, 0.05, 71.0, 5),
-    "bent": FocalEstimate(84.0, 0.04, 100.0, 5, bend=0.3),
-    "none": FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 stretches"),
+    "bent": FocalEstimate(84.0, 0.04, 100.0, 5, distortion=0.3),
+    "none": FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 windows"),
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "focal", "taken", "said"),
+    ("name", "focal", "taken", "message"),
     [
         ("clear", "auto", True, "fx 84 +- 3 px, horizontal field of view 100 deg"),
-        ("bent", "auto", True, "bends straight lines, too, by about 30%"),
-        ("wide", "auto", False, "does not tell it well: fx 84 +- 17 px"),
-        ("agrees", "auto", False, "the motion agrees: fx 140 +- 7 px"),
-        ("none", "auto", False, "0 stretches"),
+        ("bent", "auto", True, "radial distortion, about 30%"),
+        ("wide", "auto", False, "the estimate is uncertain: fx 84 +- 17 px"),
+        ("agrees", "auto", False, "consistent with the estimate: fx 140 +- 7 px"),
+        ("none", "auto", False, "0 windows"),
         ("clear", "flow", True, "fx 84 +- 3 px"),
         ("wide", "flow", True, "fx 84 +- 17 px"),
         ("agrees", "flow", True, "fx 140 +- 7 px"),
     ],
 )
 def test_which_estimate_is_taken(
-    still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, said: str
+    still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, message: str
 ) -> None:
     estimate = ESTIMATES[name]
     monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
-    assert said in " ".join([found.camera_source, *notes])
+    assert message in " ".join([found.camera_source, *notes])
     if taken:
         assert found.camera.fx == pytest.approx(estimate.focal_px)
         assert found.focal_sigma_px == pytest.approx(estimate.sigma_px)
@@ -288,9 +288,9 @@ def test_which_estimate_is_taken(
         assert found is still
 
 
-def test_asking_for_what_the_motion_does_not_tell_is_an_error(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_estimate_is_an_error_if_it_is_required(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: ESTIMATES["none"])
-    with pytest.raises(CalibrationError, match=r"input\.focal = flow.*0 stretches"):
+    with pytest.raises(CalibrationError, match=r"input\.focal = flow.*0 windows"):
         reconstruct(still, _settings("flow"))
 
 
@@ -302,11 +302,11 @@ def test_a_known_camera_is_left_alone(turning: Path, tmp_path: Path) -> None:
     assert "focal length" not in result.provenance["seconds"]
 
 
-# ---- real pictures
+# ---- real clips
 
 
 class _Rectified:
-    """Frames of a calibrated sequence as pictures of a camera that nobody knows."""
+    """Frames of a calibrated sequence as images of an unknown camera."""
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence, self.path = sequence, sequence.path

@@ -1,4 +1,4 @@
-"""Loops: a camera that comes back, on a textured plane, and a graph whose drift is known."""
+"""Loop closure of a camera that returns, on a textured plane, and pose graphs with known drift."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
+from scopemap.config.mapping import MappingAdvanced
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping import Backend
+from scopemap.mapping import Backend, TrackedPose
 from scopemap.mapping.bundle_adjustment import Solution, adjust
 from scopemap.mapping.loop_closure import Loop, LoopFinder
-from scopemap.mapping.pose_graph import spread_loops
+from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
 from scopemap.mapping.reprojection import Problem
 
 # Out to the side and back again.
@@ -25,7 +26,7 @@ OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 
 POSES = [*OUT, *OUT[-2::-1]]
 COUNT = len(POSES)
 LINE = np.column_stack([np.arange(COUNT - 1), np.arange(1, COUNT)])
-SETTINGS = MappingSettings(gaps=(1, 2))
+SETTINGS = MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2)))
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
@@ -36,7 +37,7 @@ def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0
 
 
 def _drifting() -> list[np.ndarray]:
-    """Poses whose every step errs alike, by some 0.6 degrees and 1 mm."""
+    """Poses with the same error in every step, some 0.6 degrees and 1 mm."""
     step, poses = se3_exp(np.array([0.004, -0.004, 0.008, 0.6, 0.6, -0.5])), [POSES[0]]
     for before, here in pairwise(POSES):
         poses.append(poses[-1] @ inverse(before) @ here @ step)
@@ -48,7 +49,7 @@ def _off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(rotation_angle_rad(off[:3, :3])), float(np.linalg.norm(off[:3, 3]))
 
 
-def test_a_place_is_known_again_and_placed_where_it_is() -> None:
+def test_a_place_seen_again_is_found_with_its_relative_pose() -> None:
     finder = LoopFinder(SETTINGS)
     loops = [loop for number in range(COUNT) for loop in finder.add(_frame(number, factor=1.0 + 0.02 * number))]
     assert any(loop.past + loop.new == COUNT - 1 for loop in loops)
@@ -56,22 +57,22 @@ def test_a_place_is_known_again_and_placed_where_it_is() -> None:
         assert loop.new - loop.past > 2
         T = inverse(POSES[loop.new]) @ POSES[loop.past]
         scale_past, scale_new = 1 + 0.02 * loop.past, 1 + 0.02 * loop.new
-        turn, _ = _off(loop.T_new_past, T)
-        assert turn < np.radians(1.0)
+        rotation_rad, _ = _off(loop.T_new_past, T)
+        assert rotation_rad < np.radians(1.0)
         np.testing.assert_allclose(loop.T_new_past[:3, 3], scale_past * T[:3, 3], atol=1.0)
         assert loop.log_ratio == pytest.approx(np.log(scale_new / scale_past), abs=0.03)
 
 
-def test_a_camera_that_only_goes_on_closes_no_loop() -> None:
-    finder = LoopFinder(MappingSettings(gaps=(1,)))
+def test_a_camera_that_never_returns_closes_no_loop() -> None:
+    finder = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
     for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):
         view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
         frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
         assert not [loop for loop in finder.add(frame) if loop.past == 0]
 
 
-def test_the_graph_takes_drift_of_poses_and_of_scale_away() -> None:
-    # The depth of keyframe k is too large by exp(0.02 k), and so is every way tracked from it.
+def test_the_pose_graph_removes_drift_of_poses_and_scale() -> None:
+    # The depth of keyframe k is too large by exp(0.02 k), and so is every translation tracked from it.
     scale = np.exp(0.02 * np.arange(COUNT))
     tracked = [POSES[0]]
     for k in range(COUNT - 1):
@@ -83,8 +84,8 @@ def test_the_graph_takes_drift_of_poses_and_of_scale_away() -> None:
         new = COUNT - 1 - past
         T = inverse(POSES[new]) @ POSES[past]
         T[:3, 3] *= scale[past]
-        loops.append(replace(_said(past, new, T), log_ratio=float(np.log(scale[new] / scale[past]))))
-    graph = spread_loops(np.stack(tracked), LINE, loops, depth_mm=50.0)
+        loops.append(replace(_loop(past, new, T), log_ratio=float(np.log(scale[new] / scale[past]))))
+    graph = optimise_pose_graph(np.stack(tracked), LINE, loops, depth_mm=50.0)
     before, after = (_off(poses[-1], POSES[-1])[1] for poses in (tracked, graph.T_world_camera))
     assert before > 5
     assert after < 0.05 * before
@@ -93,28 +94,48 @@ def test_the_graph_takes_drift_of_poses_and_of_scale_away() -> None:
     np.testing.assert_array_equal(graph.T_world_camera[0], tracked[0])
 
 
-def _said(past: int, new: int, T_new_past: np.ndarray) -> Loop:
+def _loop(past: int, new: int, T_new_past: np.ndarray) -> Loop:
     return Loop(past, new, T_new_past, 0.0, *(np.zeros((0, 2)),) * 4)
 
 
-def test_a_loop_that_denies_most_of_the_way_is_not_believed() -> None:
+def test_a_loop_is_converted_to_the_units_of_the_common_world() -> None:
+    T = se3_exp(np.array([0.1, 0, 0, 2.0, 3.0, 4.0]))
+    original = replace(_loop(3, 7, T), log_ratio=0.1)
+    loop = original.among([3, 6, 7], np.log([2.0, 1.0, 3.0]))
+    assert (loop.past, loop.new) == (0, 2)
+    np.testing.assert_allclose(loop.T_new_past[:3, 3], [2 * x for x in T[:3, 3]])
+    np.testing.assert_allclose(loop.T_new_past[:3, :3], T[:3, :3])
+    assert loop.log_ratio == pytest.approx(0.1 + np.log(1.5))
+    np.testing.assert_array_equal(original.T_new_past, T)
+
+
+def test_keyframes_are_paired_with_their_reference_keyframes() -> None:
+    tracked = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
+    frames, poses = [frame for frame, *_ in tracked], [TrackedPose(m, of, np.eye(4)) for _, m, of in tracked]
+    # Keyframe 40 was aligned to a frame that is no keyframe: the one before it in its map is used.
+    expected = [[0, 1], [2, 3], [0, 4], [4, 5], [3, 6]]
+    np.testing.assert_array_equal(tracked_pairs(frames, poses), expected)
+    assert tracked_pairs(frames[:1], poses[:1]).shape == (0, 2)
+
+
+def test_a_loop_that_drift_cannot_explain_is_not_accepted() -> None:
     poses = np.stack(OUT)
-    graph = spread_loops(poses, LINE[: len(OUT) - 1], [_said(0, len(OUT) - 1, np.eye(4))], depth_mm=10.0)
-    assert graph.believed == 0
+    graph = optimise_pose_graph(poses, LINE[: len(OUT) - 1], [_loop(0, len(OUT) - 1, np.eye(4))], depth_mm=10.0)
+    assert graph.accepted_loops == 0
     np.testing.assert_allclose(graph.T_world_camera, poses, atol=1e-9)
 
 
-def test_one_false_loop_gives_way_to_others() -> None:
+def test_one_false_loop_is_an_outlier() -> None:
     poses = np.stack(POSES)
-    true = [_said(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
+    true = [_loop(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
     false = se3_exp(np.array([0.0, 0.3, 0.0, 20.0, 0.0, 0.0])) @ true[0].T_new_past
-    graph = spread_loops(poses, LINE, [*true, _said(0, COUNT - 1, false)], depth_mm=50.0)
-    assert graph.believed == 4
+    graph = optimise_pose_graph(poses, LINE, [*true, _loop(0, COUNT - 1, false)], depth_mm=50.0)
+    assert graph.accepted_loops == 4
     assert max(_off(a, b)[1] for a, b in zip(graph.T_world_camera, poses, strict=True)) < 1.0
 
 
 @pytest.mark.parametrize("closing", [True, False])
-def test_the_back_end_closes_loops_where_it_may(closing: bool) -> None:
+def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()
     settings = SETTINGS if closing else SETTINGS.model_copy(update={"min_loop_inliers": 0})
     backend = Backend(settings, DisFlow())
@@ -130,24 +151,24 @@ def test_the_back_end_closes_loops_where_it_may(closing: bool) -> None:
         assert after < 0.3
 
 
-def test_loops_of_keyframes_without_depth_are_none() -> None:
+def test_keyframes_without_depth_close_no_loop() -> None:
     finder = LoopFinder(SETTINGS)
     for number in range(COUNT):
         frame = _frame(number)
         assert not finder.add(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
 
 
-def test_a_camera_that_dwells_ties_no_keyframe_to_all_others() -> None:
-    finder = LoopFinder(MappingSettings(gaps=(1,)))
+def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
+    finder = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
     loops = [loop for number in range(14) for loop in finder.add(replace(_frame(0), index=10 * number))]
     assert len(loops) > 10
-    ties = np.bincount([loop.past for loop in loops])
-    assert ties.max() <= 3
+    counts = np.bincount([loop.past for loop in loops])
+    assert counts.max() <= 3
     assert max(len(loop.pixels_past) for loop in loops) <= 60
 
 
-def test_loops_that_lead_astray_are_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An adjustment that ends badly from where loops made it begin is made once more, from where tracking ended."""
+def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The repeated adjustment starts from the poses as tracked."""
     backend = Backend(SETTINGS, DisFlow())
     for number, pose in enumerate(POSES[:12]):
         backend.add(_frame(number, pose))

@@ -1,4 +1,4 @@
-"""A run whose camera is lost for good: what shows the same place is joined, the largest of the rest is kept."""
+"""Submaps of a run whose camera is lost for good: those of the same place are merged, the largest is the result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
-from scopemap.mapping import Backend, Correction, Mapper, TrackedPose
+from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import Solution, adjust
 from scopemap.mapping.reprojection import Problem
 from scopemap.mapping.submaps import corrected_frame
@@ -33,8 +33,8 @@ from scopemap.reconstruction import DepthReader
 from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
-FIRST, SECOND, GIVEN_UP = 10, 13, 2
-LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": GIVEN_UP}
+FIRST, SECOND, LOST_BEFORE_NEW = 10, 13, 2
+LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": LOST_BEFORE_NEW}
 
 
 @pytest.fixture(scope="module")
@@ -67,18 +67,20 @@ def result(spliced: Path, out: Path) -> Reconstruction:
     return reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT), out=out)
 
 
-def test_the_largest_map_is_kept_and_the_rest_lost(result: Reconstruction) -> None:
-    lost = FIRST + GIVEN_UP
-    assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (SECOND - GIVEN_UP - 1)
+def test_the_largest_submap_is_the_result_and_other_frames_are_lost(result: Reconstruction) -> None:
+    lost = FIRST + LOST_BEFORE_NEW
+    assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (
+        SECOND - LOST_BEFORE_NEW - 1
+    )
     assert result.records[0].track.reason == "tracked in another map, number 0"
     assert "keyframe" in result.records[FIRST].track.reason
     note = next(text for text in result.provenance["warnings"] if "submaps" in text)
     assert note.startswith("2 submaps")
-    assert f"{SECOND - GIVEN_UP} of {FIRST + SECOND - GIVEN_UP} tracked frames are in the result" in note
+    assert f"{SECOND - LOST_BEFORE_NEW} of {FIRST + SECOND - LOST_BEFORE_NEW} tracked frames are in the result" in note
 
 
 def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
-    begin = FIRST + GIVEN_UP
+    begin = FIRST + LOST_BEFORE_NEW
     poses = result.trajectory.T_world_camera
     np.testing.assert_array_equal(poses[: begin + 1], np.broadcast_to(np.eye(4), (begin + 1, 4, 4)))
     off = inverse(poses[begin:]) @ true_poses(spliced, begin)[begin:]
@@ -88,12 +90,12 @@ def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstr
 
 def test_only_the_kept_map_is_fused(result: Reconstruction, spliced: Path) -> None:
     scene = spliced.parent / "1"
-    alone = reconstruct(open_sequence(scene, frames=slice(GIVEN_UP, None)), with_true_depth(scene, **LIGHT))
+    alone = reconstruct(open_sequence(scene, frames=slice(LOST_BEFORE_NEW, None)), with_true_depth(scene, **LIGHT))
     for one, other in zip(result.mesh.bounds, alone.mesh.bounds, strict=True):
         np.testing.assert_allclose(one, other, atol=2.0)
 
 
-def test_the_smaller_map_is_kept_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
+def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
     (other,) = result.others
     lost = [record.track.status == "lost" for record in other.records]
     assert lost == [False] * FIRST + [True] * SECOND
@@ -108,7 +110,7 @@ def test_the_smaller_map_is_kept_beside_it(result: Reconstruction, spliced: Path
     np.testing.assert_allclose(written.bounds, other.mesh.bounds, atol=1e-3)
 
 
-def test_another_run_takes_the_place_of_all_of_it(spliced: Path, out: Path, tmp_path: Path) -> None:
+def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(out, tmp_path / "out")
     short = with_true_depth(spliced, **LIGHT)
     again = reconstruct(open_sequence(spliced, frames=slice(0, 3)), short, out=tmp_path / "out", overwrite=True)
@@ -116,10 +118,10 @@ def test_another_run_takes_the_place_of_all_of_it(spliced: Path, out: Path, tmp_
     assert not (tmp_path / "out" / "maps").exists()
 
 
-def test_few_frames_apart_are_left_out(spliced: Path) -> None:
+def test_small_submaps_are_left_out(spliced: Path) -> None:
     some = open_sequence(spliced, frames=slice(1, None))
     result = reconstruct(some, with_true_depth(spliced, **LIGHT, fusion__enabled=False))
-    assert len(result.records) - len(result.lost) == SECOND - GIVEN_UP
+    assert len(result.records) - len(result.lost) == SECOND - LOST_BEFORE_NEW
     assert result.others == []
 
 
@@ -132,11 +134,11 @@ def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> 
 
 
 def _keyframe(
-    number: int, at_mm: tuple[float, float, float], told: Similarity, factor: float
+    number: int, at_mm: tuple[float, float, float], S_map_true: Similarity, factor: float
 ) -> tuple[Frame, TrackedPose]:
-    """A keyframe of a plane, its pose told in another world, its depth times `factor`; every map is told by its own."""
+    """A keyframe of a plane, its pose in another world, its depth times `factor`; each map has its own factor."""
     view = plane_scene.see(plane_scene.pose(at_mm=at_mm))
-    T_world_camera = told.transform_poses(view.T_world_camera)
+    T_world_camera = S_map_true.transform_poses(view.T_world_camera)
     depth_mm = (factor * view.depth_mm).astype(np.float32)
     frame = Frame(
         10 * number, number / 3, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, T_world_camera
@@ -144,7 +146,7 @@ def _keyframe(
     return frame, TrackedPose(int(factor != 1), 10 * max(number - 2, 0), T_world_camera)
 
 
-def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
+def test_maps_of_the_same_place_are_merged() -> None:
     worlds = (Similarity.identity(), Similarity(1.3, so3_exp(np.array([0.2, -0.9, 0.4])), np.array([30.0, -8.0, 5.0])))
     places = [(2.0 * number, 0.5 * number, 0.1 * number) for number in range(10)]
     backend = Backend(MappingSettings(), DisFlow())
@@ -157,7 +159,7 @@ def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
     assert [backend.keyframes(number) for number in range(3)] == [5, 5, 0]
     correction = backend.adjust(0, tracked)
     assert sorted(correction.S_common_map) == [0, 1]
-    assert "2 maps joined" in correction.description
+    assert "2 maps merged" in correction.description
     for frame, at_mm in zip(frames, places, strict=True):
         moved = corrected_frame(frame, correction)
         assert moved.T_world_camera is not None
@@ -166,7 +168,7 @@ def test_maps_that_show_the_same_are_adjusted_as_one() -> None:
         np.testing.assert_allclose(moved.depth_mm, plane_scene.see(plane_scene.pose(at_mm=at_mm)).depth_mm, rtol=0.05)
 
 
-def test_maps_that_do_not_are_adjusted_apart() -> None:
+def test_maps_of_different_places_are_not_merged() -> None:
     backend = Backend(MappingSettings(), DisFlow())
     with pytest.raises(ValueError, match="no keyframe"):
         backend.adjust()
@@ -179,7 +181,7 @@ def test_maps_that_do_not_are_adjusted_apart() -> None:
 
 
 @pytest.mark.parametrize("swelling", [False, True])
-def test_one_map_that_does_not_fit_is_left_alone(swelling: bool) -> None:
+def test_a_map_that_does_not_fit_is_not_merged(swelling: bool) -> None:
     backend, rng = Backend(MappingSettings(), DisFlow()), np.random.default_rng(0)
     for number in range(15):
         frame, pose = _keyframe(number, (1.5 * number, 0.4 * number, 0.0), Similarity.identity(), 1.0)
@@ -192,12 +194,14 @@ def test_one_map_that_does_not_fit_is_left_alone(swelling: bool) -> None:
     assert sorted(backend.adjust(0).S_common_map) == ([0, 2] if swelling else [0, 1, 2])
 
 
-def test_what_has_most_frames_in_all_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    def merging(self: Backend, main: int, tracked: Mapping[int, TrackedPose], among: Collection[int]) -> Correction:
+def test_the_submap_with_most_frames_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    def merging(
+        self: Backend, main: int, tracked: Mapping[int, TrackedPose], among: Collection[int]
+    ) -> FrameCorrection:
         """Merge maps 1 and 2."""
         maps = [number for number in ((1, 2) if main in (1, 2) else (main,)) if number in among]
         merged = {number: Similarity.identity() for number in maps}
-        return Correction(np.zeros(1, int), np.eye(4)[None], np.zeros(1), S_common_map=merged)
+        return FrameCorrection(np.zeros(1, int), np.eye(4)[None], np.zeros(1), S_common_map=merged)
 
     monkeypatch.setattr(Backend, "keyframes", lambda self, number: 1)
     monkeypatch.setattr(Backend, "adjust", merging)
@@ -215,7 +219,7 @@ def test_what_has_most_frames_in_all_comes_first(monkeypatch: pytest.MonkeyPatch
         assert warnings[0].startswith("5 submaps" if method == "none" else "4 submaps")
 
 
-def test_what_sticks_to_the_lens_joins_nothing() -> None:
+def test_dirt_on_the_lens_merges_no_maps() -> None:
     backend, dirt = (
         Backend(MappingSettings(), DisFlow()),
         np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32),
@@ -229,7 +233,7 @@ def test_what_sticks_to_the_lens_joins_nothing() -> None:
     assert list(backend.adjust().S_common_map) == [0]
 
 
-def test_maps_that_do_not_fit_together_are_left_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Backend(MappingSettings(), DisFlow())
     for number in range(10):
         backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
@@ -261,7 +265,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "cut"
 
 
-def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(
+def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fused: list[int] = []
@@ -275,9 +279,9 @@ def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(
     settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
     result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
     status = [record.track.status for record in result.records]
-    assert status == ["initial"] + ["ok"] * 9 + ["lost"] * GIVEN_UP + ["ok"] * (44 - GIVEN_UP)
-    assert result.records[10 + GIVEN_UP].track.reason == "began a map that was joined"
-    assert any("2 maps joined" in note for note in result.provenance["notes"])
+    assert status == ["initial"] + ["ok"] * 9 + ["lost"] * LOST_BEFORE_NEW + ["ok"] * (44 - LOST_BEFORE_NEW)
+    assert result.records[10 + LOST_BEFORE_NEW].track.reason == "began a map that was joined"
+    assert any("2 maps merged" in note for note in result.provenance["notes"])
     assert not [text for text in result.provenance["warnings"] if "submaps" in text]
     np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
     report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
@@ -287,9 +291,9 @@ def test_a_map_that_leads_back_into_an_older_one_is_joined_with_it(
     truth, depth = C3vdFolder(cut), DepthReader(tmp_path / "out")
     ratios = []
     for index in (2, 8, 20, 30, 50):
-        true, told_mm = truth.truth(index), depth.read(index)
+        true, depth_mm = truth.truth(index), depth.read(index)
         assert true is not None
         assert true.depth_mm is not None
-        assert told_mm is not None
-        ratios.append(np.nanmedian(told_mm / np.where(true.depth_mm > 0, true.depth_mm, np.nan)))
+        assert depth_mm is not None
+        ratios.append(np.nanmedian(depth_mm / np.where(true.depth_mm > 0, true.depth_mm, np.nan)))
     np.testing.assert_allclose(np.log(ratios), np.log(np.median(ratios)), atol=0.1)

@@ -1,4 +1,4 @@
-"""The back end in a whole run: poses, depth maps and mesh of one piece, nothing of it where there is none."""
+"""Mapping in a whole run: adjusted poses, depth maps and mesh agree; none of it with measured depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "track
 
 @dataclass(frozen=True)
 class _Bent:
-    """True depth made wrong: near gets nearer and far farther, and it is said to be predicted."""
+    """True depth distorted by a power law, and reported as predicted."""
 
     inner: Any
     name: str = "bent"
@@ -48,7 +48,7 @@ class _Run:
     tracked: Reconstruction
 
 
-@pytest.fixture(scope="module", params=[0.0, 0.1], ids=["depth scaled", "depth bent"])
+@pytest.fixture(scope="module", params=[0.0, 0.1], ids=["depth scaled", "depth correction field"])
 def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> _Run:
     folder = tmp_path_factory.mktemp("backend")
     phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}", frames=FRAMES)
@@ -60,24 +60,24 @@ def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scopemap.runner.create_estimators", bent)
-        config = with_true_depth(phantom, **SETTINGS, mapping__depth_step_sigma=request.param)
+        config = with_true_depth(phantom, **SETTINGS, mapping__advanced__depth_step_sigma=request.param)
         adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
         plain = with_true_depth(phantom, **SETTINGS, mapping__method="none")
         tracked = reconstruct(open_sequence(phantom), plain)
     return _Run(request.param, phantom, folder / "out", steps, adjusted, tracked)
 
 
-def _turn_errors_rad(result: Reconstruction, phantom: Path) -> np.ndarray:
+def _rotation_errors_rad(result: Reconstruction, phantom: Path) -> np.ndarray:
     poses, status = result.trajectory.T_world_camera, result.trajectory.status
     return rotation_angle_rad((inverse(poses) @ true_poses(phantom))[status != "lost", :3, :3])
 
 
-def test_adjusted_poses_go_less_astray_than_tracked_ones(run: _Run) -> None:
-    tracked, adjusted = (_turn_errors_rad(result, run.phantom) for result in (run.tracked, run.adjusted))
+def test_adjusted_rotations_are_better_than_tracked_ones(run: _Run) -> None:
+    tracked, adjusted = (_rotation_errors_rad(result, run.phantom) for result in (run.tracked, run.adjusted))
     assert adjusted.max() < 0.8 * tracked.max()
 
 
-def test_a_lost_frame_stays_lost_where_the_camera_was_last_seen(run: _Run) -> None:
+def test_a_lost_frame_keeps_the_last_pose(run: _Run) -> None:
     trajectory = run.adjusted.trajectory
     assert trajectory.status[LOST] == "lost"
     np.testing.assert_array_equal(trajectory.T_world_camera[LOST], trajectory.T_world_camera[LOST - 1])
@@ -108,7 +108,7 @@ def _shape_error(depth_mm: np.ndarray, bent_mm: np.ndarray) -> float:
     return float(np.abs(off - np.median(off)).mean())
 
 
-def test_the_mesh_lies_where_adjusted_poses_and_depth_put_it(run: _Run) -> None:
+def test_the_mesh_agrees_with_adjusted_poses_and_depth(run: _Run) -> None:
     number = FRAMES - 1
     depth_mm = DepthReader(run.out).read(number)
     assert depth_mm is not None
@@ -119,14 +119,14 @@ def test_the_mesh_lies_where_adjusted_poses_and_depth_put_it(run: _Run) -> None:
     assert np.median(distances) < 1.5
 
 
-def test_the_run_says_what_the_back_end_did(run: _Run) -> None:
+def test_the_provenance_reports_the_adjustment(run: _Run) -> None:
     notes = run.adjusted.provenance["notes"]
     assert any("keyframes adjusted" in note for note in notes)
-    assert not any("back end" in note for note in run.tracked.provenance["notes"])
+    assert not any(note.startswith("mapping:") for note in run.tracked.provenance["notes"])
     assert run.adjusted.provenance["seconds"]["back end"] > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:
     result = reconstruct(open_sequence(run.phantom), with_true_depth(run.phantom, **SETTINGS))
-    assert not any("back end" in note for note in result.provenance["notes"])
+    assert not any(note.startswith("mapping:") for note in result.provenance["notes"])
     assert len(result.mesh.faces) > 1000

@@ -13,7 +13,7 @@ from scopemap.depth.perceptual import create_perceptual
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.io.sequence import Sequence
-from scopemap.mapping.depth_correction import LARGEST_LOG_FACTOR
+from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
 from scopemap.pipeline import Estimators
 
@@ -47,9 +47,9 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
     """
     if isinstance(estimators.depth, FilesDepth) and estimators.depth.measured_max_mm:
         return estimators.depth.measured_max_mm
-    mapping, log_factor = config.mapping, 0.0
-    if mapping.method != "none":
-        log_factor = 3 * mapping.scale_sigma + (LARGEST_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
+    mapping, log_factor = config.mapping.advanced, 0.0
+    if config.mapping.method != "none":
+        log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
     return math.exp(log_factor) * max_depth_mm(config.depth)
 
 

@@ -29,9 +29,11 @@ from scopemap.errors import SettingsError
 Preset = Literal["paper", "default", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
 RENAMED = {
+    "mapping.depth_share": "mapping.advanced.depth_sigma_share",
+    "mapping.gaps": "mapping.advanced.keyframe_gaps",
     "mapping.loop_landmarks": "mapping.min_loop_inliers",
-    "mapping.turn_sigma_deg": "mapping.rotation_sigma_deg",
-    "mapping.way_sigma_share": "mapping.translation_sigma_share",
+    "mapping.turn_sigma_deg": "mapping.advanced.rotation_sigma_deg",
+    "mapping.way_sigma_share": "mapping.advanced.translation_sigma_share",
     "tracking.corner_depth_share": "tracking.advanced.corner_depth_sigma",
     "tracking.depth_share": "tracking.advanced.depth_weight",
     "tracking.keyframe_agreement": "tracking.advanced.min_keyframe_agreement",
@@ -41,6 +43,7 @@ RENAMED = {
 """Settings of earlier versions by their present name, with the group's new name on both sides. A setting that only
 moved within its stage (to `advanced` or `paper`) needs no entry."""
 REMOVED = {
+    *("mapping.cell_px", "mapping.consistency_px"),
     *("mask.border_px", "mask.bright_level", "mask.highlight_grow_px", "mask.highlight_ratio"),
     "networks.flow_iterations",
     *("tracking.depth_sigma_share", "tracking.doubtful_inlier_share", "tracking.flow_contradiction"),

@@ -9,41 +9,53 @@ from pydantic import Field
 from scopemap.config.settings import Settings
 
 
-class MappingSettings(Settings):
-    """Back end: bundle adjustment of all keyframes, loop closure and map merging after the last frame."""
+class MappingAdvanced(Settings):
+    """Constants of bundle adjustment."""
 
-    method: Literal["none", "full"] = Field(
-        "full",
-        description="none: poses as tracked; full: bundle adjustment after the last frame where depth is predicted "
-        "(measured depth tracks as well or better without)",
+    keyframe_gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        (1, 2, 3, 5, 8),
+        min_length=1,
+        description="corners of a keyframe are tracked to the keyframes so many before it",
     )
-    gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (1, 2, 3, 5, 8), min_length=1, description="a keyframe is matched with the keyframes this many before it"
+    depth_sigma_share: float = Field(
+        0.15, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
     )
-    cell_px: int = Field(16, ge=4, description="one point per cell of this size, px")
-    consistency_px: float = Field(1.0, gt=0, description="largest forward-backward error of flow, px")
-    min_loop_inliers: int = Field(
-        25, ge=0, description="PnP inliers that a loop closure needs at least; 0: no loop closure, no map merging"
-    )
-    depth_share: float = Field(0.15, gt=0, description="minimum relative standard deviation of depth")
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     depth_step_sigma: float = Field(
         0.1,
         ge=0,
-        description="standard deviation of ln depth between nodes of the depth correction field; 0: scale only",
+        description="standard deviation of the change of ln depth from node to node of the depth correction field; "
+        "0: depth is only scaled",
     )
-    rotation_sigma_deg: float = Field(3.0, gt=0, description="standard deviation of rotations between keyframes")
+    rotation_sigma_deg: float = Field(
+        3.0, gt=0, description="standard deviation of the tracked rotation between keyframes, deg"
+    )
     translation_sigma_share: float = Field(
-        0.1, gt=0, description="standard deviation of translations between keyframes over the mean depth"
+        0.1, gt=0, description="standard deviation of the tracked translation between keyframes, over the median depth"
     )
     max_sigma_px: float = Field(
         0.8,
         gt=0,
-        description="poses stay as tracked where the adjusted reprojection error (MAD) exceeds this, px",
+        description="poses stay as tracked where the adjusted reprojection errors are larger (robust standard "
+        "deviation), px",
     )
     max_depth_change: float = Field(
-        0.3, gt=0, description="poses stay as tracked where the median change of ln depth exceeds this"
+        0.3, gt=0, description="poses stay as tracked where the median change of ln depth is larger"
     )
+
+
+class MappingSettings(Settings):
+    """Bundle adjustment of all keyframes after the last frame, with loop closure and map merging."""
+
+    method: Literal["none", "full"] = Field(
+        "full",
+        description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
+        "predicted (measured depth tracks as well or better without)",
+    )
+    min_loop_inliers: int = Field(
+        25, ge=0, description="PnP inliers that a loop closure needs at least; 0: no loop closure, no map merging"
+    )
+    advanced: MappingAdvanced = MappingAdvanced()
 
 
 class FusionAdvanced(Settings):

@@ -1,9 +1,8 @@
-"""Where a keyframe's depth is wrong, and by how much: one smooth factor over the image and over depth.
+"""Depth correction field: a smooth factor of a keyframe's depth over the image and over depth.
 
-Predicted depth is wrong by patches: a bright organ comes out too near, a far wall too far. Points that keyframes see
-from several places know better, but only where there are corners. Between them a coarse grid is fitted, over place in
-the image and, since errors stop at the edges of organs and folds where depth jumps, over ln depth as well: a bilateral
-grid (Chen, Paris and Durand, SIGGRAPH 2007) that holds a correction instead of a picture.
+Errors of predicted depth vary over the image: a bright organ is too near, a far wall too far. Triangulated points
+measure them, but only at corners. A coarse grid interpolates between the points. Its axes are row, column and ln depth,
+because errors change abruptly at depth edges: a bilateral grid (Chen, Paris and Durand, SIGGRAPH 2007) of corrections.
 """
 
 from __future__ import annotations
@@ -15,29 +14,30 @@ import numpy as np
 from scipy import sparse
 
 ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
-# ln of the largest factor either way: what points ask for beyond that is no error of depth.
-LARGEST_LOG_FACTOR = 0.7
-# From one node to the next, over the rows and columns and over the levels, in units of the setting.
+MAX_LOG_FACTOR = 0.7
+"""Bound of |ln factor|: larger errors of points are not errors of depth."""
+
+# Standard deviation of the change between neighbouring nodes of rows, columns and levels, in units of the setting.
 _STEP_SHARES = (1.0, 1.0, 2.0)
-# How far a correction is expected to go at all, in the same units; what no point tells of stays near 0.
+# Standard deviation of the correction itself, in the same units; nodes without points stay near 0.
 _SIZE_SHARE = 3.0
-# Flow errs alike on neighbouring points, and poses err too: no point is more certain than this.
-_LEAST_SIGMA = 0.03
+# Errors of flow and poses are correlated between neighbouring points: no point is more certain than this.
+_MIN_SIGMA = 0.03
 _CAUCHY = 2.0
-_ROUNDS = 3
-_LEAST_POINTS = 10
-# Levels lie between these percentiles of the points' depths.
-_ENDS = (1, 99)
+_ITERATIONS = 3
+_MIN_POINTS = 10
+# The first and the last level are these percentiles of the points' ln depths.
+_LEVEL_PERCENTILES = (1, 99)
 
 
 @dataclass(frozen=True)
-class DepthGrid:
-    """ln of the factor that a keyframe's depth is to be multiplied by, trilinear between nodes.
+class DepthCorrectionField:
+    """ln of the factor of a keyframe's depth, trilinear between the nodes of a grid.
 
     Attributes
     ----------
-    values : (6, 7, 4) over rows, columns and ln depth, the first and last nodes at the image's borders.
-    nearest, farthest : ln mm of the first and the last level; what lies beyond is corrected as there.
+    values : (6, 7, 4) over rows, columns and ln depth; the first and last nodes are at the image's borders. nearest,
+    farthest : ln mm of the first and the last level; the field is constant beyond them.
     """
 
     values: np.ndarray
@@ -45,9 +45,9 @@ class DepthGrid:
     farthest: float
 
     def log_factor(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Return ln of the factor (H, W) float32 for depth (H, W) mm as it was estimated; NaN where that is unknown."""
+        """Return ln of the factor (H, W) float32 for estimated depth (H, W) mm; NaN where that is unknown."""
         height, width = depth_mm.shape
-        x, y = np.meshgrid(_places(width, COLUMNS), _places(height, ROWS))
+        x, y = np.meshgrid(_node_coordinates(width, COLUMNS), _node_coordinates(height, ROWS))
         flat = cv2.remap(self.values.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         with np.errstate(divide="ignore", invalid="ignore"):
             level = _level(np.log(depth_mm), self.nearest, self.farthest).astype(np.float32)
@@ -56,38 +56,38 @@ class DepthGrid:
         return low + (level - below.astype(np.float32)) * (high - low)
 
 
-def fit_grid(
-    places: np.ndarray, log_depth: np.ndarray, error: np.ndarray, sigma: np.ndarray, step_sigma: float
-) -> DepthGrid:
-    """Return the grid that corrects a keyframe's depth by what its points tell.
+def fit_depth_correction(
+    position: np.ndarray, log_depth: np.ndarray, error: np.ndarray, sigma: np.ndarray, step_sigma: float
+) -> DepthCorrectionField:
+    """Return the correction field that fits a keyframe's triangulated points.
 
-    places : (n, 2), x and y over the image's width and height, 0..1. log_depth : (n,) ln mm as estimated. error : (n,)
-    what is to be added to it. sigma : (n,) standard deviation of `error`; infinite: it says nothing. step_sigma : how
-    far the correction may change from node to node, standard deviation.
+    position : (n, 2), x and y over the image's width and height, 0..1. log_depth : (n,) ln mm as estimated. error :
+    (n,) triangulated minus estimated ln depth. sigma : (n,) standard deviation of `error`; infinite: the point is not
+    used. step_sigma : standard deviation of the change from node to node.
 
-    Least squares with Cauchy's weights, as tissue that moved has points that lie:
+    Least squares with Cauchy's weights, because points on tissue that moved are outliers:
 
         sum of rho((f(p) - error_p) / s_p)  +  sum over neighbours ((f_a - f_b) / step)^2  +  sum of (f_a / size)^2
 
-    Nothing is corrected with fewer than ten points.
+    With fewer than ten points the field is 0.
     """
     known = np.isfinite(sigma)
-    if known.sum() < _LEAST_POINTS:
-        return DepthGrid(np.zeros(_SHAPE), 0.0, 1.0)
-    nearest, farthest = (float(end) for end in np.percentile(log_depth[known], _ENDS))
+    if known.sum() < _MIN_POINTS:
+        return DepthCorrectionField(np.zeros(_SHAPE), 0.0, 1.0)
+    nearest, farthest = (float(end) for end in np.percentile(log_depth[known], _LEVEL_PERCENTILES))
     farthest = max(farthest, nearest + 1e-3)
-    at = _mixing(places[known], _level(log_depth[known], nearest, farthest))
-    variance, wanted = sigma[known] ** 2 + _LEAST_SIGMA**2, error[known]
-    held, weight = _held(step_sigma), 1 / variance
-    for _ in range(_ROUNDS):
-        values = np.linalg.solve((held + at.T @ sparse.diags(weight) @ at).toarray(), at.T @ (weight * wanted))
-        off = at @ values - wanted
-        weight = 1 / (variance + (off / _CAUCHY) ** 2)
-    return DepthGrid(np.clip(values, -LARGEST_LOG_FACTOR, LARGEST_LOG_FACTOR).reshape(_SHAPE), nearest, farthest)
+    at = _interpolation(position[known], _level(log_depth[known], nearest, farthest))
+    variance, target = sigma[known] ** 2 + _MIN_SIGMA**2, error[known]
+    prior, weight = _prior(step_sigma), 1 / variance
+    for _ in range(_ITERATIONS):
+        values = np.linalg.solve((prior + at.T @ sparse.diags(weight) @ at).toarray(), at.T @ (weight * target))
+        residual = at @ values - target
+        weight = 1 / (variance + (residual / _CAUCHY) ** 2)
+    return DepthCorrectionField(np.clip(values, -MAX_LOG_FACTOR, MAX_LOG_FACTOR).reshape(_SHAPE), nearest, farthest)
 
 
-def _places(size: int, nodes: int) -> np.ndarray:
-    """Position of each pixel of a line among the nodes, 0..nodes - 1, float32."""
+def _node_coordinates(size: int, nodes: int) -> np.ndarray:
+    """Coordinates (size,) float32 of the pixels of a row or column, in nodes, 0..nodes - 1."""
     return ((np.arange(size) + 0.5) / size * (nodes - 1)).astype(np.float32)
 
 
@@ -95,9 +95,9 @@ def _level(log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray
     return np.clip((log_depth - nearest) / (farthest - nearest), 0, 1) * (LEVELS - 1)
 
 
-def _mixing(places: np.ndarray, level: np.ndarray) -> sparse.csr_matrix:
-    """Matrix (n, nodes) that interpolates the grid at points."""
-    x, y = np.clip(places, 0, 1).T
+def _interpolation(position: np.ndarray, level: np.ndarray) -> sparse.csr_matrix:
+    """Matrix (n, nodes) of trilinear interpolation at points."""
+    x, y = np.clip(position, 0, 1).T
     coordinates = (y * (ROWS - 1), x * (COLUMNS - 1), level)
     below = [np.minimum(c.astype(int), nodes - 2) for c, nodes in zip(coordinates, _SHAPE, strict=True)]
     share = [c - b for c, b in zip(coordinates, below, strict=True)]
@@ -109,15 +109,15 @@ def _mixing(places: np.ndarray, level: np.ndarray) -> sparse.csr_matrix:
     return matrix
 
 
-def _held(step_sigma: float) -> sparse.csr_matrix:
-    """Normal matrix (nodes, nodes) of what is believed beforehand: neighbours alike, everything near 0."""
+def _prior(step_sigma: float) -> sparse.csr_matrix:
+    """Normal matrix (nodes, nodes) of the prior: neighbouring nodes are similar, all are near 0."""
     number = np.arange(ROWS * COLUMNS * LEVELS).reshape(_SHAPE)
-    held = sparse.identity(number.size, format="csr") / (_SIZE_SHARE * step_sigma) ** 2
+    prior = sparse.identity(number.size, format="csr") / (_SIZE_SHARE * step_sigma) ** 2
     for axis, share in enumerate(_STEP_SHARES):
         before, after = (np.take(number, n, axis).ravel() for n in (range(_SHAPE[axis] - 1), range(1, _SHAPE[axis])))
         rows, ones = np.arange(len(before)), np.ones(len(before))
         step = sparse.csr_matrix(
             (np.append(ones, -ones), (np.append(rows, rows), np.append(after, before))), shape=(len(rows), number.size)
         )
-        held += step.T @ step / (share * step_sigma) ** 2
-    return held
+        prior += step.T @ step / (share * step_sigma) ** 2
+    return prior

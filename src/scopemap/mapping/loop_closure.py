@@ -1,4 +1,4 @@
-"""Loops: keyframes that show what one long before has shown, told by their features and held to geometry."""
+"""Loop closure: keyframes that observe the same place as one long before or of another map, verified by PnP."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from scopemap.config import MappingSettings
 from scopemap.frame import Frame
 from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
 
-_STRONGEST = 64  # features by which candidates are chosen
-_ALIKE = 0.8  # cosine of descriptors from which on they speak for a candidate
+_STRONGEST = 64  # features by which candidates are ranked
+_MIN_SIMILARITY = 0.8  # cosine of descriptors above which they count for a candidate
 _CANDIDATES = 3
-_STICKS_PX = 2.0
-# A camera that dwells would tie everything to the same few keyframes, and adjusting these together takes their square.
-_REST, _MOST_LOOPS, _MOST_PAIRS = 5, 20, 60  # keyframes between loops to one keyframe, loops to it, points of a loop
+_STATIC_PX = 2.0
+# With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
+_MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same keyframe, loops to one keyframe
+_MAX_PAIRS = 60  # features of a loop
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Two keyframes, long after each other or of two maps, that show the same place.
+    """A loop closure: two keyframes that observe the same place, long after each other or in two maps.
 
     Attributes
     ----------
-    past, new : their numbers. T_new_past : (4, 4), mm of the past one's depth. log_ratio : ln of the new one's depth
-    over what the past one's depth and this motion make of it. pixels_past, pixels_new : (M, 2) of the features that
-    agree. log_depth_past, log_depth_new : (M,) ln of their depth, NaN = unknown.
+    past, new : numbers of the keyframes. T_new_past : (4, 4), mm of the past keyframe's depth. log_ratio : ln of the
+    new keyframe's depth over the past one's, transformed into the new camera. pixels_past, pixels_new : (M, 2) of the
+    matched features. log_depth_past, log_depth_new : (M,) ln of their depth, NaN = unknown.
     """
 
     past: int
@@ -39,79 +40,86 @@ class Loop:
     log_depth_past: np.ndarray
     log_depth_new: np.ndarray
 
+    def among(self, keyframes: list[int], log_unit: np.ndarray) -> Loop:
+        """Return the loop with keyframes numbered by their place in a list, in other units of length.
+
+        log_unit : (K,) ln of the factor of the listed keyframes' millimetres.
+        """
+        past, new = keyframes.index(self.past), keyframes.index(self.new)
+        T_new_past = self.T_new_past.copy()
+        T_new_past[:3, 3] *= np.exp(log_unit[past])
+        log_ratio = self.log_ratio + float(log_unit[new] - log_unit[past])
+        return replace(self, past=past, new=new, T_new_past=T_new_past, log_ratio=log_ratio)
+
 
 class LoopFinder:
-    """Takes keyframes one by one and tells which of those long before, and of other maps, show the same place.
+    """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
-    Candidates are those whose strongest features look most like the new one's; only what PnP can place from at least
-    `settings.min_loop_inliers` of them is a loop.
+    Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
+    at least `settings.min_loop_inliers` inliers.
     """
 
     def __init__(self, settings: MappingSettings) -> None:
-        self.settings = settings
-        self._known: list[Features] = []
+        self._min_inliers, self._max_gap = settings.min_loop_inliers, max(settings.advanced.keyframe_gaps)
+        self._features: list[Features] = []
         self._map_of: list[int] = []
-        self._closed: defaultdict[int, list[int]] = defaultdict(list)
+        self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
 
     def add(self, keyframe: Frame, map_number: int = 0) -> list[Loop]:
-        """Return the loops that a keyframe with depth closes, those into other maps among them."""
-        new = detect_features(keyframe)
-        loops = []
+        """Return the loops that a keyframe with depth closes."""
+        new, loops = detect_features(keyframe), []
         for past in self._candidates(new, map_number):
-            known = self._known[past]
-            located = relative_pose_pnp(known, new, keyframe.camera, self.settings.min_loop_inliers)
-            if located is None or (self._map_of[past] != map_number and self._sticks(known, new, located.pairs)):
-                continue
-            one, other = located.pairs[:: -(-len(located.pairs) // _MOST_PAIRS)].T
-            moved = known.points_mm[one] @ located.T_current_reference[2, :3] + located.T_current_reference[2, 3]
-            with np.errstate(invalid="ignore", divide="ignore"):
-                z_past, z_new = np.log(known.points_mm[one, 2]), np.log(new.points_mm[other, 2])
-                ratio = z_new - np.log(moved)
-            if np.isfinite(ratio).sum() < min(self.settings.min_loop_inliers, _MOST_PAIRS) // 2:
-                continue
-            self._closed[past].append(len(self._known))
-            loops.append(
-                Loop(
-                    past,
-                    len(self._known),
-                    located.T_current_reference,
-                    float(np.nanmedian(ratio)),
-                    known.pixels[one],
-                    new.pixels[other],
-                    z_past,
-                    z_new,
-                )
-            )
-        # Half of the precision tells descriptors apart as well, in half of the memory.
-        self._known.append(replace(new, descriptors=new.descriptors.astype(np.float16)))
+            loop = self._loop(past, new, keyframe, self._map_of[past] != map_number)
+            if loop is not None:
+                self._loops_to[past].append(loop.new)
+                loops.append(loop)
+        # Half precision distinguishes descriptors as well, in half of the memory.
+        self._features.append(replace(new, descriptors=new.descriptors.astype(np.float16)))
         self._map_of.append(map_number)
         return loops
 
-    def _candidates(self, new: Features, map_number: int) -> list[int]:
-        """Numbers of the keyframes that look most alike, of this map and of others.
+    def _loop(self, past: int, new: Features, keyframe: Frame, other_map: bool) -> Loop | None:
+        """Return the loop between a past keyframe and the new one; None where PnP does not verify it."""
+        old = self._features[past]
+        found = relative_pose_pnp(old, new, keyframe.camera, self._min_inliers)
+        if found is None or (other_map and self._static(old, new, found.pairs)):
+            return None
+        one, other = found.pairs[:: -(-len(found.pairs) // _MAX_PAIRS)].T
+        T_new_past = found.T_current_reference
+        transformed_z = old.points_mm[one] @ T_new_past[2, :3] + T_new_past[2, 3]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_z_past, log_z_new = np.log(old.points_mm[one, 2]), np.log(new.points_mm[other, 2])
+            ratio = log_z_new - np.log(transformed_z)
+        if np.isfinite(ratio).sum() < min(self._min_inliers, _MAX_PAIRS) // 2:
+            return None
+        log_ratio, pixels = float(np.nanmedian(ratio)), (old.pixels[one], new.pixels[other])
+        return Loop(past, len(self._features), T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
 
-        Those that flow links to anyhow, the last ones of this map, are left out.
+    def _candidates(self, new: Features, map_number: int) -> list[int]:
+        """Numbers of the most similar keyframes, of this map and of others.
+
+        The last keyframes of this map are left out: flow matches them already.
         """
         map_of, strongest = np.array(self._map_of, dtype=int), new.descriptors[:_STRONGEST]
         own, elsewhere = np.flatnonzero(map_of == map_number), np.flatnonzero(map_of != map_number)
-        likely: list[int] = []
-        for some in (own[: max(len(own) - max(self.settings.gaps), 0)], elsewhere):
-            votes = np.array([self._votes(strongest, self._known[k]) for k in some])
-            ranked = [int(some[k]) for k in np.argsort(-votes, kind="stable") if votes[k] > 0]
-            likely += [k for k in ranked if self._may_close(k)][:_CANDIDATES]
-        return likely
+        candidates: list[int] = []
+        for some in (own[: max(len(own) - self._max_gap, 0)], elsewhere):
+            similarity = np.array([self._similarity(strongest, self._features[k]) for k in some])
+            ranked = [int(some[k]) for k in np.argsort(-similarity, kind="stable") if similarity[k] > 0]
+            candidates += [k for k in ranked if self._allows_loop(k)][:_CANDIDATES]
+        return candidates
 
-    def _sticks(self, past: Features, new: Features, pairs: np.ndarray) -> bool:
-        """Whether too few features are elsewhere in the picture: dirt on the lens looks alike in unrelated places."""
-        way_px = np.linalg.norm(new.pixels[pairs[:, 1]] - past.pixels[pairs[:, 0]], axis=1)
-        return int((way_px > _STICKS_PX).sum()) < self.settings.min_loop_inliers
+    def _static(self, past: Features, new: Features, pairs: np.ndarray) -> bool:
+        """Whether too few features moved in the image: dirt on the lens matches in unrelated places."""
+        shift_px = np.linalg.norm(new.pixels[pairs[:, 1]] - past.pixels[pairs[:, 0]], axis=1)
+        return int((shift_px > _STATIC_PX).sum()) < self._min_inliers
 
     @staticmethod
-    def _votes(strongest: np.ndarray, known: Features) -> float:
-        """How much a keyframe looks like one with these descriptors."""
-        alike = strongest @ known.descriptors[:_STRONGEST].T.astype(np.float32)
-        return float(np.maximum(alike.max(1) - _ALIKE, 0).sum()) if alike.size else 0.0
+    def _similarity(strongest: np.ndarray, past: Features) -> float:
+        """Sum over descriptors of the cosine to the nearest one of a keyframe, above the threshold."""
+        cosine = strongest @ past.descriptors[:_STRONGEST].T.astype(np.float32)
+        return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
 
-    def _may_close(self, past: int) -> bool:
-        closed = self._closed[past]
-        return len(closed) < _MOST_LOOPS and (not closed or len(self._known) - closed[-1] >= _REST)
+    def _allows_loop(self, past: int) -> bool:
+        loops = self._loops_to[past]
+        return len(loops) < _MAX_LOOPS and (not loops or len(self._features) - loops[-1] >= _MIN_INTERVAL)

@@ -1,11 +1,12 @@
-"""Maps of one video, each with a world and millimetres of its own, put into one world by the loops between them.
+"""Map merging: Sim(3) from each map's world to a common world, by the loop closures between maps.
 
-A loop between keyframe p of one map and n of another says where n was as seen from p, T_n_p, in the millimetres of p's
-depth, and how much larger n's depth is, exp(r). So the world of n's map lies in that of p's as the similarity
+Each map has a world and a unit of length of its own. A loop closure between keyframe p of one map and n of another
+gives T_n_p, in the millimetres of p's depth, and the ratio exp(r) of n's depth to p's. So Sim(3) from the world of n's
+map to the world of p's has
 
-    scale exp(-r),    rotation R_p R_n_p^T R_n^T,    which takes n's place to the place of T_p T_n_p^-1
+    scale exp(-r),    rotation R_p R_n_p^T R_n^T,    and takes the position of n to the position of T_p T_n_p^-1
 
-One loop is believed only as far as others, of other keyframes, bear it out.
+A loop closure is accepted only if loop closures of other keyframes agree with it.
 """
 
 from __future__ import annotations
@@ -20,91 +21,94 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.loop_closure import Loop
 
-_LEAST_AGREEING = 2  # keyframes on either side
-# Maps drift, each by itself: rad, share of the scene's depth, ln.
-_ALIKE = (0.2, 0.3, 0.3)
-_LARGEST_LOG_SCALE = 1.0  # no depth estimate is so much off in one map of a video and right in another
+_MIN_SUPPORT = 2  # agreeing keyframes in either map
+# Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
+_MAX_DIFFERENCE = (0.2, 0.3, 0.3)
+_MAX_LOG_SCALE = 1.0  # between maps of one video
 
 
-class _Word(NamedTuple):
-    """What one loop says of a map: how its world lies, its keyframe's pose (4, 4) in it, numbers of both keyframes."""
+class _Hypothesis(NamedTuple):
+    """Sim(3) of a map by one loop: to the common world, its keyframe's pose (4, 4) in the map, both keyframes."""
 
-    lies: Similarity
+    S_common_map: Similarity
     T_map_camera: np.ndarray
     own: int
     other: int
 
 
-def join_maps(
+def merge_maps(
     T_world_camera: np.ndarray, map_of: Sequence[int], loops: Sequence[Loop], main: int, depth_mm: float
 ) -> dict[int, Similarity]:
-    """Return how the world of each map that loops tie to the main one lies in the common world, the main one's too.
+    """Return Sim(3) from the world of each map to the common world, for the main map and all that loops connect to it.
 
     T_world_camera : (K, 4, 4) of all keyframes, each in the world of its map. map_of : (K,) numbers of these maps.
-    depth_mm : typical depth in the main one. The common world has the main map's millimetres, and the first of the
-    keyframes that are in it is where it was in its own. Maps are in the order in which they were joined.
+    depth_mm : typical depth in the main map. The common world has the main map's millimetres, and its first keyframe
+    has the pose that it had in its own map. Maps are in the order in which they were merged.
     """
-    lies = {main: Similarity.identity()}
-    words: defaultdict[int, list[_Word]] = defaultdict(list)
+    S_common_map = {main: Similarity.identity()}
+    hypotheses: defaultdict[int, list[_Hypothesis]] = defaultdict(list)
     latest: int | None = main
     while latest is not None:
         for loop in loops:
             maps = {map_of[loop.past], map_of[loop.new]}
-            if latest in maps and (number := next(iter(maps - set(lies)), None)) is not None:
-                words[number].append(_word(T_world_camera, map_of, loop, lies, number))
+            if latest in maps and (number := next(iter(maps - set(S_common_map)), None)) is not None:
+                hypotheses[number].append(_hypothesis(T_world_camera, map_of, loop, S_common_map, number))
         latest, most = None, 0
-        for number in sorted(set(words) - set(lies)):
-            supported, world = _best(words[number], depth_mm)
-            if supported > most:
-                latest, most, best = number, supported, world
+        for number in sorted(set(hypotheses) - set(S_common_map)):
+            support, found = _best(hypotheses[number], depth_mm)
+            if support > most:
+                latest, most, best = number, support, found
         if latest is not None:
-            lies[latest] = best
-    return _from_the_first(T_world_camera, map_of, lies)
+            S_common_map[latest] = best
+    return _with_first_pose_kept(T_world_camera, map_of, S_common_map)
 
 
-def _word(
-    T_world_camera: np.ndarray, map_of: Sequence[int], loop: Loop, lies: dict[int, Similarity], number: int
-) -> _Word:
-    """What a loop between map `number` and one whose place is known says of the former."""
+def _hypothesis(
+    T_world_camera: np.ndarray, map_of: Sequence[int], loop: Loop, S_common_map: dict[int, Similarity], number: int
+) -> _Hypothesis:
+    """Return Sim(3) of map `number` by a loop to a map whose Sim(3) is known."""
     T_new = T_world_camera[loop.past] @ inverse(loop.T_new_past)
     scale = float(np.exp(-loop.log_ratio))
     R = T_new[:3, :3] @ T_world_camera[loop.new, :3, :3].T
-    new_in_past = Similarity(scale, R, T_new[:3, 3] - scale * R @ T_world_camera[loop.new, :3, 3])
+    S_past_new = Similarity(scale, R, T_new[:3, 3] - scale * R @ T_world_camera[loop.new, :3, 3])
     past, new = map_of[loop.past], map_of[loop.new]
     if new == number:
-        return _Word(lies[past].after(new_in_past), T_world_camera[loop.new], loop.new, loop.past)
-    return _Word(lies[new].after(new_in_past.inverse()), T_world_camera[loop.past], loop.past, loop.new)
+        return _Hypothesis(S_common_map[past].after(S_past_new), T_world_camera[loop.new], loop.new, loop.past)
+    return _Hypothesis(S_common_map[new].after(S_past_new.inverse()), T_world_camera[loop.past], loop.past, loop.new)
 
 
-def _best(words: Sequence[_Word], depth_mm: float) -> tuple[int, Similarity]:
-    """Return what most loops agree on, and how many keyframes do, on the side that has fewer; 0: nothing is believed.
+def _best(hypotheses: Sequence[_Hypothesis], depth_mm: float) -> tuple[int, Similarity]:
+    """Return the largest number of agreeing keyframes, on the side with fewer, and Sim(3); 0: none is accepted.
 
-    Two loops agree where they put the keyframe that the second one looked at in the same place.
+    Two hypotheses agree if they give the second one's keyframe a similar position, with similar rotation and scale.
     """
-    scale = np.array([word.lies.scale for word in words])
-    R, t = np.stack([word.lies.R for word in words]), np.stack([word.lies.t for word in words])
-    T = np.stack([word.T_map_camera for word in words])
-    own, other = np.array([word.own for word in words]), np.array([word.other for word in words])
-    place = scale[:, None] * np.einsum("nij,nj->ni", R, T[:, :3, 3]) + t
+    scale = np.array([hypothesis.S_common_map.scale for hypothesis in hypotheses])
+    R, t = (np.stack([getattr(hypothesis.S_common_map, name) for hypothesis in hypotheses]) for name in ("R", "t"))
+    centre = np.stack([hypothesis.T_map_camera for hypothesis in hypotheses])[:, :3, 3]
+    own, other = (np.array([getattr(hypothesis, name) for hypothesis in hypotheses]) for name in ("own", "other"))
+    position = scale[:, None] * np.einsum("nij,nj->ni", R, centre) + t
     best = (0, Similarity.identity())
-    for k, word in enumerate(words):
-        if not abs(np.log(word.lies.scale)) < _LARGEST_LOG_SCALE:
+    for k, (S_common_map, *_) in enumerate(hypotheses):
+        if not abs(np.log(S_common_map.scale)) < _MAX_LOG_SCALE:
             continue
-        # The trace of the turn between two rotations is 1 + 2 cos of its angle.
-        turn_rad = np.arccos(np.clip((np.einsum("ij,nij->n", R[k], R) - 1) / 2, -1, 1))
-        way = np.linalg.norm(word.lies.transform_points(T[:, :3, 3]) - place, axis=1) / depth_mm
-        alike = (turn_rad < _ALIKE[0]) & (way < _ALIKE[1]) & (np.abs(np.log(scale / scale[k])) < _ALIKE[2])
-        supported = min(len(np.unique(own[alike])), len(np.unique(other[alike])))
-        if supported >= _LEAST_AGREEING and supported > best[0]:
-            best = (supported, word.lies)
+        # The trace of a relative rotation is 1 + 2 cos of its angle.
+        angle_rad = np.arccos(np.clip((np.einsum("ij,nij->n", R[k], R) - 1) / 2, -1, 1))
+        distance = np.linalg.norm(S_common_map.transform_points(centre) - position, axis=1) / depth_mm
+        log_ratio = np.abs(np.log(scale / scale[k]))
+        agree = np.all(
+            [d < limit for d, limit in zip((angle_rad, distance, log_ratio), _MAX_DIFFERENCE, strict=True)], 0
+        )
+        support = min(len(np.unique(own[agree])), len(np.unique(other[agree])))
+        if support >= _MIN_SUPPORT and support > best[0]:
+            best = (support, S_common_map)
     return best
 
 
-def _from_the_first(
-    T_world_camera: np.ndarray, map_of: Sequence[int], lies: dict[int, Similarity]
+def _with_first_pose_kept(
+    T_world_camera: np.ndarray, map_of: Sequence[int], S_common_map: dict[int, Similarity]
 ) -> dict[int, Similarity]:
-    """Return the same with the first keyframe's pose as it was in its own map."""
-    first = next(k for k, number in enumerate(map_of) if number in lies)
-    moved = T_world_camera[first] @ inverse(lies[map_of[first]].transform_poses(T_world_camera[first]))
-    common = Similarity(1.0, moved[:3, :3], moved[:3, 3])
-    return {number: common.after(world) for number, world in lies.items()}
+    """Return the same with the common world moved so that the first keyframe has the pose of its own map."""
+    first = next(k for k, number in enumerate(map_of) if number in S_common_map)
+    motion = T_world_camera[first] @ inverse(S_common_map[map_of[first]].transform_poses(T_world_camera[first]))
+    moved = Similarity(1.0, motion[:3, :3], motion[:3, 3])
+    return {number: moved.after(S) for number, S in S_common_map.items()}

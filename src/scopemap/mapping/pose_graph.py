@@ -1,19 +1,19 @@
-"""Pose graph: what loops say is spread over all keyframes, so that the adjustment can begin from close by.
+"""Pose graph optimisation over Sim(3): loop closures spread over all keyframes, as the start of bundle adjustment.
 
-Every keyframe has a pose and a scale of its depth, so a similarity. An edge from keyframe i to j says where j was as
-seen from i, in the millimetres of i's depth, and how j's depth compares:
+Every keyframe has a pose and a depth scale exp(s). An edge from keyframe i to j is the relative pose T_ij in the
+millimetres of i's depth and the ratio exp(r_ij) of their depth scales:
 
-    rotation   log(R_ij^T R_i^T R_j)                     over its standard deviation
-    position   R_i^T (p_j - p_i) / exp(s_i) - t_ij       over its standard deviation
-    scale      s_j - s_i - r_ij                          over its standard deviation
+    rotation      log(R_ij^T R_i^T R_j)                     over its standard deviation
+    translation   R_i^T (p_j - p_i) / exp(s_i) - t_ij       over its standard deviation
+    scale         s_j - s_i - r_ij                          over its standard deviation
 
-Neighbours are joined by what was tracked (r = 0), the ends of loops by what their landmarks say. Cauchy's loss lets a
-false loop, or a slip of the tracker, give way. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular
-SLAM", RSS 2010.
+Edges are the tracked motions (r = 0) and the loop closures. Cauchy's loss makes false loops and tracking failures
+outliers. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,27 +23,26 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.mapping.loop_closure import Loop
+from scopemap.mapping.pose_interpolation import TrackedPose
 
-_OWN = 7
-# Standard deviations of an edge: rad, share of the scene's depth, ln. Their ratio is what counts.
-_TRACKED = (0.01, 0.02, 0.03)
-_LOOP = (0.02, 0.03, 0.05)
-# Of Cauchy's loss, in standard deviations. Wide at first: after much drift a true loop looks as false as a false one.
+_UNKNOWNS = 7  # of a keyframe: rotation, position, ln scale
+# Standard deviations of an edge: rad, share of the scene's depth, ln. Only their ratio matters.
+_TRACKED_SIGMA = (0.01, 0.02, 0.03)
+_LOOP_SIGMA = (0.02, 0.03, 0.05)
+# Of Cauchy's loss, in standard deviations. Wide at first: after much drift a true loop has errors as large as a false.
 _TOLERANCES = (100.0, 10.0, 1.0)
-_MOST_CALLS = 20
-_BELIEVED = 3.0  # root mean square error, in standard deviations, up to which a loop has been closed
+_MAX_EVALUATIONS = 20
+_MAX_LOOP_ERROR = 3.0  # root mean square, in standard deviations, of an accepted loop
+# A loop whose error as tracked exceeds this share of path length plus depth cannot be drift.
+_MAX_DRIFT_SHARE = 0.5
 
 
-# A loop that says more than that share of the way between its ends (and of the depth) was never walked is not believed.
-_MOST_OF_THE_WAY = 0.5
-
-
-class Graph(NamedTuple):
-    """Poses T_world_camera (K, 4, 4) and ln of the depth scales (K,) of all keyframes; how many loops were believed."""
+class PoseGraph(NamedTuple):
+    """Poses T_world_camera (K, 4, 4), ln of the depth scales (K,), and the number of accepted loops."""
 
     T_world_camera: np.ndarray
     log_scale: np.ndarray
-    believed: int
+    accepted_loops: int
 
 
 class _Edges(NamedTuple):
@@ -54,30 +53,50 @@ class _Edges(NamedTuple):
     sigma: np.ndarray  # (E, 7)
 
 
-def spread_loops(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float) -> Graph:
-    """Return poses and scales that agree best with the tracked motions and the loops; the first keyframe stays.
+def tracked_pairs(frames: Sequence[int], tracked: Sequence[TrackedPose]) -> np.ndarray:
+    """Return pairs (C, 2) int of keyframes between which the motion was tracked.
+
+    The first of a pair is the keyframe that the second was aligned to, or, where that is no keyframe of these, the one
+    before it in its map. frames : numbers of the keyframes' frames, increasing.
+    """
+    place = {frame: k for k, frame in enumerate(frames)}
+    pairs: list[tuple[int, int]] = []
+    latest: dict[int, int] = {}
+    for k, pose in enumerate(tracked):
+        first = place.get(pose.keyframe, k)
+        first = latest.get(pose.map, k) if first >= k else first
+        if first < k:
+            pairs.append((first, k))
+        latest[pose.map] = k
+    return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def optimise_pose_graph(
+    T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float
+) -> PoseGraph:
+    """Return the poses and scales that fit the tracked motions and the loops best; the first keyframe is held.
 
     T_world_camera : (K, 4, 4) as tracked. neighbours : (C, 2) int, pairs between which the motion was tracked.
-    depth_mm : typical depth, the unit of ways.
+    depth_mm : typical depth, the unit of translations.
     """
     count = len(T_world_camera)
-    loops = [loop for loop in loops if _plausible(T_world_camera, loop, depth_mm)]
+    loops = [loop for loop in loops if _explained_by_drift(T_world_camera, loop, depth_mm)]
     edges = _edges(T_world_camera, neighbours, loops, depth_mm)
-    turns, places = Rotation.from_matrix(T_world_camera[:, :3, :3]), T_world_camera[:, :3, 3] / depth_mm
+    rotations, positions = Rotation.from_matrix(T_world_camera[:, :3, :3]), T_world_camera[:, :3, 3] / depth_mm
 
     def state(x: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
-        own = np.vstack([np.zeros(_OWN), x.reshape(-1, _OWN)])
-        return turns * Rotation.from_rotvec(own[:, :3]), places + own[:, 3:6], own[:, 6]
+        own = np.vstack([np.zeros(_UNKNOWNS), x.reshape(-1, _UNKNOWNS)])
+        return rotations * Rotation.from_rotvec(own[:, :3]), positions + own[:, 3:6], own[:, 6]
 
     def errors(x: np.ndarray) -> np.ndarray:
         R, p, s = state(x)
-        back = R[edges.i].inv()
-        turn = (Rotation.from_matrix(edges.T[:, :3, :3]).inv() * back * R[edges.j]).as_rotvec()
-        way = back.apply(p[edges.j] - p[edges.i]) * np.exp(-s[edges.i])[:, None] - edges.T[:, :3, 3]
+        R_i_world = R[edges.i].inv()
+        rotation = (Rotation.from_matrix(edges.T[:, :3, :3]).inv() * R_i_world * R[edges.j]).as_rotvec()
+        translation = R_i_world.apply(p[edges.j] - p[edges.i]) * np.exp(-s[edges.i])[:, None] - edges.T[:, :3, 3]
         scale = s[edges.j] - s[edges.i] - edges.log_ratio
-        return (np.column_stack([turn, way, scale]) / edges.sigma).ravel()
+        return (np.column_stack([rotation, translation, scale]) / edges.sigma).ravel()
 
-    x, pattern = np.zeros(_OWN * (count - 1)), _pattern(edges, count)
+    x, pattern = np.zeros(_UNKNOWNS * (count - 1)), _sparsity(edges, count)
     for tolerance in _TOLERANCES:
         x = least_squares(
             errors,
@@ -86,44 +105,45 @@ def spread_loops(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list
             loss="cauchy",
             f_scale=tolerance,
             ftol=1e-4,
-            max_nfev=_MOST_CALLS,
+            max_nfev=_MAX_EVALUATIONS,
             tr_solver="lsmr",
             # Long chains are stiff: with lsmr's own tolerances steps end far too early.
             tr_options={"atol": 1e-12, "btol": 1e-12, "maxiter": 1000},
         ).x
     R, p, s = state(x)
-    poses = [se3(turn, depth_mm * place) for turn, place in zip(R.as_matrix(), p, strict=True)]
-    left = np.linalg.norm(errors(x).reshape(-1, _OWN)[len(neighbours) :], axis=1) / np.sqrt(_OWN)
-    return Graph(np.stack(poses), s, int((left < _BELIEVED).sum()))
+    poses = [se3(rotation, depth_mm * position) for rotation, position in zip(R.as_matrix(), p, strict=True)]
+    loop_error = np.linalg.norm(errors(x).reshape(-1, _UNKNOWNS)[len(neighbours) :], axis=1) / np.sqrt(_UNKNOWNS)
+    return PoseGraph(np.stack(poses), s, int((loop_error < _MAX_LOOP_ERROR).sum()))
 
 
-def _plausible(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:
-    """Whether drift can be all that keeps the ends of a loop from where it says they are."""
-    here = T_world_camera[loop.past : loop.new + 1, :3, 3]
-    way_mm = float(np.linalg.norm(np.diff(here, axis=0), axis=1).sum())
+def _explained_by_drift(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:
+    """Whether drift along the path can explain the difference between a loop and the tracked poses."""
+    positions = T_world_camera[loop.past : loop.new + 1, :3, 3]
+    path_mm = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     T = T_world_camera[loop.new] @ loop.T_new_past
-    off_mm = float(np.linalg.norm(T[:3, 3] - T_world_camera[loop.past][:3, 3]))
-    return off_mm <= _MOST_OF_THE_WAY * (way_mm + depth_mm)
+    error_mm = float(np.linalg.norm(T[:3, 3] - T_world_camera[loop.past][:3, 3]))
+    return error_mm <= _MAX_DRIFT_SHARE * (path_mm + depth_mm)
 
 
 def _edges(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float) -> _Edges:
-    """Edges between neighbours and of loops, ways in units of `depth_mm`."""
+    """Edges of tracked motions, then of loops, translations in units of `depth_mm`."""
     steps = inverse(T_world_camera[neighbours[:, 0]]) @ T_world_camera[neighbours[:, 1]]
     i = np.append(neighbours[:, 0], [loop.past for loop in loops]).astype(int)
     j = np.append(neighbours[:, 1], [loop.new for loop in loops]).astype(int)
     T = np.concatenate([steps, *(inverse(loop.T_new_past)[None] for loop in loops)])
     T[:, :3, 3] /= depth_mm
-    # The new one's depth is too large by its ratio: its scale has to be smaller.
+    # The new keyframe's depth is too large by its ratio: its scale has to be smaller.
     ratio = np.append(np.zeros(len(steps)), [-loop.log_ratio for loop in loops])
-    sigma = np.array([_TRACKED] * len(steps) + [_LOOP] * len(loops))
+    sigma = np.array([_TRACKED_SIGMA] * len(steps) + [_LOOP_SIGMA] * len(loops))
     return _Edges(i, j, T, ratio, np.repeat(sigma, (3, 3, 1), axis=1))
 
 
-def _pattern(edges: _Edges, count: int) -> lil_matrix:
-    """Which error depends on which unknown; the first keyframe has none."""
-    pattern = lil_matrix((_OWN * len(edges.i), _OWN * (count - 1)), dtype=np.int8)
+def _sparsity(edges: _Edges, count: int) -> lil_matrix:
+    """Pattern of the Jacobian: which error depends on which unknown; the first keyframe has none."""
+    pattern = lil_matrix((_UNKNOWNS * len(edges.i), _UNKNOWNS * (count - 1)), dtype=np.int8)
     for row, ends in enumerate(zip(edges.i, edges.j, strict=True)):
         for k in ends:
             if k > 0:
-                pattern[_OWN * row : _OWN * (row + 1), _OWN * (k - 1) : _OWN * k] = 1
+                rows, columns = (slice(_UNKNOWNS * n, _UNKNOWNS * (n + 1)) for n in (row, k - 1))
+                pattern[rows, columns] = 1
     return pattern

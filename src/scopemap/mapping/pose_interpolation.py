@@ -1,4 +1,4 @@
-"""From corrected keyframes to every frame: those on the way from one to the next take a share of both corrections."""
+"""Propagated correction: poses and depth of all frames, interpolated between the adjusted keyframes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
-from scopemap.mapping.depth_correction import DepthGrid
+from scopemap.mapping.depth_correction import DepthCorrectionField
 
 _AT_REST = 1e-6  # rad
 
 
 class TrackedPose(NamedTuple):
-    """How a frame was tracked.
+    """A frame's pose as tracked.
 
-    map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), its pose in
-    that map's world. segment : the same number for all frames between which the camera was not lost.
+    map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), in that
+    map's world. segment : the same number for all frames between which the camera was not lost.
     """
 
     map: int
@@ -29,18 +29,17 @@ class TrackedPose(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Correction:
-    """What the adjustment changed.
+class FrameCorrection:
+    """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
 
     Attributes
     ----------
-    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), takes the common world as
+    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
-    robust standard deviation of the reprojection errors; NaN where nothing was observed twice. refused : why nothing is
-    changed, "" where it is. loops : accepted loop closures. grids : (K,) what the depth of each pixel is multiplied by
-    besides; (): nothing. S_common_map : by number of each merged map, Sim(3) from its world to the common one.
-    tracked : by number of the frame, how it was tracked, where that is known. depth_mm : typical depth, the unit of
-    translations beside rotations in rad.
+    robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,
+    "" where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's depth;
+    (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as
+    tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
     """
 
     index: np.ndarray
@@ -49,28 +48,27 @@ class Correction:
     sigma_px: float = float("nan")
     refused: str = ""
     loops: int = 0
-    grids: tuple[DepthGrid, ...] = ()
+    depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
 
     @property
     def description(self) -> str:
-        """One sentence for the provenance: what was adjusted, and what of it did not agree."""
+        """One sentence for the provenance: what was adjusted and how well it fits, or why nothing was."""
         if not np.isfinite(self.sigma_px):
-            return f"back end: nothing linked the {len(self.index)} keyframes; poses are as tracked"
+            return f"mapping: poses are as tracked; the {len(self.index)} keyframes have no common observations"
         if self.refused:
-            return (
-                f"back end: poses are as tracked; even adjusted, {self.refused}: tissue that moves by itself, or "
-                "another focal length"
-            )
-        turn_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
-        closed = f", {self.loops} loops closed" if self.loops else ""
-        closed += f", {len(self.S_common_map)} maps joined" if len(self.S_common_map) > 1 else ""
-        return (
-            f"back end: {len(self.index)} keyframes adjusted, turned by up to {turn_deg:.1f} deg{closed}; points seen "
-            f"again lie {self.sigma_px:.2f} px from where they should{self._bent()}"
-        )
+            return f"mapping: poses are as tracked; the scene is not rigid or the focal length is wrong: {self.refused}"
+        rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
+        text = f"mapping: {len(self.index)} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg"
+        text += f", {self.loops} loops closed" if self.loops else ""
+        text += f", {len(self.S_common_map)} maps merged" if len(self.S_common_map) > 1 else ""
+        text += f"; reprojection errors {self.sigma_px:.2f} px (robust standard deviation)"
+        if self.depth_fields:
+            typical = np.median([np.abs(depth_field.values).mean() for depth_field in self.depth_fields])
+            text += f"; depth corrected by {100 * np.expm1(typical):.0f} % on average"
+        return text
 
     def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the corrected pose (4, 4) of the frame with this number."""
@@ -80,90 +78,77 @@ class Correction:
         return mean_near(poses[0], [poses[1]], [share])
 
     def depth_factor(self, index: int) -> float:
-        """Return what all depth of the frame with this number is to be multiplied by, before what its grids ask for."""
+        """Return the factor of the whole depth of the frame with this number, without its depth correction field."""
         before, after, share = self._between(index)
         log_scale = (1 - share) * self.log_scale[before] + share * self.log_scale[after]
         return float(np.exp(log_scale)) * self._world(index).scale
 
     def depth_factors(self, index: int, depth_mm: np.ndarray) -> np.ndarray:
-        """Return what each pixel's depth (H, W) mm is to be multiplied by, float32; NaN where depth is unknown."""
+        """Return the factors (H, W) float32 of depth (H, W) mm; NaN where depth is unknown."""
         factor = np.float32(self.depth_factor(index))
-        if not self.grids:
+        if not self.depth_fields:
             return np.full(depth_mm.shape, factor, np.float32)
         before, after, share = self._between(index)
         depth_mm = depth_mm * np.float32(self._world(index).scale)
-        log = self.grids[before].log_factor(depth_mm)
+        log = self.depth_fields[before].log_factor(depth_mm)
         if after != before:
-            log = (1 - share) * log + share * self.grids[after].log_factor(depth_mm)
+            log = (1 - share) * log + share * self.depth_fields[after].log_factor(depth_mm)
         return factor * np.exp(log.astype(np.float32))
 
     def _world(self, index: int) -> Similarity:
-        """How the world of a frame's map lies in the common one."""
+        """Sim(3) from the world of a frame's map to the common one."""
         tracked = self.tracked.get(index)
         return self.S_common_map.get(0 if tracked is None else tracked.map, Similarity.identity())
 
-    def _bent(self) -> str:
-        """How far the grids go, for the description; nothing where there are none."""
-        if not self.grids:
-            return ""
-        typical = np.median([np.abs(grid.values).mean() for grid in self.grids])
-        return f"; depth corrected by {100 * np.expm1(typical):.0f} % on average"
-
     def _between(self, index: int) -> tuple[int, int, float]:
-        """Numbers of the two keyframes that a frame moves with, and its share of the second's correction.
+        """Two keyframes whose corrections a frame interpolates, and the weight of the second.
 
-        A frame moves with the keyframe that it was aligned to, and more and more with the next one, if that was aligned
-        to the same: as much as the camera had moved by then. (Where a recording was cut that is all at once, and what
-        is wrong with the jump is wrong from there on.) Where the camera was lost between them, or found again by an
-        older keyframe, what is wrong with that is wrong from there on, too: with all that was aligned to the same.
+        These are the keyframe that the frame was aligned to and the next one, if that was aligned to the same. After a
+        loss, or a relocalisation against an older keyframe, the correction of the next keyframe holds from there on.
         """
         after = int(np.searchsorted(self.index, index))
         if after < len(self.index) and self.index[after] == index:
             return after, after, 0.0
-        own = self._reference(index)
-        if own is not None:
-            if after == len(self.index) or not self._alike(index, int(self.index[after])):
-                return own, own, 0.0
-            if own != after - 1 or self._lost_between(int(self.index[own]), index):
+        reference = self._reference(index)
+        if reference is not None:
+            if after == len(self.index) or not self._same_reference(index, int(self.index[after])):
+                return reference, reference, 0.0
+            if reference != after - 1 or self._lost_between(int(self.index[reference]), index):
                 return after, after, 0.0
         if after == 0 or after == len(self.index):
             nearest = min(after, len(self.index) - 1)
             return nearest, nearest, 0.0
-        return after - 1, after, self._share(index, after - 1, after)
+        return after - 1, after, self._weight(index, after - 1, after)
 
-    def _share(self, index: int, before: int, after: int) -> float:
-        """How far a frame is on the way from one keyframe to the next, by motion; by time where that is not known."""
+    def _weight(self, index: int, before: int, after: int) -> float:
+        """Weight of the second of two keyframes: share of the motion between them; of the time where that is unknown.
+
+        The share of the motion puts the correction of a jump, where a recording was cut, on the frames after it.
+        """
         frames = (int(self.index[before]), index, int(self.index[after]))
         if all(frame in self.tracked for frame in frames):
             first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)
-            there, onwards = self._motion(first, own), self._motion(own, last)
-            if there + onwards > _AT_REST:
-                return there / (there + onwards)
+            motion_before, motion_after = self._motion(first, own), self._motion(own, last)
+            if motion_before + motion_after > _AT_REST:
+                return motion_before / (motion_before + motion_after)
         return (index - frames[0]) / (frames[2] - frames[0])
 
     def _motion(self, T_world_one: np.ndarray, T_world_other: np.ndarray) -> float:
         T = inverse(T_world_one) @ T_world_other
         return float(np.hypot(rotation_angle_rad(T[:3, :3]), np.linalg.norm(T[:3, 3]) / self.depth_mm))
 
-    def _alike(self, index: int, keyframe: int) -> bool:
-        """Whether a frame and a later keyframe were aligned to the same, and the camera was not lost between them."""
+    def _same_reference(self, index: int, keyframe: int) -> bool:
+        """Whether a frame and a later keyframe were aligned to the same one, and the camera was not lost between."""
         same = self._reference(index) == self._reference(keyframe)
         return same and not self._lost_between(index, keyframe)
 
     def _lost_between(self, one: int, other: int) -> bool:
-        return (
-            one in self.tracked and other in self.tracked and self.tracked[one].segment != self.tracked[other].segment
-        )
+        segments = {self.tracked[frame].segment for frame in (one, other) if frame in self.tracked}
+        return len(segments) > 1
 
     def _reference(self, index: int) -> int | None:
-        """Number of the keyframe that a frame was aligned to, where that is known."""
+        """Place in `index` of the keyframe that a frame was aligned to; None where that is unknown."""
         tracked = self.tracked.get(index)
         place = 0 if tracked is None else int(np.searchsorted(self.index, tracked.keyframe))
         known = tracked is not None and place < len(self.index) and self.index[place] == tracked.keyframe
         return place if known else None
-
-
-def unchanged(index: np.ndarray, sigma_px: float, refused: str) -> Correction:
-    """Return the correction of keyframes (K,) that leaves every frame as it is, and says why."""
-    count = len(index)
-    return Correction(index, np.stack([np.eye(4)] * count), np.zeros(count), sigma_px, refused=refused)

@@ -13,7 +13,7 @@ from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.mapping.backend import Backend
-from scopemap.mapping.pose_interpolation import Correction, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.tracking.track import Track
 
 LEAST_FRAMES = 10
@@ -35,7 +35,7 @@ class Submap:
     maps: tuple[int, ...]
     frames: frozenset[int]
     main_frames: frozenset[int]
-    correction: Correction | None = None
+    correction: FrameCorrection | None = None
 
 
 class Mapper:
@@ -96,7 +96,7 @@ class Mapper:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)
 
 
-def corrected_frame(frame: Frame, correction: Correction | None) -> Frame:
+def corrected_frame(frame: Frame, correction: FrameCorrection | None) -> Frame:
     """Return a tracked frame with its pose, its depth and the standard deviation of that corrected."""
     if correction is None:
         return frame

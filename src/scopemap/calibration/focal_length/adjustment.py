@@ -1,11 +1,11 @@
 """Bundle adjustment of one window with an unknown focal length and an unknown distortion of the lens.
 
-It starts from no motion at all and one depth for everything, which small motion forgives (Ha et al., "High-quality
+It starts without motion and with one depth for all points, which converges for small motion (Ha et al., "High-quality
 depth from uncalibrated small motion clip", CVPR 2016), first without distortion and from two focal lengths.
 
-A rotation about the optical axis does not depend on the focal length, and neither does a translation: it shows in how
-far the axis tilts. The standard deviation of ln f is a cluster-robust sandwich over blocks of the image, since
-neighbouring corners err alike.
+Neither a translation nor a rotation about the optical axis determines the focal length; a tilt of the axis does. The
+standard deviation of ln f is a cluster-robust sandwich over blocks of the image, because the errors of neighbouring
+corners are correlated.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scopemap.mapping.reprojection import Observations, Points, Priors, Problem,
 _LOG_DEPTH_SIGMA, _DISTORTION_SIGMA, _LOG_FOCAL_SIGMA = 1.0, 0.3, 1.0
 _NO_DISTORTION_SIGMA = 1e-4
 _START_FOV_DEG = (60.0, 105.0)
-_BLOCKS = 4  # columns and rows of the image whose corners are taken to err alike
-_LEAST_SIGMA_PX = 0.03
+_BLOCKS = 4  # columns and rows of the image within which errors are correlated
+_MIN_SIGMA_PX = 0.03
 _FIRST_ITERATIONS, _ITERATIONS, _MIN_DECREASE = 25, 30, 1e-5
 
 
@@ -44,10 +44,10 @@ class WindowFit:
     distortion: float
 
 
-def adjusted(window: Window, assumed_focal_px: float) -> WindowFit | None:
-    """Return the best fit to a window from all starts; None where the focal length cannot be solved for.
+def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
+    """Return the best fit to a window over all starts; None where the focal length is undetermined.
 
-    assumed_focal_px : expected beforehand, to a factor of e either way.
+    assumed_focal_px : mean of its prior, whose standard deviation is a factor of e.
     """
     problem = _problem(window, assumed_focal_px)
     fits = []
@@ -68,7 +68,7 @@ def adjusted(window: Window, assumed_focal_px: float) -> WindowFit | None:
 
 
 def _problem(window: Window, focal_px: float) -> Problem:
-    """The host is keyframe 0, and its partners follow."""
+    """Return the bundle adjustment of a window: the host is keyframe 0, its partners follow."""
     squeeze = np.array([1.0, window.aspect])
     corners, partners = window.seen.shape[:2]
     corner, partner = np.nonzero(np.isfinite(window.seen).all(-1))
@@ -78,10 +78,11 @@ def _problem(window: Window, focal_px: float) -> Problem:
     observations = Observations(corner, partner + 1, window.seen[corner, partner] / squeeze)
     T_camera_world, neighbours = np.tile(np.eye(4), (partners + 1, 1, 1)), np.zeros((0, 2), int)
     priors = Priors(scale=0.0)
-    return Problem(T_camera_world, points, observations, priors, neighbours, focal_px, least_sigma_px=_LEAST_SIGMA_PX)
+    return Problem(T_camera_world, points, observations, priors, neighbours, focal_px, least_sigma_px=_MIN_SIGMA_PX)
 
 
 def _log_focal_deviation(problem: Problem, state: State) -> float:
+    """Return the cluster-robust standard deviation of ln f, all else marginalised; NaN where it is undetermined."""
     model = linearised(problem, state)
     (block,), free = model.blocks[0], model.free
     matrix = model.reduced()[0][free][:, free].toarray()
@@ -95,6 +96,6 @@ def _log_focal_deviation(problem: Problem, state: State) -> float:
     low, high = pixel.min(0), pixel.max(0)
     cell = np.clip((pixel - low) / np.maximum(high - low, 1e-9) * _BLOCKS, 0, _BLOCKS - 1).astype(int)
     number = cell[:, 0] * _BLOCKS + cell[:, 1]
-    pulls = np.bincount(number, weights=scores @ influence[block.columns], minlength=_BLOCKS**2)
+    influences = np.bincount(number, weights=scores @ influence[block.columns], minlength=_BLOCKS**2)
     filled = len(np.unique(number))
-    return float(np.sqrt((pulls**2).sum() * filled / max(filled - 1, 1)))
+    return float(np.sqrt((influences**2).sum() * filled / max(filled - 1, 1)))

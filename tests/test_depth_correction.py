@@ -1,4 +1,4 @@
-"""The back end's correction of depth: closed forms come back, lies do little harm, what is not known stays."""
+"""Depth correction field: closed forms are recovered, outliers do little harm, unknown depth stays unknown."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
+from scopemap.config.mapping import MappingAdvanced
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.mapping import LARGEST_LOG_FACTOR, Backend, Correction
-from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthGrid, fit_grid
+from scopemap.mapping import MAX_LOG_FACTOR, Backend, FrameCorrection
+from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
 from scopemap.mapping.submaps import corrected_frame
 
 HEIGHT, WIDTH = 120, 160
@@ -29,82 +30,88 @@ def _image(rng: np.random.Generator) -> np.ndarray:
 
 
 def _bend(x: np.ndarray, y: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
-    """An error that is linear in everything, which a trilinear grid can follow exactly."""
+    """An error that is linear in position and ln depth, which a trilinear grid represents exactly."""
     return 0.3 * (x - 0.5) - 0.2 * (y - 0.5) + 0.1 * (log_depth - np.log(40))
 
 
-def test_an_error_linear_in_place_and_ln_depth_is_found_everywhere() -> None:
+def test_an_error_linear_in_position_and_ln_depth_is_recovered() -> None:
     rng = np.random.default_rng(0)
     places, log_depth = _points(rng, 3000)
     error = _bend(*places.T, log_depth)
-    grid = fit_grid(places, log_depth, error, np.full(len(error), 0.005), step_sigma=0.3)
+    field = fit_depth_correction(places, log_depth, error, np.full(len(error), 0.005), step_sigma=0.3)
     depth_mm = _image(rng)
     y, x = (np.mgrid[:HEIGHT, :WIDTH] + 0.5) / np.reshape([HEIGHT, WIDTH], (2, 1, 1))
-    off = grid.log_factor(depth_mm) - _bend(x, y, np.log(depth_mm))
+    off = field.log_factor(depth_mm) - _bend(x, y, np.log(depth_mm))
     assert np.abs(off).mean() < 0.005
     assert np.abs(off).max() < 0.05
 
 
-def test_organs_at_two_depths_get_a_factor_each_where_they_meet() -> None:
+def test_surfaces_at_two_depths_get_separate_factors_where_they_overlap() -> None:
     rng = np.random.default_rng(1)
     places = rng.random((800, 2))
     near = rng.random(800) < 0.5
-    grid = fit_grid(places, np.where(near, np.log(30), np.log(70)), np.where(near, 0.3, -0.2), np.full(800, 0.01), 0.2)
+    field = fit_depth_correction(
+        places, np.where(near, np.log(30), np.log(70)), np.where(near, 0.3, -0.2), np.full(800, 0.01), 0.2
+    )
     depth_mm = np.full((HEIGHT, WIDTH), 70, np.float32)
     depth_mm[::2] = 30
-    found = grid.log_factor(depth_mm)
+    found = field.log_factor(depth_mm)
     np.testing.assert_allclose(found[::2], 0.3, atol=0.02)
     np.testing.assert_allclose(found[1::2], -0.2, atol=0.02)
 
 
-def test_a_quarter_of_lying_points_does_little_harm() -> None:
+def test_a_quarter_of_outliers_does_little_harm() -> None:
     rng = np.random.default_rng(2)
     places, log_depth = _points(rng)
     error = _bend(*places.T, log_depth)
-    told = np.where(rng.random(len(error)) < 0.25, error + rng.normal(0, 1.0, len(error)), error)
-    grids = [fit_grid(places, log_depth, e, np.full(len(e), 0.02), 0.1) for e in (error, told)]
+    noisy = np.where(rng.random(len(error)) < 0.25, error + rng.normal(0, 1.0, len(error)), error)
+    fields = [fit_depth_correction(places, log_depth, e, np.full(len(e), 0.02), 0.1) for e in (error, noisy)]
     depth_mm = _image(rng)
-    clean, spoilt = (grid.log_factor(depth_mm) for grid in grids)
+    clean, spoilt = (field.log_factor(depth_mm) for field in fields)
     assert np.abs(clean - spoilt).mean() < 0.015
 
 
-def test_points_that_know_nothing_change_nothing() -> None:
+def test_uncertain_points_change_nothing() -> None:
     rng = np.random.default_rng(3)
     places, log_depth = _points(rng)
     wild = rng.normal(0, 1, len(log_depth))
     for sigma in (np.full(len(wild), np.inf), np.full(len(wild), 1e3)):
-        grid = fit_grid(places, log_depth, wild, sigma, 0.1)
-        assert np.abs(grid.log_factor(_image(rng))).max() < 1e-3
+        field = fit_depth_correction(places, log_depth, wild, sigma, 0.1)
+        assert np.abs(field.log_factor(_image(rng))).max() < 1e-3
 
 
 def test_fewer_than_ten_points_change_nothing() -> None:
     places, log_depth = _points(np.random.default_rng(4), 9)
-    grid = fit_grid(places, log_depth, np.full(9, 0.3), np.full(9, 0.01), 0.1)
-    np.testing.assert_array_equal(grid.values, 0)
+    field = fit_depth_correction(places, log_depth, np.full(9, 0.3), np.full(9, 0.01), 0.1)
+    np.testing.assert_array_equal(field.values, 0)
 
 
-def test_one_depth_for_all_points_is_no_division_by_nothing() -> None:
+def test_points_of_equal_depth_do_not_divide_by_zero() -> None:
     places, _ = _points(np.random.default_rng(5))
-    grid = fit_grid(places, np.full(len(places), 3.7), np.full(len(places), 0.2), np.full(len(places), 0.01), 0.1)
-    np.testing.assert_allclose(grid.log_factor(np.full((8, 8), np.exp(3.7), np.float32)), 0.2, atol=0.01)
+    field = fit_depth_correction(
+        places, np.full(len(places), 3.7), np.full(len(places), 0.2), np.full(len(places), 0.01), 0.1
+    )
+    np.testing.assert_allclose(field.log_factor(np.full((8, 8), np.exp(3.7), np.float32)), 0.2, atol=0.01)
 
 
 @given(st.floats(-3, 3), st.floats(0.01, 1.0), st.integers(0, 2**32 - 1))
-def test_no_factor_is_beyond_the_limit_and_unknown_depth_stays_unknown(error: float, step: float, seed: int) -> None:
+def test_factors_are_bounded_and_unknown_depth_stays_unknown(error: float, step: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     places, log_depth = _points(rng, 60)
-    grid = fit_grid(places, log_depth, np.full(60, error), np.full(60, 0.01), step)
+    field = fit_depth_correction(places, log_depth, np.full(60, error), np.full(60, 0.01), step)
     depth_mm = np.exp(rng.uniform(-3, 9, (20, 30))).astype(np.float32)
     depth_mm[rng.random(depth_mm.shape) < 0.3] = np.nan
-    found = grid.log_factor(depth_mm)
+    found = field.log_factor(depth_mm)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(found), np.isnan(depth_mm))
-    assert np.nanmax(np.abs(found), initial=0) <= LARGEST_LOG_FACTOR + 1e-5
+    assert np.nanmax(np.abs(found), initial=0) <= MAX_LOG_FACTOR + 1e-5
 
 
-def test_a_frame_between_two_keyframes_takes_a_share_of_both_grids() -> None:
-    grids = tuple(DepthGrid(np.full((ROWS, COLUMNS, LEVELS), value), 3.0, 4.0) for value in (0.1, 0.3))
-    correction = Correction(np.array([10, 20]), np.stack([np.eye(4)] * 2), np.array([0.0, 0.2]), 0.2, grids=grids)
+def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
+    fields = tuple(DepthCorrectionField(np.full((ROWS, COLUMNS, LEVELS), value), 3.0, 4.0) for value in (0.1, 0.3))
+    correction = FrameCorrection(
+        np.array([10, 20]), np.stack([np.eye(4)] * 2), np.array([0.0, 0.2]), 0.2, depth_fields=fields
+    )
     depth_mm = np.array([[30.0, np.nan]], np.float32)
     for index, log in ((0, 0.1), (10, 0.1), (15, 0.2 + 0.1), (20, 0.3 + 0.2), (99, 0.3 + 0.2)):
         np.testing.assert_allclose(correction.depth_factors(index, depth_mm), np.exp([[log, np.nan]]), rtol=1e-5)
@@ -125,7 +132,7 @@ def test_a_frame_between_two_keyframes_takes_a_share_of_both_grids() -> None:
 
 
 def _bent(number: int) -> Frame:
-    """View of the plane whose depth is bent, as a network's is: up to 30 % off, differently from left to right."""
+    """View of the plane whose depth is wrong by up to 30 %, varying from left to right, as a network's is."""
     at = (2.0 * number, 0.6 * number, 0.5 * number)
     view = plane_scene.see(plane_scene.pose(at_mm=at, turn_rad=(0.01 * number, -0.01 * number, 0.02 * number)))
     assert view.depth_mm is not None
@@ -135,18 +142,18 @@ def _bent(number: int) -> Frame:
 
 
 def _shape_error(frame: Frame, factors: np.ndarray) -> float:
-    """Mean error of depth, its scale set right."""
+    """Mean error of ln depth after alignment of its scale."""
     assert frame.T_world_camera is not None
     assert frame.depth_mm is not None
     off = np.log(frame.depth_mm * factors / plane_scene.see(frame.T_world_camera).depth_mm)
     return float(np.abs(off - np.median(off)).mean())
 
 
-def test_bent_depth_of_a_plane_seen_from_six_places_is_straightened() -> None:
+def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
     frames = [_bent(number) for number in range(6)]
     results = {}
     for step_sigma in (0.0, 0.1):
-        backend = Backend(MappingSettings(depth_step_sigma=step_sigma), DisFlow())
+        backend = Backend(MappingSettings(advanced=MappingAdvanced(depth_step_sigma=step_sigma)), DisFlow())
         for frame in frames:
             backend.add(frame)
         correction = backend.adjust()
@@ -156,8 +163,8 @@ def test_bent_depth_of_a_plane_seen_from_six_places_is_straightened() -> None:
     assert max(results[0.1]) < 0.3 * min(results[0.0])
 
 
-def test_where_the_adjustment_is_refused_depth_stays_too() -> None:
-    backend = Backend(MappingSettings(max_sigma_px=1e-6), DisFlow())
+def test_depth_stays_where_the_adjustment_is_refused() -> None:
+    backend = Backend(MappingSettings(advanced=MappingAdvanced(max_sigma_px=1e-6)), DisFlow())
     frames = [_bent(number) for number in range(4)]
     for frame in frames:
         backend.add(frame)
@@ -166,7 +173,7 @@ def test_where_the_adjustment_is_refused_depth_stays_too() -> None:
     np.testing.assert_array_equal(correction.depth_factors(2, frames[2].depth_mm), 1.0)
 
 
-def test_a_camera_that_only_turns_tells_nothing_of_depth() -> None:
+def test_pure_rotation_does_not_change_depth() -> None:
     backend = Backend(MappingSettings(), DisFlow())
     frames = []
     for number in range(5):

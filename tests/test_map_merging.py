@@ -1,4 +1,4 @@
-"""Maps put into one world: known similarities come back, and what only one loop says is not believed."""
+"""Map merging: known Sim(3) are recovered, and a single loop closure is not accepted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
 from scopemap.mapping.loop_closure import Loop
-from scopemap.mapping.map_merging import join_maps
+from scopemap.mapping.map_merging import merge_maps
 
 DEPTH_MM = 50.0
 # Of nine keyframes; the second map is left and entered again.
@@ -21,24 +21,26 @@ few = settings(max_examples=25, deadline=None)
 
 
 class _Scene:
-    """Keyframes of one true world, each told in the world and the millimetres of its map."""
+    """Keyframes with true poses, and their poses in the world and the millimetres of their map."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         twists = np.column_stack([rng.normal(0, 0.3, (len(MAP_OF), 3)), rng.normal(0, 15, (len(MAP_OF), 3))])
         self.true = np.stack([se3_exp(twist) for twist in twists])
         self.true[0] = np.eye(4)
-        # What takes the true world to each map's.
-        self.told = {
+        # Sim(3) from the true world to each map's.
+        self.S_map_true = {
             number: Similarity(
                 float(np.exp(rng.uniform(-0.45, 0.45))), so3_exp(rng.normal(size=3)), rng.normal(0, 40, 3)
             )
             for number in (1, 2)
         } | {0: Similarity.identity()}
-        self.poses = np.stack([self.told[m].transform_poses(pose) for m, pose in zip(MAP_OF, self.true, strict=True)])
+        self.poses = np.stack(
+            [self.S_map_true[m].transform_poses(pose) for m, pose in zip(MAP_OF, self.true, strict=True)]
+        )
 
     def loop(self, past: int, new: int) -> Loop:
-        scale_past, scale_new = (self.told[MAP_OF[k]].scale for k in (past, new))
+        scale_past, scale_new = (self.S_map_true[MAP_OF[k]].scale for k in (past, new))
         T_new_past = inverse(self.true[new]) @ self.true[past]
         T_new_past[:3, 3] *= scale_past
         nothing = np.zeros((0, 2))
@@ -46,18 +48,18 @@ class _Scene:
 
 
 def _common(scene: _Scene, worlds: dict[int, Similarity]) -> dict[int, np.ndarray]:
-    """Where the keyframes of the joined maps are in the common world."""
+    """Poses of the merged maps' keyframes in the common world."""
     own = {k: number for k, number in enumerate(MAP_OF) if number in worlds}
     return {k: worlds[number].transform_poses(scene.poses[k]) for k, number in own.items()}
 
 
 @few
 @given(seeds)
-def test_maps_come_to_lie_as_they_truly_do(seed: int) -> None:
+def test_true_relative_poses_of_maps_are_recovered(seed: int) -> None:
     scene = _Scene(seed)
-    # The third map is tied to the second only, by loops in both directions of time.
+    # The third map is connected to the second only, by loops in both directions of time.
     loops = [scene.loop(0, 3), scene.loop(2, 7), scene.loop(4, 5), scene.loop(6, 8)]
-    worlds = join_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)
+    worlds = merge_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)
     assert sorted(worlds) == [0, 1, 2]
     for k, pose in _common(scene, worlds).items():
         np.testing.assert_allclose(pose, scene.true[k], atol=1e-6)
@@ -65,20 +67,20 @@ def test_maps_come_to_lie_as_they_truly_do(seed: int) -> None:
 
 @few
 @given(seeds)
-def test_the_first_keyframe_stays_and_millimetres_are_the_main_maps(seed: int) -> None:
+def test_first_keyframe_is_held_and_the_unit_is_the_main_maps(seed: int) -> None:
     scene = _Scene(seed)
-    worlds = join_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 1, DEPTH_MM)
+    worlds = merge_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 1, DEPTH_MM)
     assert sorted(worlds) == [0, 1]
     assert worlds[1].scale == 1
     poses = _common(scene, worlds)
     np.testing.assert_allclose(poses[0], scene.poses[0], atol=1e-6)
     for k, pose in poses.items():
         true = inverse(scene.true[0]) @ scene.true[k]
-        true[:3, 3] *= scene.told[1].scale
+        true[:3, 3] *= scene.S_map_true[1].scale
         np.testing.assert_allclose(inverse(poses[0]) @ pose, true, atol=1e-6)
 
 
-def test_what_one_loop_says_alone_or_against_another_is_not_believed() -> None:
+def test_single_or_contradicting_loops_are_not_accepted() -> None:
     scene = _Scene(0)
     true, other = scene.loop(0, 3), scene.loop(2, 7)
     turned = replace(other, T_new_past=se3_exp(np.array([0, 0.3, 0, 0, 0, 0])) @ other.T_new_past)
@@ -87,18 +89,18 @@ def test_what_one_loop_says_alone_or_against_another_is_not_believed() -> None:
     within = scene.loop(0, 2)
     beside = scene.loop(0, 8)  # of the same keyframe as the first
     for loops in ([], [true], [true, within], [true, turned], [true, moved], [true, larger], [true, beside]):
-        assert list(join_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)) == [0]
+        assert list(merge_maps(scene.poses, MAP_OF, loops, 0, DEPTH_MM)) == [0]
 
 
-def test_a_scale_that_cannot_be_is_not_believed() -> None:
+def test_an_impossible_scale_is_not_accepted() -> None:
     scene = _Scene(0)
-    scene.told[1] = replace(scene.told[1], scale=3.0)
-    assert list(join_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)) == [0]
+    scene.S_map_true[1] = replace(scene.S_map_true[1], scale=3.0)
+    assert list(merge_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)) == [0]
 
 
-def test_a_false_loop_is_outvoted() -> None:
+def test_a_false_loop_is_rejected_by_the_majority() -> None:
     scene = _Scene(1)
     false = replace(scene.loop(1, 4), T_new_past=np.eye(4))
-    worlds = join_maps(scene.poses, MAP_OF, [false, scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)
+    worlds = merge_maps(scene.poses, MAP_OF, [false, scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)
     for k, pose in _common(scene, worlds).items():
         np.testing.assert_allclose(pose, scene.true[k], atol=1e-6)
