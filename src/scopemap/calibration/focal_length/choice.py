@@ -26,7 +26,8 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         if wanted:
             raise CalibrationError(
                 f"input.focal = flow: the motion in {sequence.path} does not determine the focal length, "
-                f"{estimate.reason}; give a calibration (--camera) or the field of view (--fov, with input.focal = assume)"
+                f"{estimate.reason}; "
+                "give a calibration (--camera) or the field of view (--fov, with input.focal = assume)"
             )
         return sequence, [f"focal length: assumed, because the motion does not determine it: {estimate.reason}"]
     if not wanted and estimate.share > MAX_SHARE:
