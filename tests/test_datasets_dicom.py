@@ -102,6 +102,23 @@ def test_grey_levels_are_those_that_the_file_wants_shown(tmp_path: Path) -> None
     np.testing.assert_array_equal(pictures(file)[..., 0], whole)
 
 
+def test_jpeg_frames_may_be_called_partial(tmp_path: Path) -> None:
+    frames = [jpeg(rgb) for rgb in film()]
+    tags = {"PhotometricInterpretation": "YBR_PARTIAL_420"}
+    assert (
+        np.abs(pictures(packed(tmp_path / "a.dcm", frames, JPEGBaseline8Bit, **tags)).astype(int) - film()).mean() < 4
+    )
+
+
+def test_a_palette_is_looked_up(tmp_path: Path) -> None:
+    tags = GREY | {"PhotometricInterpretation": "PALETTE COLOR"}
+    for colour, level in zip(("Red", "Green", "Blue"), (10, 120, 250), strict=True):
+        tags[f"{colour}PaletteColorLookupTableDescriptor"] = [4, 0, 16]
+        tags[f"{colour}PaletteColorLookupTableData"] = np.array([0, 0, level << 8, 0], "<u2").tobytes()
+    rgb = pictures(native(tmp_path / "a.dcm", np.full((2, 48, 64), 2, np.uint8), **tags))
+    np.testing.assert_allclose(rgb, np.broadcast_to((10, 120, 250), rgb.shape), atol=1)
+
+
 def test_packed_pictures(tmp_path: Path) -> None:
     close = pictures(write_frames(tmp_path / "a"))
     assert np.abs(close.astype(int) - film()).mean() < 4
@@ -159,10 +176,11 @@ def test_times_are_those_that_the_file_states(tmp_path: Path) -> None:
     def times(**tags: Any) -> list[float]:
         return [time_s for _, time_s in Dicom(native(tmp_path / "a.dcm", film(), **tags)).stamps(slice(None)) or []]
 
+    np.testing.assert_allclose(times(FrameTimeVector=[0, 40, 20, 30], FrameTime=1), [0, 0.04, 0.06, 0.09])
     np.testing.assert_allclose(times(FrameTime=20, CineRate=25), np.arange(4) / 50)
     np.testing.assert_allclose(times(CineRate=25), np.arange(4) / 25)
     np.testing.assert_allclose(times(RecommendedDisplayFrameRate=10), np.arange(4) / 10)
-    np.testing.assert_allclose(times(FrameTime=0), np.arange(4) / 30)
+    np.testing.assert_allclose(times(FrameTimeVector=[0, 40, 0, 30], FrameTime=0), np.arange(4) / 30)
 
 
 def test_pixels_need_not_be_square(tmp_path: Path) -> None:
@@ -254,10 +272,10 @@ def test_claims_take_no_memory(tmp_path: Path) -> None:
 
 def test_what_is_not_read_is_named(tmp_path: Path) -> None:
     lossless = packed(tmp_path / "a.dcm", [jpeg(film()[0])] * 2, JPEGLosslessSV1)
-    with pytest.raises(InputError, match=r"no decoder is installed for its compression.* or convert the file"):
+    with pytest.raises(InputError, match=r"no decoder is installed for JPEG Lossless.* or convert the file"):
         open_sequence(lossless)
     lossless.write_bytes(lossless.read_bytes().replace(b"1.2.840.10008.1.2.4.70", b"1.2.4711.1950.1950.195"))
-    with pytest.raises(InputError, match="no decoder is installed") as caught:
+    with pytest.raises(InputError, match="for an unknown transfer syntax") as caught:
         open_sequence(lossless)
     assert "4711" not in str(caught.value)
     with pytest.raises(InputError, match="holds no images"):
@@ -274,6 +292,17 @@ def test_a_file_without_pictures_is_one_sentence(tmp_path: Path) -> None:
     del found.PixelData
     with pytest.raises(InputError, match="holds no images"):
         open_sequence(save(found, tmp_path / "b.dcm"))
+    (tmp_path / "c.dcm").write_text("wrongly named")
+    with pytest.raises(InputError, match=r"c\.dcm: the DICOM file"):
+        open_sequence(tmp_path / "c.dcm")
+
+
+def test_a_file_without_its_preamble_is_read_by_its_ending(tmp_path: Path) -> None:
+    file = native(tmp_path / "a.dcm", film(), ImplicitVRLittleEndian)
+    content = file.read_bytes()
+    start = content.index(struct.pack("<HHL", 8, 0x16, 0)[:4])
+    file.write_bytes(content[start:])
+    np.testing.assert_array_equal(pictures(file), film())
 
 
 def test_several_series_are_refused(tmp_path: Path) -> None:
@@ -284,7 +313,7 @@ def test_several_series_are_refused(tmp_path: Path) -> None:
     (folder / "film").write_bytes((folder / "film").read_bytes()[:600])
     sequence = open_sequence(folder)
     assert sequence.count == 2
-    assert any("it was left out" in warning for warning in sequence.warnings)
+    assert any("1 of 3 DICOM files hold no images or cannot be read" in warning for warning in sequence.warnings)
 
 
 def test_instances_that_repeat_a_number_are_counted(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,15 @@ def test_rows_may_be_filled_up_and_samples_stored_the_other_way_round(tmp_path: 
         np.testing.assert_array_equal(rgb, COLOUR)
 
 
+def test_a_compressed_mosaic_gets_its_colours(tmp_path: Path) -> None:
+    bag = Bag()
+    for number in range(2):
+        content = cv2.imencode(".png", mosaic("gbrg"))[1].tobytes()
+        bag.compressed(IMAGE, number, content, "bayer_gbrg8; png compressed bayer_gbrg8")
+    rgb = next(RosBag(bag.write_bag1(tmp_path / "a.bag")).frames(slice(None))).rgb
+    np.testing.assert_array_equal(rgb[4:-4, 4:-4], COLOUR[4:-4, 4:-4])
+
+
 def test_the_calibrated_then_the_left_then_the_longest_topic_is_taken(tmp_path: Path) -> None:
     def chosen(counts: dict[str, int], infos: tuple[str, ...] = ()) -> tuple[str, list[str]]:
         bag = Bag()
@@ -132,9 +142,11 @@ def test_the_calibrated_then_the_left_then_the_longest_topic_is_taken(tmp_path: 
 
     assert chosen({"/a/image": 3, "/b/image": 2}, ("/b/camera_info", "/c/camera_info"))[0] == "/b/image"
     assert chosen({"/cam/right/image": 4, "/cam/left/image": 2})[0] == "/cam/left/image"
+    assert chosen({"/cleft/image": 2, "/right/image": 5, "/other/image": 3})[0] == "/other/image"
     name, notes = chosen({"/a/image": 2, "/b/image": 3})
     assert name == "/b/image"
     assert any("images of /b/image, one of /a/image, /b/image (--dataset rosbag:TOPIC" in note for note in notes)
+    assert any("the only camera_info, /x/camera_info" in n for n in chosen({"/a": 2}, ("/x/camera_info",))[1])
 
 
 def camera(tmp_path: Path, topic: str = IMAGE, **info: Any) -> RosBag:
@@ -186,6 +198,17 @@ def test_depth_that_is_aligned_is_truth(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.depth_mm[1:], 180, rtol=1e-6)
     assert source.truth(1) is None
     assert any("not used: /endoscope/depth/image" in note for note in source.notes)
+
+
+def test_compressed_depth_is_read(tmp_path: Path) -> None:
+    bag = small_bag(2)
+    inverse = np.full((SIZE[1], SIZE[0]), 2000, np.uint16)
+    content = struct.pack("<iff", 0, 100.0, 0.0) + cv2.imencode(".png", inverse)[1].tobytes()
+    for number in range(2):
+        bag.compressed("/e/aligned_depth/compressedDepth", number, content, "32FC1; compressedDepth png")
+    truth = RosBag(bag.write_bag1(tmp_path / "a.bag")).truth(1)
+    assert truth is not None
+    np.testing.assert_allclose(truth.depth_mm, 1000 * 100 / 2000)
 
 
 def test_times_without_stamps_are_those_of_recording(tmp_path: Path) -> None:
@@ -246,3 +269,20 @@ def test_depth_is_that_of_the_pictures_it_names(tmp_path: Path, depth: str, pict
         bag.image(pictures, number, picture(number, SIZE), "rgb8")
         bag.image(depth, number, np.full((SIZE[1], SIZE[0]), 50, np.uint16), "16UC1")
     assert (RosBag(bag.write_bag1(tmp_path / "a.bag")).truth(0) is not None) == used
+
+
+@pytest.mark.parametrize(
+    ("form", "bits"), [("mono16", 10), ("bayer_rggb16", 12), ("rgb16", 14), ("mono16; png compressed", 16)]
+)
+def test_as_many_of_16_bits_are_used_as_the_first_image_needs(tmp_path: Path, form: str, bits: int) -> None:
+    bag, shape = Bag(), (SIZE[1], SIZE[0], 3) if form == "rgb16" else (SIZE[1], SIZE[0])
+    for number, level in enumerate((200, 100, 300)):
+        values = np.minimum(np.full(shape, level) << (bits - 8), 65535).astype(np.uint16)
+        if "png" in form:
+            bag.compressed(IMAGE, number, cv2.imencode(".png", values)[1].tobytes(), form)
+        else:
+            bag.image(IMAGE, number, values, form)
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert [int(frame.rgb[20, 20].max()) for frame in source.frames(slice(None))] == [200, 100, 255]
+    assert any(f"samples of 16 bits: {bits} are used" in note for note in source.notes)
+    assert any("brighter than" in warning for warning in source.warnings) == (bits < 16)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn_bags import IMAGE, SIZE, START_NS, STEP_NS, Bag, small_bag, write_bag1, write_mcap
+from drawn_bags import IMAGE, INFO, SIZE, START_NS, STEP_NS, Bag, small_bag, write_bag1, write_mcap
 from drawn_dicom import jpeg
 from drawn_inputs import number_in, picture
 
@@ -81,7 +81,7 @@ def test_a_bag_without_pictures_names_what_it_holds(tmp_path: Path) -> None:
     for number in range(2):
         bag.image("/depth", number, np.ones((48, 64), np.uint16), "16UC1")
     file = bag.write_bag1(tmp_path / "a.bag")
-    with pytest.raises(InputError, match="holds no images"):
+    with pytest.raises(InputError, match=f"holds no images .* {INFO}, /depth"):
         open_sequence(file)
 
 
@@ -150,7 +150,7 @@ def test_metadata_that_does_not_fit_the_files_is_one_sentence(tmp_path: Path) ->
     metadata.unlink()
     assert RosBag(folder).count == 4
     (folder / "other.mcap").write_bytes((folder / "a.mcap").read_bytes())
-    with pytest.raises(InputError, match=r"2 bags and no metadata\.yaml"):
+    with pytest.raises(InputError, match=r"2 bags and no metadata\.yaml .*\(a\.mcap, other\.mcap\)"):
         RosBag(folder)
 
 
@@ -164,6 +164,14 @@ def test_a_count_beyond_the_file_is_bounded(tmp_path: Path) -> None:
     metadata.write_text(metadata.read_text().replace(f"message_count: {9 * 10**20}", "message_count: many"))
     with pytest.raises(InputError, match="the bag is damaged"):
         RosBag(folder)
+
+
+def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:
+    bag = small_bag(2)
+    bag.image(IMAGE, 2, picture(2, SIZE), "rgb8", stamp_ns=0)
+    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
+    assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 2 * STEP_NS + 5) / 1e9)
+    assert any("hold no stamp" in warning for warning in source.warnings)
 
 
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.reference import reference_trajectory
+from scopemap.io.datasets.tum import associated
 from scopemap.io.opening import open_sequence
 
 SIZE = (64, 48)  # a tenth of the data set's
@@ -174,6 +175,14 @@ def test_whole_stamps_are_seconds_and_said(tmp_path: Path) -> None:
 # ---- association
 
 
+def test_association_is_greedy_by_time_and_one_to_one() -> None:
+    # 0.110 is nearer to 0.112 than 0.100 is; 0.100 then takes what is left within 0.02 s.
+    assert associated([0.100, 0.110], [0.085, 0.112]) == {1: 1, 0: 0}
+    assert associated([0.100, 0.110], [0.112]) == {1: 0}
+    assert associated([1.0, 2.0], [1.0199, 2.0201]) == {0: 0}
+    assert associated([1.0], []) == {}
+
+
 def test_a_pose_too_far_in_time_is_none(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / ROOM)
     replace_line(folder / "groundtruth.txt", 5, f"{STAMPS[3] + 0.021:.4f} 9 9 9 {TURN}")
@@ -189,6 +198,18 @@ def test_another_clock_is_a_warning(tmp_path: Path) -> None:
     sequence = open_sequence(folder)
     assert sequence.source.pose(0) is None
     assert any("no pose belongs to any frame" in warning for warning in sequence.warnings)
+
+
+@pytest.mark.parametrize("depth_first", [True, False])
+def test_associations_win_over_time(depth_first: bool, tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / ROOM)
+    colour, depth = (f"rgb/{STAMPS[2]:.6f}.png", f"depth/{STAMPS[3] + 0.005:.6f}.png")
+    first, second = (depth, colour) if depth_first else (colour, depth)
+    (folder / "associations.txt").write_text(f"# pairs\n1.0 {first} 2.0 {second}\n3.0 rgb/other.png 4.0 depth/o.png\n")
+    sequence = open_sequence(folder)
+    assert [sequence.source.truth(number).depth_mm is None for number in range(4)] == [True, True, False, True]
+    np.testing.assert_allclose(sequence.source.truth(2).depth_mm[6:], 1003.0, rtol=1e-6)
+    assert any("depth: of 1 of 4 frames, associations.txt" in note for note in sequence.notes)
 
 
 def test_lists_out_of_order_are_sorted_by_time(tmp_path: Path) -> None:
@@ -242,14 +263,27 @@ def test_a_row_without_a_pose_leaves_its_frame_without_one(row: str, tmp_path: P
         ("rgb.txt", "nan rgb/1.png", r"rgb\.txt, line 4: expected `timestamp filename`"),
         ("rgb.txt", f"{STAMPS[2]:.6f} rgb/1.png", r"rgb\.txt, line 6: the time stamp of an earlier line"),
         ("depth.txt", "1305031102.2 depth/1.png x", r"depth\.txt, line 4: expected `timestamp filename`"),
+        ("associations.txt", "1.0 rgb/1.png 2.0", r"associations\.txt, line 4: expected `timestamp rgb_file"),
+        ("associations.txt", "rgb/1.png 1.0 depth/1.png 1.0", r"associations\.txt, line 4: expected `timestamp rgb"),
     ],
 )
 def test_rows_that_are_none_are_named(file: str, line: str, message: str, tmp_path: Path) -> None:
     folder = write_tum(tmp_path / ROOM)
+    (folder / "associations.txt").write_text("# pairs\n" * 4)
     replace_line(folder / file, 3, line)
+    if file == "depth.txt":
+        (folder / "associations.txt").unlink()
     with pytest.raises(InputError, match=message) as caught:
         open_sequence(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_a_colour_image_with_two_depths_is_refused(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / ROOM)
+    colour = f"rgb/{STAMPS[2]:.6f}.png"
+    (folder / "associations.txt").write_text(f"1.0 {colour} 2.0 depth/a.png\n1.0 {colour} 2.0 depth/b.png\n")
+    with pytest.raises(InputError, match=r"line 2: .* has another depth image in an earlier line"):
+        open_sequence(folder)
 
 
 def test_folders_of_others_are_left_to_them(tmp_path: Path) -> None:

@@ -203,7 +203,7 @@ def _read_out(fields: Fields, calibration: Calibration) -> Calibration:
     if not width or not height:
         x, y, width, height = 0, 0, sensor.width, sensor.height
     across, down = (max(1, _whole(fields, name)) for name in ("binning_x", "binning_y"))
-    if (width, height, across, down) == (sensor.width, sensor.height, 1, 1):
+    if (x, y, width, height, across, down) == (0, 0, sensor.width, sensor.height, 1, 1):
         return calibration
     if calibration.size_origin != "stated":
         raise ValueError("it has a region or a binning, but not the size of the sensor (image_width, image_height)")

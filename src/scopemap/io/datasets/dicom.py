@@ -19,7 +19,9 @@ from scopemap.io.decoding import first_bytes
 from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
 from scopemap.io.source import SourceDefaults, SourceFrame
 
-_PREAMBLE, _MAGIC = 128, b"DICM"
+_PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
+# The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
+_DIRECTORY = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
 
 
 class Dicom(SourceDefaults):
@@ -126,14 +128,19 @@ class Dicom(SourceDefaults):
             self._warn("by its header notes, perhaps a patient's name, are burned into the images")
 
     def _in_folder(self, path: Path) -> list[Header]:
-        headers = []
-        for file in _files(path):
+        """Return the headers of the one series in a folder, sorted."""
+        files = _files(path)
+        headers, fault = [], ""
+        for file in files:
             try:
                 headers.append(read_header(file))
             except InputError as error:
-                self._warn(f"{error}; it was left out")
+                fault = str(error)
         if not headers:
-            raise InputError(f"reading {path}: no DICOM file with images ({'; '.join(self.warnings[:1])})")
+            raise InputError(fault or f"reading {path}: it holds no DICOM file")
+        if len(headers) < len(files):
+            left_out = f"{len(files) - len(headers)} of {len(files)} DICOM files"
+            self._warn(f"{left_out} hold no images or cannot be read, and were left out")
         single = [header for header in headers if not header.is_video and header.frames + header.missing == 1]
         several, series = len(headers) - len(single), {str(h.fields.get("SeriesInstanceUID", "")) for h in single}
         if several + len(series) > 1:
@@ -152,7 +159,11 @@ class Dicom(SourceDefaults):
 
 
 def _is_dicom(file: Path) -> bool:
-    return file.name.upper() != "DICOMDIR" and first_bytes(file, _PREAMBLE + len(_MAGIC))[_PREAMBLE:] == _MAGIC
+    """Whether a file is DICOM by its magic word or its ending, and not the directory of a medium."""
+    start = first_bytes(file, _META_BYTES)
+    is_directory = file.name.upper() == "DICOMDIR" or _DIRECTORY in start
+    has_magic = start[_PREAMBLE : _PREAMBLE + 4] == _MAGIC
+    return bool(start) and not is_directory and (has_magic or file.suffix.lower() == ".dcm")
 
 
 def _files(folder: Path) -> list[Path]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +22,7 @@ from scopemap.io.video import VideoFile
 
 _IMPLICIT, _EXPLICIT = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 _PIXEL_DATA, _UNDEFINED = struct.pack("<HH", 0x7FE0, 0x0010), 0xFFFFFFFF
+_PARTIAL = "YBR_PARTIAL_420"
 _MOST_IMAGE_BYTES = 256 << 20
 _RATES = ("CineRate", "RecommendedDisplayFrameRate")
 _SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e5
@@ -30,6 +31,7 @@ _TAGS = (
     *("BitsAllocated", "BitsStored", "PixelRepresentation", "PixelAspectRatio", "BurnedInAnnotation"),
     *("WindowCenter", "WindowWidth", "VOILUTFunction", "RescaleSlope", "RescaleIntercept"),
     *("FrameTime", "FrameTimeVector", "CineRate", "RecommendedDisplayFrameRate", "InstanceNumber", "SeriesInstanceUID"),
+    *(f"{c}PaletteColorLookupTable{part}" for c in ("Red", "Green", "Blue") for part in ("Data", "Descriptor")),
 )
 
 
@@ -118,7 +120,8 @@ def read_header(file: Path) -> Header:
 
     with _reporting(file), file.open("rb") as stream:
         fields = pydicom.dcmread(stream, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
-        syntax = str(fields.file_meta.get("TransferSyntaxUID", "")) or _IMPLICIT
+        syntax = str(fields.file_meta.get("TransferSyntaxUID", ""))
+        syntax = syntax or (_IMPLICIT if fields.original_encoding[0] else _EXPLICIT)
         rows, columns = int(fields.get("Rows") or 0), int(fields.get("Columns") or 0)
         length = _pixel_length(stream, syntax)
         if min(rows, columns) < 1 or length is None:
@@ -181,6 +184,7 @@ def _reporting(path: Path) -> AbstractContextManager[None]:
 
 
 def _is_mpeg(syntax: str) -> bool:
+    """Whether a UID is one of MPEG-2, MPEG-4 or HEVC (PS3.5, A.4.5 to A.4.8)."""
     part = syntax.removeprefix("1.2.840.10008.1.2.4.").removesuffix(".1")
     return syntax.startswith("1.2.840.10008.1.2.4.") and part.isdecimal() and 100 <= int(part) <= 108
 
@@ -206,6 +210,7 @@ def _fragments(stream: BinaryIO) -> list[tuple[int, int]]:
 
 
 def _native_bytes(fields: Any) -> int:
+    """Return the bytes of one image that is not compressed."""
     from pydicom.pixels.utils import get_expected_length
 
     return int(get_expected_length(fields)) // int(fields.NumberOfFrames)
@@ -214,18 +219,23 @@ def _native_bytes(fields: Any) -> int:
 def _check_decoder(file: Path, syntax: str) -> None:
     """Raise `InputError` where no decoder of `pydicom` is installed for a transfer syntax."""
     from pydicom.pixels import get_decoder
-    from pydicom.uid import UID
+    from pydicom.uid import UID, UID_dictionary
 
-    with suppress(RuntimeError):  # it is unknown
+    try:
         if get_decoder(UID(syntax)).is_available:
             return
+    except RuntimeError:  # it is unknown
+        pass
+    # A UID that is unknown is not quoted: it may hold anything.
+    name = UID(syntax).name if syntax in UID_dictionary else "an unknown transfer syntax"
     raise InputError(
-        f"reading {file}: no decoder is installed for its compression; install a plugin of pydicom (pyjpegls, "
-        "pylibjpeg), or convert the file, for example with dcmconv or dcmdjpeg"
+        f"reading {file}: no decoder is installed for {name}; install a plugin of pydicom (pyjpegls, pylibjpeg), or "
+        "convert the file, for example with dcmconv or dcmdjpeg"
     )
 
 
 def _packed(header: Header) -> Iterator[bytes]:
+    """Yield the bytes of each image, as they are in the file."""
     from pydicom.encaps import generate_frames
 
     with header.path.open("rb") as stream:
@@ -244,19 +254,27 @@ def _packed(header: Header) -> Iterator[bytes]:
 
 
 def _rgb(header: Header, content: bytes) -> np.ndarray:
+    """Return the image (rows, columns, 3) uint8 in the bytes of one frame."""
     from pydicom.encaps import encapsulate
-    from pydicom.pixels import get_decoder
+    from pydicom.pixels import apply_color_lut, get_decoder
     from pydicom.pixels.utils import as_pixel_options
     from pydicom.uid import UID
 
     options = as_pixel_options(header.fields, number_of_frames=1, pixel_keyword="PixelData")
+    colours = options["photometric_interpretation"]
+    if colours == _PARTIAL:
+        # JPEG frames hold their subsampling themselves.
+        options["photometric_interpretation"] = "YBR_FULL_422"
     content = content if header.is_native else encapsulate([content], has_bot=False)
     values, found = get_decoder(UID(header.syntax)).as_array(content, index=0, raw=False, **options)
     stored = int(found["bits_stored"])
+    if colours == "PALETTE COLOR":
+        values = apply_color_lut(values, header.fields)
+        stored = 8 * values.dtype.itemsize
     lowest = -(1 << (stored - 1)) if values.dtype.kind == "i" else 0
     low, high = header.window or (lowest, lowest + (1 << stored) - 1)
     if (low, high) != (0, 255):
         values = np.rint(255 * np.clip((values.astype(np.float32) - low) / (high - low), 0, 1))
     values = values.astype(np.uint8)
-    values = 255 - values if options["photometric_interpretation"] == "MONOCHROME1" else values
+    values = 255 - values if colours == "MONOCHROME1" else values
     return np.ascontiguousarray(np.broadcast_to(values.reshape(*values.shape[:2], -1), (*values.shape[:2], 3)))

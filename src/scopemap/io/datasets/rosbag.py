@@ -18,6 +18,7 @@ from functools import cached_property
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
+from posixpath import commonpath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +26,10 @@ import numpy as np
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
 from scopemap.io.datasets.rosbag_messages import (
+    bit_depth,
     calibration_of,
     depth_of,
+    eight_bit,
     encoding_of,
     image_of,
     is_depth,
@@ -41,7 +44,7 @@ _MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite form
 _METADATA = "metadata.yaml"
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
 _ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)(?:_depth_to_([a-z0-9]+))?")
-_LEFT = re.compile(r"(?<![a-z])left(?![a-z])")
+_LEFT, _RIGHT = (re.compile(rf"(?<![a-z]){side}(?![a-z])") for side in ("left", "right"))
 _LARGEST_GAP_S = 0.02
 _NS_PER_S = 10**9
 
@@ -56,16 +59,23 @@ class _Topic(NamedTuple):
 
 
 class _Message(NamedTuple):
-    """One message: its topic, when it was recorded, and its deserialized fields."""
+    """One message: its topic, when it was recorded, and its deserialized fields, None where it is damaged."""
 
     topic: str
     bag_ns: int
     fields: Any
 
     @property
+    def content(self) -> Any:
+        """The fields as attributes; `InputError` where the message is damaged."""
+        if self.fields is None:
+            raise InputError("the message is damaged")
+        return self.fields
+
+    @property
     def header_ns(self) -> int:
         """The stamp in its header, 0 where it has none."""
-        stamp = getattr(getattr(self.fields, "header", None), "stamp", None)
+        stamp = None if self.fields is None else self.fields.header.stamp
         return 0 if stamp is None else int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
 
 
@@ -74,7 +84,7 @@ class RosBag(SourceDefaults):
 
     path : the bag. topic : the topic of the images; None: one with a `camera_info`, in colour, of the left camera and
     with the most messages, in this order. A frame's index is its number among the topic's messages, its time the stamp
-    in its header, or the time of recording without one.
+    in its header, or the time of recording where the first message has no stamp.
 
     Raises `InputError` for what cannot be read, holds no images, or needs the package `rosbags`.
     """
@@ -93,6 +103,7 @@ class RosBag(SourceDefaults):
         self._lock = threading.Lock()
         self._depth_reader: Any = None
         self._open_readers = ExitStack()
+        self._bits = 0
         with self._opened() as reader:
             self._topics = self._topics_in(reader)
             self._topic = self._chosen(topic)
@@ -129,7 +140,7 @@ class RosBag(SourceDefaults):
             messages = enumerate(self._as_far_as_read(reader, [self._topic.name]))
             for number, message in islice(messages, *selection.indices(self.count or 0)):
                 try:
-                    rgb = image_of(message.fields)
+                    rgb = self._picture(message)
                 except InputError as error:
                     self._warn(f"image {number} of {self._topic.name} was left out: {error}")
                     continue
@@ -162,9 +173,13 @@ class RosBag(SourceDefaults):
         with self._lock:
             if self._depth_reader is None:
                 self._depth_reader = self._open_readers.enter_context(self._opened())
-            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1))
-        with reporting(f"reading {self.path}: depth recorded at {bag_ns} ns in {topic}"):
-            return depth_of(message.fields)
+            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1), None)
+        try:
+            if message is None:
+                raise InputError("it is not found again")
+            return depth_of(message.content)
+        except InputError as error:
+            raise InputError(f"reading {self.path}: depth recorded at {bag_ns} ns in {topic}: {error}") from None
 
     @cached_property
     def _clock(self) -> dict[str, list[tuple[float, int]]]:
@@ -179,10 +194,14 @@ class RosBag(SourceDefaults):
         return clock
 
     def _time_s(self, message: _Message) -> float:
-        return ((message.header_ns if self._stamped else 0) or message.bag_ns) / _NS_PER_S
+        stamp_ns = message.header_ns if self._stamped else 0
+        if self._stamped and not stamp_ns:
+            self._warn(f"some messages of {message.topic} hold no stamp: the time of recording is used for them")
+        return (stamp_ns or message.bag_ns) / _NS_PER_S
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
+        """Open the bag with the reader of `rosbags` for its version."""
         from rosbags import rosbag1, rosbag2
 
         with self._reporting():
@@ -216,6 +235,7 @@ class RosBag(SourceDefaults):
             yield _Message(connection.topic, bag_ns, fields)
 
     def _as_far_as_read(self, reader: Any, topics: list[str]) -> Iterator[_Message]:
+        """Yield messages up to where the bag breaks off; a warning says so."""
         read = 0
         try:
             for message in self._messages(reader, topics):
@@ -228,11 +248,24 @@ class RosBag(SourceDefaults):
         advice = "'rosbag reindex', 'ros2 bag reindex' or 'mcap recover' may mend it"
         return reporting(f"reading {self.path}: the bag is damaged or was not closed; {advice}")
 
+    def _picture(self, message: _Message) -> np.ndarray:
+        """Return the image (h, w, 3) uint8; the first one of 16 bits decides how many bits are used of all."""
+        rgb = image_of(message.content)
+        if rgb.dtype == np.uint8:
+            return rgb
+        if not self._bits:
+            self._bits = bit_depth(rgb)
+            self.notes.append(f"samples of 16 bits: {self._bits} are used, by the brightest of the first image")
+        if bit_depth(rgb) > self._bits:
+            self._warn(f"images of {self._topic.name} are brighter than the {self._bits} bits of the first: clipped")
+        return eight_bit(rgb, self._bits)
+
     def _size(self, reader: Any) -> tuple[int, int]:
-        fault = "it holds no message"
+        """Return height and width of the first image that can be decoded."""
+        fault = f"{self._topic.name} holds no message"
         for message in self._as_far_as_read(reader, [self._topic.name]):
             try:
-                height, width = image_of(message.fields).shape[:2]
+                height, width = self._picture(message).shape[:2]
             except InputError as error:
                 fault = str(error)
                 continue
@@ -247,10 +280,13 @@ class RosBag(SourceDefaults):
                 counts[connection.topic, connection.msgtype] += int(connection.msgcount)
         topics: dict[str, _Topic] = {}
         for (name, kind), count in counts.items():
-            message = next(self._as_far_as_read(reader, [name]), None) if count > 0 else None
-            if message is not None:
-                encoding = "" if kind == _CAMERA_INFO else encoding_of(message.fields)
-                topics[name] = _Topic(name, kind, count, encoding)
+            try:
+                message = next(self._messages(reader, [name]), None) if count > 0 else None
+                if message is not None:
+                    encoding = "" if kind == _CAMERA_INFO else encoding_of(message.content)
+                    topics[name] = _Topic(name, kind, count, encoding)
+            except InputError as error:
+                self._warn(f"{name} cannot be read: {error}")
         return topics
 
     def _chosen(self, name: str | None) -> _Topic:
@@ -262,18 +298,20 @@ class RosBag(SourceDefaults):
                 raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
             return found
         if not images:
-            faults = "".join(f"; {warning}" for warning in self.warnings)
+            fault = "".join(f"; {warning}" for warning in self.warnings[:1])
             raise InputError(
-                f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage){faults}"
+                f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage; topics of "
+                f"these kinds and camera_info are {', '.join(self._topics) or 'none'}){fault}"
             )
         chosen = max(images, key=self._preference)
         if len(images) > 1:
             self.notes.append(f"images of {chosen.name}, one of {names} (--dataset {self.name}:TOPIC takes another)")
         return chosen
 
-    def _preference(self, topic: _Topic) -> tuple[bool, bool, bool, int]:
-        colour, left = not is_grey(topic.encoding), _LEFT.search(topic.name) is not None
-        return self._own_info(topic) is not None, colour, left, topic.total
+    def _preference(self, topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
+        left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
+        colour = not is_grey(topic.encoding)
+        return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == _IMAGE
 
     def _own_info(self, topic: _Topic) -> str | None:
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
@@ -284,16 +322,19 @@ class RosBag(SourceDefaults):
         return next((found.name for found in topics if found and found.kind == _CAMERA_INFO), None)
 
     def _take_camera(self, reader: Any) -> None:
+        infos = [topic.name for topic in self._topics.values() if topic.kind == _CAMERA_INFO]
         name = self._own_info(self._topic)
+        if name is None and len(infos) == 1:
+            name = infos[0]
+            self.notes.append(f"the only camera_info, {name}, is taken as that of {self._topic.name}")
         if name is None:
-            self.notes.append(f"no camera_info beside {self._topic.name}")
+            self.notes += [f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}"] if infos else []
             return
         rectified = bool(_RECTIFIED.search(self._topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]))
         try:
-            info = next(self._messages(reader, [name])).fields
-            if info is None:
-                raise InputError(f"reading {self.path}: the message in {name} is damaged")
-            self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
+            for message in islice(self._messages(reader, [name]), 1):
+                info = message.content
+                self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
             return
@@ -303,13 +344,16 @@ class RosBag(SourceDefaults):
             self.camera, self.camera_source = self.calibration.camera, self.calibration.source
 
     def _aligned(self) -> _Topic | None:
+        """Return the depth topic that is aligned to the images, by its name."""
         depths = [topic for topic in self._topics.values() if is_depth(topic.encoding)]
         aligned = [
             topic
             for topic in depths
             if (match := _ALIGNED.search(topic.name)) and (match[2] is None or match[2] in self._topic.name)
         ]
-        chosen = max(aligned, key=lambda topic: topic.total, default=None)
+        # Of several cameras' depth, that of the same camera has the most of its name in common.
+        common = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
+        chosen = max(aligned, key=lambda topic: (common[topic.name], topic.total), default=None)
         others = [topic.name for topic in depths if topic is not chosen]
         if chosen is not None:
             self.notes.append(f"depth: {chosen.name}, taken as aligned to {self._topic.name}; whole numbers mm, else m")
@@ -324,11 +368,13 @@ def _storages_in(folder: Path) -> list[Path]:
 
 
 def _storage_of(path: Path) -> Path:
+    """Return what `rosbags` opens: a file, or a folder with `metadata.yaml`."""
     if not path.is_dir() or (path / _METADATA).is_file():
         return path
     files = _storages_in(path)
     if len(files) != 1:
-        raise InputError(f"reading {path}: {len(files)} bags and no {_METADATA} that joins them; give one")
+        some = ", ".join(file.name for file in files[:5])
+        raise InputError(f"reading {path}: {len(files)} bags and no {_METADATA} that joins them ({some}); give one")
     return files[0]
 
 

@@ -7,6 +7,7 @@ numbers are mm, floating-point numbers m.
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import replace
 from typing import Any
 
@@ -30,8 +31,10 @@ _YUV = {
 }
 _BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_COMPRESSED_DEPTH, _DEPTH_HEADER_BYTES = "compressedDepth", 12
+_COMPRESSED_DEPTH = "compressedDepth"
+_DEPTH_HEADER = struct.Struct("<iff")
 _MM_PER_METRE = 1000.0
+_BIT_DEPTHS = (8, 10, 12, 14, 16)
 _OPENCV_TERMS = (4, 5, 8)
 
 
@@ -50,15 +53,26 @@ def is_grey(encoding: str) -> bool:
     return _bare(encoding) in ("mono8", "mono16", "8UC1")
 
 
+def bit_depth(wide: np.ndarray) -> int:
+    """Return how many bits of a uint16 image are used, by its brightest sample: 8, 10, 12, 14 or 16.
+
+    Cameras of 10 or 12 bits put them into the lower part of 16.
+    """
+    return next(bits for bits in _BIT_DEPTHS if int(wide.max()) < 1 << bits)
+
+
+def eight_bit(wide: np.ndarray, bits: int) -> np.ndarray:
+    """Return a uint16 image, of which `bits` are used, as uint8; brighter samples are clipped."""
+    return np.minimum(wide >> (bits - 8), 255).astype(np.uint8)
+
+
 def image_of(message: Any) -> np.ndarray:
-    """Return an image message as (h, w, 3) uint8 RGB; of samples of 16 bits the upper eight.
+    """Return an image message as (h, w, 3) RGB, uint8 or, where its samples have 16 bits, uint16.
 
     Raises `InputError` for an unknown encoding and for data that do not make the image.
     """
     if hasattr(message, "format"):
         return _compressed_image(message)
-    if not hasattr(message, "encoding"):
-        raise InputError("the message is damaged")
     encoding = _OPENCV.get(message.encoding, message.encoding)
     if plain := _PLAIN.fullmatch(encoding):
         channels = 1 if plain[1] == "mono" else 3 + len(plain[2])
@@ -71,7 +85,7 @@ def image_of(message: Any) -> np.ndarray:
     else:
         known = "rgb8, bgr8, rgba8, bgra8, mono8, the same with 16, " + ", ".join([*_OPENCV, *_YUV, "bayer_*"])
         raise InputError(f"the encoding '{encoding}' of its images is not known (known are {known})")
-    return np.ascontiguousarray(_eight_bit(values))
+    return np.ascontiguousarray(values)
 
 
 def depth_of(message: Any) -> np.ndarray:
@@ -81,11 +95,11 @@ def depth_of(message: Any) -> np.ndarray:
     """
     if hasattr(message, "format"):
         depth_mm = _compressed_depth(message)
-    elif getattr(message, "encoding", "") in _DEPTH:
+    elif message.encoding in _DEPTH:
         values = _samples(message, _DEPTH[message.encoding], 1)[..., 0]
         depth_mm = values.astype(np.float32) * (_MM_PER_METRE if values.dtype.kind == "f" else 1.0)
     else:
-        raise InputError(f"expected depth of an encoding {', '.join(_DEPTH)}")
+        raise InputError(f"its encoding '{message.encoding}' is none of depth ({', '.join(_DEPTH)})")
     return np.where(np.isfinite(depth_mm) & (depth_mm > 0), depth_mm, np.nan).astype(np.float32)
 
 
@@ -122,6 +136,7 @@ def calibration_of(info: Any, size: tuple[int, int], rectified: bool, topic: str
 
 
 def _bare(encoding: str) -> str:
+    """Return an encoding without the compression that a format adds."""
     return encoding.split(";")[0].strip()
 
 
@@ -151,21 +166,28 @@ def _demosaiced(values: np.ndarray, order: str) -> np.ndarray:
     return _converted(values, getattr(cv2, f"COLOR_Bayer{order.upper()}2RGB"))
 
 
-def _eight_bit(values: np.ndarray) -> np.ndarray:
-    return (values >> 8).astype(np.uint8) if values.dtype == np.uint16 else values
-
-
 def _compressed_image(message: Any) -> np.ndarray:
-    values = decoded(message.data.tobytes(), cv2.IMREAD_COLOR)
-    if values is None:
+    # The encoding of what was compressed comes after the semicolon.
+    bayer = _BAYER.search(message.format.split(";")[-1])
+    values = decoded(message.data.tobytes(), (0 if bayer else cv2.IMREAD_COLOR) | cv2.IMREAD_ANYDEPTH)
+    if values is None or values.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its compressed image ('{message.format[:40]}') cannot be decoded")
-    return _converted(values, cv2.COLOR_BGR2RGB)
+    return _demosaiced(values, bayer[1]) if bayer else _converted(values, cv2.COLOR_BGR2RGB)
 
 
 def _compressed_depth(message: Any) -> np.ndarray:
     """Return depth, mm, of a 16-bit PNG, which `compressed_depth_image_transport` puts behind a header of 12 bytes."""
-    has_header = _COMPRESSED_DEPTH in message.format
-    values = decoded(message.data.tobytes()[_DEPTH_HEADER_BYTES * has_header :])
-    if values is None or values.ndim != 2 or values.dtype != np.uint16 or not message.format.startswith("16UC1"):
-        raise InputError(f"its compressed depth ('{message.format[:40]}') cannot be read: expected a PNG of 16UC1")
-    return values.astype(np.float32)
+    content, quantization = message.data.tobytes(), b""
+    if _COMPRESSED_DEPTH in message.format:
+        quantization, content = content[: _DEPTH_HEADER.size], content[_DEPTH_HEADER.size :]
+    values = decoded(content)
+    if values is None or values.ndim != 2 or values.dtype != np.uint16:
+        raise InputError(f"its compressed depth ('{message.format[:40]}') cannot be decoded: PNG of 16 bit is read")
+    if not message.format.startswith("32FC1"):
+        return values.astype(np.float32)
+    if not quantization:
+        raise InputError(f"its compressed depth ('{message.format[:40]}') has no header of its quantization")
+    _, a, b = _DEPTH_HEADER.unpack(quantization)
+    # Inverse depth in equal steps.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.where(values > 0, _MM_PER_METRE * a / (values.astype(np.float32) - b), np.nan)

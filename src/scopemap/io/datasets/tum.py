@@ -1,8 +1,9 @@
 """TUM RGB-D: rooms seen by a Kinect, with poses by motion capture, and whatever else is written in its layout.
 
 `rgb.txt` and `depth.txt` list `timestamp filename`, `groundtruth.txt` lists `timestamp tx ty tz qx qy qz qw`, the pose
-of the colour camera in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. Frame number
-= position in rgb.txt, from 0. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+of the colour camera in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. Optional
+`associations.txt`: `t_rgb rgb_file t_depth depth_file`, or depth first. Frame number = position in rgb.txt, from 0.
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ CAMERAS: dict[str, CameraModel] = {
 
 DEPTH_UNIT_MM = 0.2
 ASSOCIATED_WITHIN_S = 0.02
-_IMAGES, _DEPTHS, _POSES = "rgb.txt", "depth.txt", "groundtruth.txt"
+_IMAGES, _DEPTHS, _POSES, _PAIRS = "rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt"
 _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IGNORECASE)
 
 
@@ -66,7 +67,7 @@ class TumRgbdFolder(ImageFolder):
             with self._making_camera():
                 known = f"published calibration of freiburg{number}"
                 self._set_camera(CAMERAS[number], known, f"shipped for freiburg{number}")
-        self._associate_depth()
+        self._associate_depth({name: number for number, (_, name) in there.items()})
         self._associate_poses()
 
     @staticmethod
@@ -75,16 +76,23 @@ class TumRgbdFolder(ImageFolder):
         beside = (path / _DEPTHS).is_file() or (path / _POSES).is_file() or (path / "rgb").is_dir()
         return (path / _IMAGES).is_file() and beside
 
-    def _associate_depth(self) -> None:
-        if not (self.path / _DEPTHS).is_file():
+    def _associate_depth(self, number_of: dict[str, int]) -> None:
+        """Find the depth files of frames: the pairs of associations.txt, else the nearest in time."""
+        if (self.path / _PAIRS).is_file():
+            named, how = _read_pairs(self.path / _PAIRS, number_of), _PAIRS
+            pairs = {number: name for number, name in named.items() if _is_there(self.path, name)}
+            self._warn_of_missing(_PAIRS, len(named), len(pairs))
+        elif (self.path / _DEPTHS).is_file():
+            listed = sorted(_read_list(self.path / _DEPTHS))
+            there = [(stamp, name) for stamp, name in listed if _is_there(self.path, name)]
+            self._warn_of_missing(_DEPTHS, len(listed), len(there))
+            pairs = {number: there[row][1] for number, row in self._nearest([stamp for stamp, _ in there]).items()}
+            how = f"the nearest in time, less than {ASSOCIATED_WITHIN_S:g} s away"
+        else:
             return
-        listed = sorted(_read_list(self.path / _DEPTHS))
-        there = [(stamp, name) for stamp, name in listed if _is_there(self.path, name)]
-        self._warn_of_missing(_DEPTHS, len(listed), len(there))
-        rows = self._nearest([stamp for stamp, _ in there])
         unit = f"{1 / DEPTH_UNIT_MM:g} units per mm" if self.depth_scale_mm is None else "depth_scale of camera.yaml"
-        self._note_associated("depth", len(rows), f"the nearest in time; {unit}")
-        self.depth_files = {number: self.path / there[row][1] for number, row in rows.items()}
+        self._note_associated("depth", len(pairs), f"{how}; {unit}")
+        self.depth_files = {number: self.path / name for number, name in pairs.items()}
 
     def _associate_poses(self) -> None:
         file = self.path / _POSES
@@ -98,11 +106,9 @@ class TumRgbdFolder(ImageFolder):
         self.poses = {number: T[row] for number, row in rows.items()}
 
     def _nearest(self, stamps_s: list[float]) -> dict[int, int]:
-        """Return for each frame the row of `stamps_s` that is nearest in time, where one is less than 0.02 s away."""
-        if not stamps_s:
-            return {}
-        gaps_s = {number: np.abs(np.array(stamps_s) - time_s) for number, time_s in self.times_s.items()}
-        return {n: int(gap_s.argmin()) for n, gap_s in gaps_s.items() if gap_s.min() < ASSOCIATED_WITHIN_S}
+        """Return the row of `stamps_s` (ascending) for each frame that has one."""
+        pairs = associated(list(self.times_s.values()), stamps_s)
+        return {self.numbers[position]: row for position, row in pairs.items()}
 
     def _warn_of_missing(self, file: str, listed: int, there: int) -> None:
         if there < listed:
@@ -127,28 +133,68 @@ def read_stamped(file: Path) -> NumberTable:
     return table.rows(known).sorted_by_stamp()
 
 
+def associated(stamps_s: list[float], others_s: list[float]) -> dict[int, int]:
+    """Return pairs of rows of two ascending lists of time stamps: the nearest first, each row in one pair at most.
+
+    As the data set's own tool does it: pairs are less than 0.02 s apart.
+    """
+    windows = np.searchsorted(others_s, np.add.outer(stamps_s, [-ASSOCIATED_WITHIN_S, ASSOCIATED_WITHIN_S]))
+    gaps = sorted(
+        (abs(stamp - others_s[k]), i, k)
+        for i, (stamp, window) in enumerate(zip(stamps_s, windows, strict=True))
+        for k in range(*window)
+    )
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for gap_s, i, k in gaps:
+        if gap_s < ASSOCIATED_WITHIN_S and i not in pairs and k not in taken:
+            pairs[i] = k
+            taken.add(k)
+    return pairs
+
+
+def _fields_by_line(file: Path, columns: int, form: str) -> dict[str, list[str]]:
+    """Return place -> fields of each line that is no comment; `InputError` where their number is another."""
+    lines = {f"{file}, line {number}": line.split() for number, line in enumerate(text_lines(file), start=1)}
+    rows = {where: fields for where, fields in lines.items() if fields and not fields[0].startswith("#")}
+    wrong = next((where for where, fields in rows.items() if len(fields) != columns), None)
+    if wrong is not None:
+        raise InputError(f"{wrong}: expected `{form}`, found '{' '.join(rows[wrong])[:80]}'")
+    return rows
+
+
 def _read_list(file: Path) -> list[tuple[float, str]]:
+    """Return (time stamp, name) of each image in a list, in its order."""
     listed: dict[float, str] = {}
-    for number, line in enumerate(text_lines(file), start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        stamp = _number(fields[0])
-        if len(fields) != 2 or not np.isfinite(stamp):
-            raise InputError(f"{file}, line {number}: expected `timestamp filename`, found '{line[:80]}'")
-        if stamp in listed:
-            raise InputError(f"{file}, line {number}: the time stamp of an earlier line comes again; leave one out")
-        listed[stamp] = fields[1]
+    for where, (stamp, name) in _fields_by_line(file, 2, "timestamp filename").items():
+        if _stamp(stamp, where) in listed:
+            raise InputError(f"{where}: the time stamp of an earlier line comes again; leave one out")
+        listed[_stamp(stamp, where)] = name
     if not listed:
         raise InputError(f"reading {file}: it names no image")
     return list(listed.items())
 
 
-def _number(text: str) -> float:
+def _read_pairs(file: Path, number_of: dict[str, int]) -> dict[int, str]:
+    """Return the depth file of each frame that associations.txt names, colour or depth first."""
+    pairs: dict[int, str] = {}
+    form = "timestamp rgb_file timestamp depth_file"
+    for where, (stamp, one, other_stamp, other) in _fields_by_line(file, 4, form).items():
+        _stamp(stamp, where, form), _stamp(other_stamp, where, form)
+        colour, depth = (one, other) if one in number_of else (other, one)
+        if colour in number_of and pairs.setdefault(number_of[colour], depth) != depth:
+            raise InputError(f"{where}: {colour} has another depth image in an earlier line")
+    return pairs
+
+
+def _stamp(text: str, where: str, form: str = "timestamp filename") -> float:
     try:
-        return float(text)
+        stamp = float(text)
     except ValueError:
-        return float("nan")
+        stamp = float("nan")
+    if not np.isfinite(stamp):
+        raise InputError(f"{where}: expected `{form}`, found the time stamp '{text[:40]}'")
+    return stamp
 
 
 def _is_there(folder: Path, name: str) -> bool:
