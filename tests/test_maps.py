@@ -72,7 +72,7 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost(result: Reco
     assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (
         SECOND - LOST_BEFORE_NEW - 1
     )
-    assert result.records[0].track.reason == "tracked in another map, number 0"
+    assert result.records[0].track.reason == "tracked in another submap, map 0"
     assert "keyframe" in result.records[FIRST].track.reason
     note = next(text for text in result.provenance["warnings"] if "submaps" in text)
     assert note.startswith("2 submaps")
@@ -280,7 +280,7 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
     status = [record.track.status for record in result.records]
     assert status == ["initial"] + ["ok"] * 9 + ["lost"] * LOST_BEFORE_NEW + ["ok"] * (44 - LOST_BEFORE_NEW)
-    assert result.records[10 + LOST_BEFORE_NEW].track.reason == "began a map that was joined"
+    assert result.records[10 + LOST_BEFORE_NEW].track.reason == "first frame of a merged map"
     assert any("2 maps merged" in note for note in result.provenance["notes"])
     assert not [text for text in result.provenance["warnings"] if "submaps" in text]
     np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)

@@ -73,8 +73,8 @@ def test_masked_pixels_are_not_linked(folder: Path) -> None:
 
 def test_measured_depth_needs_no_link(folder: Path) -> None:
     config = with_true_depth(folder)
-    assert not Mapis(config.mapis).links("measured")
-    assert Mapis(config.mapis).links("depth")
+    assert not Mapis(config.mapis).needs_previous("measured")
+    assert Mapis(config.mapis).needs_previous("depth")
     sequence = open_sequence(folder)
     pipeline = Pipeline(config, create_estimators(config, sequence))
     assert all(pipeline.perceive(frame).link is None for frame in sequence.frames())

@@ -33,7 +33,7 @@ from scopemap.tracking.tracker import Tracker
 
 @dataclass(frozen=True)
 class Estimators:
-    """The interchangeable parts that look at images; each flow is used by one thread, so there are three."""
+    """The interchangeable parts that look at images; a flow is not thread-safe, so each thread has its own."""
 
     depth: DepthEstimator
     anchor: AnchoredDepth
@@ -97,7 +97,7 @@ class Pipeline:
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
         raw = self.estimators.anchor.metric(estimate, shown)
-        link = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.links(estimate.kind))
+        link = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.needs_previous(estimate.kind))
         frame = replace(frame, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
         return Percept(frame, estimate.kind, link, self.estimators.anchor.just_fitted)
 
@@ -142,7 +142,7 @@ class Pipeline:
             return track
         keyframe = replace(frame, T_world_camera=track.T_world_camera)
         # Depth that MAPIS scaled or blended is not what the next frame measures.
-        adopted = self._tracker.adopt(keyframe, measured=kind == "measured" and not self._mapis.links(kind))
+        adopted = self._tracker.adopt(keyframe, measured=kind == "measured" and not self._mapis.needs_previous(kind))
         if adopted and kind != "measured":  # with measured depth tracking alone is better
             self.mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not adopted:

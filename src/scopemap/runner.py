@@ -72,7 +72,7 @@ def reconstruct(
         _refuse_own_input(folder, sequence, config)
         prepare_folder(folder, overwrite=overwrite)
         write = DepthWriter(folder, largest_depth_mm(config, estimators))
-    sequence, camera_notes = _with_best_camera(sequence, config, estimators, clock)
+    sequence, camera_notes = _with_estimated_focal(sequence, config, estimators, clock)
     config, exponent_notes = _with_exponent(sequence, config, estimators, clock)
     if exponent_notes:
         # Some estimators remember the first frame that they saw, and the anchor holds the settings.
@@ -116,17 +116,17 @@ class _Run:
     def result(self, notes: list[str]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others."""
         submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
-        results = [self._fused(submap, notes) for submap in submaps]
-        for frame in self._frames_of_none(submaps):
-            self._written(frame)
+        results = [self._fuse_submap(submap, notes) for submap in submaps]
+        for frame in self._frames_outside_submaps(submaps):
+            self._write_depth(frame)
         results[0].provenance["warnings"] += warnings
         return replace(results[0], others=results[1:])
 
-    def _fused(self, submap: Submap, notes: list[str]) -> Reconstruction:
+    def _fuse_submap(self, submap: Submap, notes: list[str]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
         sequence, pipeline = self.sequence, self.pipeline
         stored = pipeline.fusion.store.frames(submap.frames)
-        frames = (self._written(corrected_frame(frame, submap.correction)) for frame in stored)
+        frames = (self._write_depth(corrected_frame(frame, submap.correction)) for frame in stored)
         fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
@@ -141,12 +141,12 @@ class _Run:
             sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
         )
 
-    def _frames_of_none(self, submaps: list[Submap]) -> Iterator[Frame]:
+    def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
         """Yield the stored frames that are in no submap, as tracked."""
         submapped = {index for submap in submaps for index in submap.frames}
         return self.pipeline.fusion.store.frames([r.index for r in self.records if r.index not in submapped])
 
-    def _written(self, frame: Frame) -> Frame:
+    def _write_depth(self, frame: Frame) -> Frame:
         """Write the final depth of a frame."""
         if self.write is not None:
             self.write(frame)
@@ -195,7 +195,7 @@ def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
             raise InputError(f"cannot write a run to {out}: its input {source} is in it; name another folder")
 
 
-def _with_best_camera(
+def _with_estimated_focal(
     sequence: Sequence, config: Config, estimators: Estimators, clock: _Clock
 ) -> tuple[Sequence, list[str]]:
     """Give an unknown camera the focal length by `input.focal`, with notes on the estimation."""
@@ -205,8 +205,8 @@ def _with_best_camera(
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if config.input.focal == "auto" and network is not None:
         return _with_networks_focal(sequence, network), []
-    taken: tuple[Sequence, list[str]] = clock.timed("focal length", with_focal_from_motion, sequence, config)
-    return taken
+    estimated: tuple[Sequence, list[str]] = clock.timed("focal length", with_focal_from_motion, sequence, config)
+    return estimated
 
 
 def _with_networks_focal(sequence: Sequence, network: DepthEstimator) -> Sequence:

@@ -98,7 +98,7 @@ class Mapis:
         )
         return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
 
-    def links(self, kind: DepthKind) -> bool:
+    def needs_previous(self, kind: DepthKind) -> bool:
         """Return whether depth of this kind is compared with the previous frame at all."""
         return self._scales(kind) or self._blend(kind) != "none"
 
