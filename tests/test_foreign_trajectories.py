@@ -176,7 +176,7 @@ def test_logs_point_one_way_for_open3d_and_the_other_for_endo_depth(tmp_path: Pa
 
 
 def test_log_is_as_open3d_itself_reads_it(tmp_path: Path) -> None:
-    o3d = pytest.importorskip("open3d", reason="Open3D is not a dependency")
+    o3d = pytest.importorskip("open3d", reason="Open3D is not a dependency", exc_type=ImportError)
     (tmp_path / "trajectory.log").write_text(log_text(moving_camera()))
     theirs = o3d.io.read_pinhole_camera_trajectory(str(tmp_path / "trajectory.log")).parameters
     found = read_trajectory(tmp_path, kind="open3d").T_world_camera

@@ -15,7 +15,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import Config, MaskSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.estimators import create_estimators
+from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles, create_masks
@@ -136,7 +136,7 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     )
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
-    assert estimators.provenance()["masks"].startswith("3 files")
+    assert estimators_provenance(estimators)["masks"].startswith("3 files")
     percept = Pipeline(config, estimators).perceive(frames_of(sequence)[1])
     assert not percept.frame.valid[:, :160].any()
     assert percept.frame.valid[:, 160:].any()

@@ -94,7 +94,8 @@ def test_depth_maps_in_the_folder_have_the_adjusted_scale_and_shape(run: _Run) -
         assert kept is not None
         scaled = factors[-1] * step.refined.depth_mm[known]
         if run.step_sigma == 0:
-            np.testing.assert_allclose(kept[known], scaled, atol=0.02)
+            # Stored depth has steps of 0.03 %, written depth of 0.01 mm.
+            np.testing.assert_allclose(kept[known], scaled, rtol=2e-4, atol=0.01)
         before_all.append(_shape_error(scaled, step.raw_mm[known]))
         after_all.append(_shape_error(kept[known], step.raw_mm[known]))
     assert max(np.abs(np.log(factors))) > 1e-4

@@ -75,7 +75,8 @@ def reporting(fault: str, *, quoting: bool = True) -> Iterator[None]:
     except ScopemapError:
         raise
     except Exception as error:
-        raise InputError(f"{fault} ({(quoting and str(error)) or type(error).__name__})") from None
+        quoted = " ".join(str(error).split()) if quoting else ""
+        raise InputError(f"{fault} ({quoted or type(error).__name__})") from None
 
 
 def check_pixels(claimed: float, doing: str = "decoding an image") -> None:
