@@ -34,7 +34,7 @@ def test_a_video_of_an_unknown_codec_is_one_sentence(tmp_path: Path) -> None:
     content = file.read_bytes()
     assert b"FMP4" in content
     file.write_bytes(content.replace(b"FMP4", b"ZZZZ"))
-    with pytest.raises(InputError, match=r"v\.avi: FFmpeg knows no decoder for it"):
+    with pytest.raises(InputError, match=r"v\.avi: FFmpeg has no decoder for it"):
         open_sequence(file)
 
 

@@ -182,7 +182,7 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no png, tif, jpg or npy"):
         files(tmp_path)
     write(tmp_path, "0.png", np.dstack([ramp(np.uint8, 255), 0 * ramp(np.uint8, 1), ramp(np.uint8, 9)]))
-    with pytest.raises(InputError, match="coloured picture"):
+    with pytest.raises(InputError, match="colour-mapped"):
         files(tmp_path)
     (tmp_path / "0.png").write_bytes(b"not a picture")
     with pytest.raises(InputError, match="cannot read the depth file"):

@@ -137,7 +137,7 @@ needs_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no
 @pytest.mark.parametrize("name", ["clip.mp4", "clip.bag", "clip.dcm", "clip"])
 def test_a_pipe_is_one_sentence(name: str, tmp_path: Path, at_once: None) -> None:
     os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=f"{name}: it is a pipe or a device"):
+    with pytest.raises(InputError, match=f"{name}: it is no file and no folder"):
         open_sequence(tmp_path / name)
 
 
