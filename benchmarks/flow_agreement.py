@@ -45,10 +45,14 @@ def measure(path: Path, frames: int, config: Config, tracker: FrameTracker | Non
     moved, off, lost = [], [], []
     last: Step | None = None
     for frame in sequence.frames():
-        percept = pipeline.perceive(frame)
-        step = pipeline.step(percept)
-        if last is not None and percept.link is not None and "lost" not in (step.track.status, last.track.status):
-            points_mm, pixels = observed(last, percept.link)
+        preprocessed = pipeline.preprocess(frame)
+        step = pipeline.step(preprocessed)
+        if (
+            last is not None
+            and preprocessed.correspondence is not None
+            and "lost" not in (step.track.status, last.track.status)
+        ):
+            points_mm, pixels = observed(last, preprocessed.correspondence)
             if len(pixels) >= LEAST_SHARE * frame.valid.size:
                 T_current_last = inverse(step.track.T_world_camera) @ last.track.T_world_camera
                 for errors, T in ((moved, np.eye(4)), (off, T_current_last)):

@@ -27,7 +27,7 @@ PHANTOMS = {
     "tube phantom, no texture": ("--scene", "tube", "--frames", "120", "--seed", "13"),
     "colon phantom, breathing": ("--scene", "colon", "--frames", "120", "--seed", "14", "--deform"),
 }
-STAGES = ("focal length", "read", "perceive", "track and fuse", "back end", "fuse")
+STAGES = ("focal length", "read", "preprocess", "track and fuse", "back end", "fuse")
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def draw_speed(stages: dict[str, dict[str, float]], file: Path) -> None:
         axes.barh(names, width, left=left, label=stage)
         left = [a + b for a, b in zip(left, width, strict=True)]
     axes.invert_yaxis()
-    axes.set_xlabel('ms per frame, one thread; "read" and "perceive" run beside "track and fuse"')
+    axes.set_xlabel('ms per frame, one thread; "read" and "preprocess" run beside "track and fuse"')
     axes.legend(ncols=len(STAGES), loc="lower center", bbox_to_anchor=(0.35, 1.0), frameon=False, fontsize="small")
     figure.savefig(file)
 

@@ -48,8 +48,8 @@ def tracked(clip: Path, count: int | None, tracker: FrameTracker) -> tuple[Traje
     for frame in frames(clip, count):
         started = time.perf_counter()
         track = tracker.track(frame)
-        if track.status != "lost" and tracker.wants_keyframe():
-            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=False)
+        if track.status != "lost" and tracker.needs_keyframe():
+            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=False)
         seconds += time.perf_counter() - started
         rows.append((frame.index, frame.time_s, track.T_world_camera, track.status))
     indices, times_s, poses, status = zip(*rows, strict=True)

@@ -59,7 +59,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         "depth estimate": (pipeline.estimators.depth, "estimate"),
         "flow, perceptual distance": (pipeline._matcher, "match"),
         "track": (pipeline._tracker, "track"),
-        "keyframe": (pipeline._tracker, "adopt"),
+        "keyframe": (pipeline._tracker, "insert_keyframe"),
         "MAPIS": (pipeline._mapis, "refine"),
         "store": (pipeline.fusion, "put"),
         "fuse": (TsdfVolume, "integrate"),
@@ -70,7 +70,7 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
         setattr(owner, name, timed(getattr(owner, name), part, seconds))
     previous = None
     for frame, _ in sequence:
-        pipeline.step(pipeline.perceive(frame))
+        pipeline.step(pipeline.preprocess(frame))
         if previous is not None:
             timed(pair_flow, "DIS", seconds)(DisFlow(), previous, frame.rgb, 1.0)
         previous = frame.rgb

@@ -19,7 +19,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, FrameCorrection, TrackedPose
 from scopemap.mapping.backend import contradiction
-from scopemap.mapping.bundle_adjustment import Solution
+from scopemap.mapping.bundle_adjustment import BundleSolution
 from scopemap.mapping.depth_correction import DepthCorrectionField
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.reprojection import Points, State
@@ -219,7 +219,7 @@ def test_few_points_with_another_depth_do_not_refuse_the_adjustment(certain: int
     points = Points(np.zeros(count, int), np.ones((count, 2)), np.zeros(count), np.full(count, 0.1))
     sigma = np.where(known, 0.01, np.inf)
     state = State(np.eye(4)[None], np.zeros(1), np.where(known, 1.0, 0.0), np.zeros(2), 0.2)
-    found = Solution(state, sigma, 1)
+    found = BundleSolution(state, sigma, 1)
     assert bool(contradiction(points, found, MappingAdvanced())) == refused
 
 

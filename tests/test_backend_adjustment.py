@@ -9,7 +9,7 @@ import pytest
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
 from scopemap.mapping.bundle_adjustment import adjust
-from scopemap.mapping.reprojection import Observations, Points, Priors, Problem
+from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors
 
 FOCAL_PX = 150.0
 KEYFRAMES, PER_KEYFRAME = 6, 80
@@ -53,7 +53,9 @@ def test_exact_observations_and_depths_recover_exact_poses() -> None:
     rng = np.random.default_rng(0)
     T, points, observations = _world(rng)
     found = adjust(
-        Problem(_tracked(T, rng), points, observations, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX)
+        BundleProblem(
+            _tracked(T, rng), points, observations, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX
+        )
     )
     rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
     assert rotation_rad < 1e-4
@@ -69,7 +71,7 @@ def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
         points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=np.full(len(points.host), 0.02)
     )
     found = adjust(
-        Problem(
+        BundleProblem(
             _tracked(T, rng),
             wrong,
             observations,
@@ -90,7 +92,7 @@ def test_a_fifth_of_outliers_does_little_harm() -> None:
     pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
     tracked = _tracked(T, rng)
     noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
-    found = adjust(Problem(tracked, noisy, replace(observations, pixel=pixel), Priors(), LINE, FOCAL_PX))
+    found = adjust(BundleProblem(tracked, noisy, replace(observations, pixel=pixel), Priors(), LINE, FOCAL_PX))
     rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
     rotation_before, translation_before = _pose_errors(tracked, T)
     assert rotation_rad < 0.2 * rotation_before
@@ -102,7 +104,7 @@ def test_without_observations_nothing_changes() -> None:
     rng = np.random.default_rng(3)
     T, points, _ = _world(rng)
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    found = adjust(Problem(T, points, nothing, Priors(), LINE, FOCAL_PX))
+    found = adjust(BundleProblem(T, points, nothing, Priors(), LINE, FOCAL_PX))
     np.testing.assert_array_equal(found.state.T_camera_world, T)
     assert found.iterations == 0
 
@@ -114,7 +116,7 @@ def test_the_tracked_motion_stays_where_there_are_no_observations() -> None:
     known = (observations.keyframe < 4) & (points.host[observations.point] < 4)
     some = Observations(observations.point[known], observations.keyframe[known], observations.pixel[known])
     tracked = _tracked(T, rng)
-    found = adjust(Problem(tracked, points, some, Priors(), LINE, FOCAL_PX)).state.T_camera_world
+    found = adjust(BundleProblem(tracked, points, some, Priors(), LINE, FOCAL_PX)).state.T_camera_world
     np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
     np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
 
@@ -129,7 +131,7 @@ def test_depth_uncertainty_follows_from_the_baseline() -> None:
     # No other keyframe observes the last point.
     points = Points(np.zeros(50, int), pixels, np.log(depth_mm), np.full(50, 0.1))
     found = adjust(
-        Problem(T, points, Observations(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1], FOCAL_PX)
+        BundleProblem(T, points, Observations(np.arange(49), np.ones(49, int), seen[:49]), Priors(), LINE[:1], FOCAL_PX)
     )
     # A pixel moves by fx baseline / depth, and the floor of a pixel's deviation is 0.1.
     np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (FOCAL_PX * baseline_mm), rtol=0.02)

@@ -68,8 +68,8 @@ def _follow(tracker: FrameTracker, frames: list[Frame]) -> Iterator[Track]:
     """What the pipeline does with a tracker and frames whose depth stays as it is."""
     for frame in frames:
         track = tracker.track(frame)
-        if track.status != "lost" and tracker.wants_keyframe():
-            assert tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+        if track.status != "lost" and tracker.needs_keyframe():
+            assert tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
         yield track
 
 
@@ -181,11 +181,13 @@ def test_the_reference_has_the_depth_that_was_adopted_last() -> None:
     tracker = Open3dTracker(CLOUDS[1])
     assert tracker.track(_bowl(0)).status == "initial"
     refined = replace(_bowl(0, further_mm=1.0), T_world_camera=np.eye(4))
-    assert tracker.adopt(refined, measured=False)
+    assert tracker.insert_keyframe(refined, measured=False)
     np.testing.assert_allclose(tracker.track(_bowl(1, further_mm=1.0)).T_world_camera, np.eye(4), atol=1e-9)
-    assert not tracker.adopt(replace(refined, depth_mm=np.full_like(refined.depth_mm, np.nan)), measured=False)
+    assert not tracker.insert_keyframe(
+        replace(refined, depth_mm=np.full_like(refined.depth_mm, np.nan)), measured=False
+    )
     with pytest.raises(ValueError, match="needs a pose"):
-        tracker.adopt(_bowl(2), measured=False)
+        tracker.insert_keyframe(_bowl(2), measured=False)
     with pytest.raises(ValueError, match="frames with depth"):
         tracker.track(replace(_bowl(2), depth_mm=None))
 

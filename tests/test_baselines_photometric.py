@@ -92,7 +92,7 @@ def test_it_has_no_verdict_on_its_result_but_an_empty_image_is_lost() -> None:
     tracker = create_endo_depth_and_motion()
     first = tracker.track(_frame(0))
     assert first.status == "initial"
-    assert tracker.adopt(replace(_frame(0), T_world_camera=np.eye(4)), measured=False)
+    assert tracker.insert_keyframe(replace(_frame(0), T_world_camera=np.eye(4)), measured=False)
     black = tracker.track(_frame(1, usable=False))
     assert (black.status, black.reason) == ("lost", "only 0% of the image is usable")
     unrelated = tracker.track(_frame(2))
@@ -134,8 +134,8 @@ def test_standing_still_never_becomes_a_reference() -> None:
     assert still.track(_frame(4, usable=False)).status == "lost"
     assert still.track(_frame(5)).status == "initial"
     assert still.track(_frame(6)).keyframe == 5
-    assert not still.wants_keyframe()
-    assert not still.adopt(_frame(6), measured=True)
+    assert not still.needs_keyframe()
+    assert not still.insert_keyframe(_frame(6), measured=True)
 
 
 # ---- real frames

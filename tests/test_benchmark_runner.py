@@ -108,7 +108,7 @@ def test_a_row_says_where_and_with_what_it_was_run(done: tuple[Benchmark, Path])
     assert row.facts["align"] == "origin"
     assert row.timing["ms_per_frame"] > row.timing["track_ms_per_frame"] > 0
     assert row.timing["peak_memory_mb"] > 100
-    assert {"seconds_read", "seconds_perceive"} <= set(row.timing)
+    assert {"seconds_read", "seconds_preprocess"} <= set(row.timing)
 
 
 def test_every_run_keeps_its_folder(done: tuple[Benchmark, Path]) -> None:

@@ -105,7 +105,7 @@ def _bumpy(T_world_camera: np.ndarray, index: int) -> Frame:
 def _tracked(frames: list[Frame], settings: TrackingSettings, *, measured: bool) -> list[np.ndarray]:
     tracker = Tracker(settings)
     tracker.track(frames[0])
-    tracker.adopt(replace(frames[0], T_world_camera=np.eye(4)), measured=measured)
+    tracker.insert_keyframe(replace(frames[0], T_world_camera=np.eye(4)), measured=measured)
     return [tracker.track(frame).T_world_camera for frame in frames[1:]]
 
 

@@ -25,7 +25,7 @@ from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3
-from scopemap.geometry.uncertainty import blended_share, by_variance, depth_trust, faded_share, sigma_share
+from scopemap.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.pipeline import Estimators, Step
 
@@ -45,11 +45,11 @@ SPEC = PhantomSpec(scene="colon", frames=6, width=160, height=128, seed=4)
 def test_a_share_is_sigma_over_depth_and_unknown_where_either_is() -> None:
     depth = np.array([[50.0, 50.0, np.nan, 50.0, -1.0, 50.0]], np.float32)
     sigma = np.array([[5.0, np.nan, 5.0, np.inf, 5.0, 0.0]], np.float32)
-    np.testing.assert_allclose(sigma_share(depth, sigma), [[0.1, np.nan, np.nan, 1e3, np.nan, 1e-4]], rtol=1e-6)
-    assert sigma_share(depth, sigma).dtype == np.float32
-    assert np.isnan(sigma_share(depth, None)).all()
+    np.testing.assert_allclose(relative_sigma(depth, sigma), [[0.1, np.nan, np.nan, 1e3, np.nan, 1e-4]], rtol=1e-6)
+    assert relative_sigma(depth, sigma).dtype == np.float32
+    assert np.isnan(relative_sigma(depth, None)).all()
     with pytest.raises(ValueError, match="sigma_mm"):
-        sigma_share(depth, sigma[:, :2])
+        relative_sigma(depth, sigma[:, :2])
 
 
 def test_trust_is_the_inverse_variance_against_the_median_pixel() -> None:
@@ -94,15 +94,15 @@ def test_equal_shares_leave_every_weight_to_the_last_bit(seed: int) -> None:
 
 def test_errors_of_one_kind_do_not_average_out() -> None:
     one, other = np.float32([0.1, 0.1, np.nan, np.nan]), np.float32([0.1, 0.3, 0.3, np.nan])
-    np.testing.assert_allclose(blended_share(np.float32(0.25), one, other), [0.1, 0.25, 0.3, np.nan], rtol=1e-6)
+    np.testing.assert_allclose(blended_sigma(np.float32(0.25), one, other), [0.1, 0.25, 0.3, np.nan], rtol=1e-6)
 
 
 def test_old_certainty_fades_towards_the_present_and_doubt_does_not() -> None:
     carried, current = np.float32([0.1, 0.1, 0.3, 0.1, np.nan]), np.float32([0.1, 0.3, 0.1, np.nan, 0.1])
-    faded = faded_share(carried, current, 0.1)
+    faded = faded_sigma(carried, current, 0.1)
     np.testing.assert_allclose(faded, [0.1, np.sqrt(0.01 + 0.1 * 0.08), 0.3, 0.1, np.nan], rtol=1e-6)
-    np.testing.assert_array_equal(faded_share(carried, current, 0.0), carried)
-    np.testing.assert_allclose(faded_share(carried, current, 1.0)[:3], [0.1, 0.3, 0.3], rtol=1e-6)
+    np.testing.assert_array_equal(faded_sigma(carried, current, 0.0), carried)
+    np.testing.assert_allclose(faded_sigma(carried, current, 1.0)[:3], [0.1, 0.3, 0.3], rtol=1e-6)
 
 
 # ---- frames, estimates and the anchor

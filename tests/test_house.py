@@ -32,8 +32,6 @@ FORBIDDEN_NAMES = {"utils", "util", "common", "core", "helpers", "base", "misc"}
 # The one network that the package brings along.
 ALLOWED_BYTES = {"src/scopemap/depth/scopenet/scopenet.safetensors": 8_000_000}
 ENDINGS = ("print", "exit", "quit", "sys.exit", "os._exit")
-# A least-squares problem and its solution, in general and for bundle adjustment.
-NAMED_TWICE = {"Problem", "Solution"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -251,9 +249,7 @@ def test_public_classes_have_unique_names() -> None:
         for node in module.tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 found.setdefault(node.name, []).append(module.name)
-    _none(
-        [f"{name}: {', '.join(files)}" for name, files in found.items() if len(files) > 1 and name not in NAMED_TWICE]
-    )
+    _none([f"{name}: {', '.join(files)}" for name, files in found.items() if len(files) > 1])
 
 
 def test_no_module_has_a_name_that_says_nothing() -> None:

@@ -70,7 +70,7 @@ class _Shifted(DisFlow):
 def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
     tracker = Tracker(chosen(TrackingSettings, finest_level=0, **changes), flow)
     tracker.track(_frame(0, HERE))
-    assert tracker.adopt(_frame(0, HERE), measured=measured)
+    assert tracker.insert_keyframe(_frame(0, HERE), measured=measured)
     return tracker.track(_frame(1, THERE))
 
 
@@ -108,6 +108,6 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
     for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
         tracker = Tracker(chosen(TrackingSettings, finest_level=0, min_keyframe_agreement=0.0), DisFlow())
         tracker.track(_frame(0, HERE))
-        tracker.adopt(_frame(0, HERE), measured=False)
+        tracker.insert_keyframe(_frame(0, HERE), measured=False)
         assert tracker.track(replace(_frame(1, THERE), valid=valid)).status == "ok"
-        assert tracker.wants_keyframe() == wanted
+        assert tracker.needs_keyframe() == wanted

@@ -16,10 +16,10 @@ from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, TrackedPose
-from scopemap.mapping.bundle_adjustment import Solution, adjust
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
-from scopemap.mapping.reprojection import Problem
+from scopemap.mapping.reprojection import BundleProblem
 
 # Out to the side and back again.
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
@@ -174,7 +174,7 @@ def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: py
         backend.add(_frame(number, pose))
     starts = []
 
-    def failing(problem: Problem) -> Solution:
+    def failing(problem: BundleProblem) -> BundleSolution:
         starts.append(problem.start)
         found = adjust(problem)
         return found if problem.start is None else replace(found, state=found.state._replace(sigma_px=9.9))

@@ -43,8 +43,8 @@ def _tracked(frames: list[Frame], settings: TrackingSettings = SETTINGS) -> list
     for frame in frames:
         track = tracker.track(frame)
         tracks.append(track)
-        if track.status != "lost" and tracker.wants_keyframe():
-            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+        if track.status != "lost" and tracker.needs_keyframe():
+            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
     return tracks
 
 
@@ -169,7 +169,7 @@ def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
 
     tracker = Tracker(SETTINGS)
     first = tracker.track(bare(0))
-    tracker.adopt(replace(bare(0), T_world_camera=first.T_world_camera), measured=False)
+    tracker.insert_keyframe(replace(bare(0), T_world_camera=first.T_world_camera), measured=False)
     track = tracker.track(bare(1))
     assert track.status == "lost"
     assert "weakly constrained" in track.reason
@@ -203,6 +203,6 @@ def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
 def test_no_map_begins_with_an_unsharp_frame() -> None:
     tracker, frame = Tracker(SETTINGS), _frame(0, NEAR[0])
     assert tracker.track(frame).status == "initial"
-    # Not adopted, for want of depth: the next one fixes the world, unless it shows nothing.
+    # Not inserted, for want of depth: the next one fixes the world, unless it shows nothing.
     assert tracker.track(replace(_smoked(frame), index=1)).status == "lost"
     assert tracker.track(replace(frame, index=2)).status == "initial"

@@ -24,8 +24,8 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
-from scopemap.mapping.bundle_adjustment import Solution, adjust
-from scopemap.mapping.reprojection import Problem
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
+from scopemap.mapping.reprojection import BundleProblem
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
@@ -238,7 +238,7 @@ def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.Mon
     for number in range(10):
         backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
 
-    def failing(problem: Problem) -> Solution:
+    def failing(problem: BundleProblem) -> BundleSolution:
         found = adjust(problem)
         return replace(found, state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
 

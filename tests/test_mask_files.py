@@ -137,9 +137,9 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
     assert estimators_provenance(estimators)["masks"].startswith("3 files")
-    percept = Pipeline(config, estimators).perceive(frames_of(sequence)[1])
-    assert not percept.frame.valid[:, :160].any()
-    assert percept.frame.valid[:, 160:].any()
+    preprocessed = Pipeline(config, estimators).preprocess(frames_of(sequence)[1])
+    assert not preprocessed.frame.valid[:, :160].any()
+    assert preprocessed.frame.valid[:, 160:].any()
     assert create_masks(MaskSettings(), sequence.rectifier) is None
 
 

@@ -149,7 +149,7 @@ def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
         """Believes that the camera never moves, and loses every third frame."""
 
         def __init__(self) -> None:
-            self.adopted: list[int] = []
+            self.inserted: list[int] = []
 
         def track(self, frame: Frame) -> Track:
             assert frame.depth_mm is not None
@@ -157,18 +157,18 @@ def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
             status = "initial" if frame.index == 0 else "lost" if frame.index % 3 == 2 else "ok"
             return Track(frame.index, status, "", np.eye(4), 0)
 
-        def wants_keyframe(self) -> bool:
+        def needs_keyframe(self) -> bool:
             return True
 
-        def adopt(self, frame: Frame, *, measured: bool) -> bool:
-            self.adopted.append(frame.index)
+        def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+            self.inserted.append(frame.index)
             return measured
 
     tracker = Standing()
     result = reconstruct(open_sequence(folder), with_true_depth(folder), tracker=tracker)
     lost = [record.index for record in result.lost]
     assert lost == [index for index in range(FRAMES) if index % 3 == 2]
-    assert tracker.adopted == [index for index in range(FRAMES) if index not in lost]
+    assert tracker.inserted == [index for index in range(FRAMES) if index not in lost]
     np.testing.assert_array_equal(result.trajectory.T_world_camera, np.tile(np.eye(4), (FRAMES, 1, 1)))
 
 
@@ -380,7 +380,7 @@ def test_an_error_in_the_look_ahead_comes_out(fails_at: int, folder: Path, monke
     with pytest.raises(RuntimeError, match="the network broke"):
         reconstruct(open_sequence(folder), with_true_depth(folder), observers=(steps.append,))
     assert len(steps) == fails_at - 1
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("perceive")]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("preprocess")]
 
 
 def test_a_frame_of_another_size_is_told_from_the_look_ahead(folder: Path, tmp_path: Path) -> None:

@@ -39,15 +39,15 @@ def test_no_flow_does_not_hold_the_camera(phantom: Path) -> None:
 def test_depth_that_mapis_changed_is_not_compared_with_what_is_measured(
     phantom: Path, monkeypatch: pytest.MonkeyPatch, scaled: str, speaks: bool
 ) -> None:
-    adopted: list[bool] = []
-    real = Tracker.adopt
+    inserted: list[bool] = []
+    real = Tracker.insert_keyframe
 
-    def adopt(self: Tracker, frame: Frame, *, measured: bool) -> bool:
-        adopted.append(measured)
+    def insert_keyframe(self: Tracker, frame: Frame, *, measured: bool) -> bool:
+        inserted.append(measured)
         return real(self, frame, measured=measured)
 
-    monkeypatch.setattr(Tracker, "adopt", adopt)
+    monkeypatch.setattr(Tracker, "insert_keyframe", insert_keyframe)
     changes = {"depth__files_kind": "measured", "mapis__advanced__frame_scale": scaled}
     reconstruct(open_sequence(phantom), with_true_depth(phantom, **SETTINGS | changes))
-    assert adopted
-    assert set(adopted) == {speaks}
+    assert inserted
+    assert set(inserted) == {speaks}

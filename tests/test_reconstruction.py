@@ -158,7 +158,7 @@ def test_provenance(run: _Run) -> None:
     assert told["estimators"]["anchor"] == "measured depth"
     assert set(told["versions"]) >= {"scopemap", "numpy", "torch", "python"}
     parts = told["seconds"]
-    assert {"read", "perceive", "track and fuse", "fuse", "total"} <= set(parts)
+    assert {"read", "preprocess", "track and fuse", "fuse", "total"} <= set(parts)
     assert parts["total"] >= max(parts["track and fuse"], parts["fuse"])
 
 

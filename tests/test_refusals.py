@@ -64,11 +64,13 @@ def test_masked_pixels_are_not_linked(folder: Path) -> None:
     config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
     sequence = open_sequence(folder)
     pipeline = Pipeline(config, create_estimators(config, sequence))
-    percepts = [pipeline.perceive(frame) for frame in sequence.frames()]
-    assert not percepts[0].frame.valid.all()
-    for past, percept in itertools.pairwise(percepts):
-        assert percept.link is not None
-        np.testing.assert_array_equal(percept.link.consistent, past.frame.valid & percept.frame.valid)
+    preprocessed_frames = [pipeline.preprocess(frame) for frame in sequence.frames()]
+    assert not preprocessed_frames[0].frame.valid.all()
+    for past, preprocessed in itertools.pairwise(preprocessed_frames):
+        assert preprocessed.correspondence is not None
+        np.testing.assert_array_equal(
+            preprocessed.correspondence.consistent, past.frame.valid & preprocessed.frame.valid
+        )
 
 
 def test_measured_depth_needs_no_link(folder: Path) -> None:
@@ -77,7 +79,7 @@ def test_measured_depth_needs_no_link(folder: Path) -> None:
     assert Mapis(config.mapis).needs_previous("depth")
     sequence = open_sequence(folder)
     pipeline = Pipeline(config, create_estimators(config, sequence))
-    assert all(pipeline.perceive(frame).link is None for frame in sequence.frames())
+    assert all(pipeline.preprocess(frame).correspondence is None for frame in sequence.frames())
 
 
 def test_facts_of_the_parts_do_not_overwrite_each_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

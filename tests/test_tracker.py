@@ -47,8 +47,8 @@ def _track_all(settings: TrackingSettings, frames: list[Frame]) -> list[np.ndarr
     for frame in frames:
         track = tracker.track(frame)
         poses.append(track.T_world_camera)
-        if track.status != "lost" and tracker.wants_keyframe():
-            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+        if track.status != "lost" and tracker.needs_keyframe():
+            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
     return poses
 
 
@@ -125,7 +125,7 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
         track = tracker.track(frame)
         tracks.append(track)
         if track.status == "initial":
-            tracker.adopt(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 4 + ["lost"] * 2 + ["ok"] * 5
     assert tracks[5].reason == "only 0% of the image is usable"
     assert "inlier share" in tracks[6].reason
@@ -139,7 +139,7 @@ def test_a_jump_is_not_believed() -> None:
     frames, _ = _sequence()
     tracker = Tracker(chosen(TrackingSettings, **PLAIN, max_step=1e-4))
     first = tracker.track(frames[0])
-    tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+    tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
     track = tracker.track(frames[4])
     assert track.status == "lost"
     assert "jump" in track.reason
@@ -150,28 +150,28 @@ def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: boo
     frames, _ = _sequence()
     tracker = Tracker(chosen(TrackingSettings, **PLAIN, min_keyframe_agreement=share))
     first = tracker.track(frames[0])
-    tracker.adopt(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+    tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
     tracker.track(frames[1])
-    assert not tracker.wants_keyframe()
+    assert not tracker.needs_keyframe()
     half = frames[2].valid.copy()
     half[:, half.shape[1] // 2 :] = False
     track = tracker.track(replace(frames[2], valid=half))
     assert track.status == "ok"
-    assert tracker.wants_keyframe() == wanted
+    assert tracker.needs_keyframe() == wanted
     # A new keyframe starts without a past.
     known = replace(frames[2], T_world_camera=track.T_world_camera)
-    assert tracker.adopt(known, measured=True)
-    assert not tracker.wants_keyframe()
+    assert tracker.insert_keyframe(known, measured=True)
+    assert not tracker.needs_keyframe()
 
 
 def test_a_keyframe_without_depth_is_refused() -> None:
     frames, _ = _sequence()
     tracker = Tracker(SETTINGS)
     blind = replace(frames[0], depth_mm=np.full_like(frames[0].depth_mm, np.nan), T_world_camera=np.eye(4))
-    assert not tracker.adopt(blind, measured=True)
+    assert not tracker.insert_keyframe(blind, measured=True)
     assert tracker.track(frames[1]).status == "initial"
     with pytest.raises(ValueError, match="needs a depth and a pose"):
-        tracker.adopt(frames[0], measured=True)
+        tracker.insert_keyframe(frames[0], measured=True)
 
 
 def test_pyramid_sizes_cameras_and_masks() -> None:

@@ -1,12 +1,12 @@
 """The pipeline: frames, in order, to poses, depth and a surface. No files, clocks or printing: see `runner.py`.
 
-    perceive    mask -> raw metric depth -> correspondence with the previous frame
+    preprocess  mask -> raw metric depth -> correspondence with the previous frame
     step        track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS) -> new keyframe
                 -> smooth (WEMA) -> store, or fuse (TSDF)
     mapper.submaps    after the last frame: adjust all keyframes, close loops, merge maps
     fusion.fuse       fuse the stored frames of a submap, corrected (TSDF)
 
-`perceive` needs no motion, so it may run a frame ahead of `step`. The preset `paper` refines before it tracks.
+`preprocess` needs no motion, so it may run a frame ahead of `step`. The preset `paper` refines before it tracks.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ class Estimators:
 
     depth: DepthEstimator
     anchor: AnchoredDepth
-    flow: FlowEstimator
-    corner_flow: FlowEstimator
-    keyframe_flow: FlowEstimator
+    flow: FlowEstimator  # between successive frames
+    corner_flow: FlowEstimator  # of the keyframe's corners, in tracking
+    keyframe_flow: FlowEstimator  # between keyframes, in mapping
     perceptual: PerceptualDistance
     masks: StoredMasks | None = None
 
 
 @dataclass(frozen=True)
-class Percept:
-    """Results that need no motion: `frame` is masked, with raw depth; `anchored`: it determined the depth scale."""
+class PreprocessedFrame:
+    """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale."""
 
     frame: Frame
     kind: DepthKind
-    link: DenseCorrespondence | None
+    correspondence: DenseCorrespondence | None
     anchored: bool
 
 
@@ -65,7 +65,7 @@ class Step:
 
 
 class Pipeline:
-    """One run over one sequence; frames go through `perceive` and `step` in order, each once.
+    """One run over one sequence; frames go through `preprocess` and `step` in order, each once.
 
     store : for frames that are fused after the last one. tracker : replaces the one of `config.tracking` (baselines).
     """
@@ -89,7 +89,7 @@ class Pipeline:
         self.mapper = Mapper(config.mapping, estimators.keyframe_flow)
         self._last_track: Track | None = None
 
-    def perceive(self, frame: Frame) -> Percept:
+    def preprocess(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame, estimate its raw depth and its correspondence with the previous frame."""
         frame = self._masker(frame)
         # A frame that the tracker refuses must not fix the scale of depth.
@@ -97,19 +97,19 @@ class Pipeline:
         shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
         estimate = self.estimators.depth.estimate(shown)
         raw = self.estimators.anchor.metric(estimate, shown)
-        link = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.needs_previous(estimate.kind))
+        correspondence = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.needs_previous(estimate.kind))
         frame = replace(frame, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
-        return Percept(frame, estimate.kind, link, self.estimators.anchor.just_fitted)
+        return PreprocessedFrame(frame, estimate.kind, correspondence, self.estimators.anchor.just_fitted)
 
-    def step(self, percept: Percept) -> Step:
+    def step(self, preprocessed: PreprocessedFrame) -> Step:
         """Track a frame, refine its depth, make it a keyframe where one is due, store or fuse it."""
-        refined = self._refine(percept, None) if self.config.mapis.paper.order == "refine-first" else None
-        track, last = self._tracker.track(percept.frame), self._last_track
+        refined = self._refine(preprocessed, None) if self.config.mapis.paper.order == "refine-first" else None
+        track, last = self._tracker.track(preprocessed.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
-        refined = refined or self._refine(percept, motion_between(last, track))
-        frame = replace(percept.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
-        track = self._with_keyframe(track, frame, percept.kind)
+        refined = refined or self._refine(preprocessed, motion_between(last, track))
+        frame = replace(preprocessed.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
+        track = self._with_keyframe(track, frame, preprocessed.kind)
         if track.status == "lost":
             self._reset()
         else:
@@ -117,18 +117,18 @@ class Pipeline:
         self.mapper.observe(track)
         self.fusion.put(frame)
         self._last_track = track
-        return Step(frame, track, np.asarray(percept.frame.depth_mm), refined)
+        return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
 
-    def _refine(self, percept: Percept, T_current_previous: np.ndarray | None) -> RefinedDepth:
-        raw = percept.frame
+    def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
+        raw = preprocessed.frame
         return self._mapis.refine(
             np.asarray(raw.depth_mm),
-            percept.kind,
+            preprocessed.kind,
             raw.camera,
-            percept.link,
+            preprocessed.correspondence,
             T_current_previous,
             sigma_mm=raw.depth_sigma_mm,
-            anchored=percept.anchored,
+            anchored=preprocessed.anchored,
         )
 
     def _reset(self) -> None:
@@ -138,13 +138,13 @@ class Pipeline:
 
     def _with_keyframe(self, track: Track, frame: Frame, kind: DepthKind) -> Track:
         """Make a frame the keyframe where one is due; the first one of a map that cannot be one is lost."""
-        if track.status == "lost" or not self._tracker.wants_keyframe():
+        if track.status == "lost" or not self._tracker.needs_keyframe():
             return track
         keyframe = replace(frame, T_world_camera=track.T_world_camera)
-        # Depth that MAPIS scaled or blended is not what the next frame measures.
-        adopted = self._tracker.adopt(keyframe, measured=kind == "measured" and not self._mapis.needs_previous(kind))
-        if adopted and kind != "measured":  # with measured depth tracking alone is better
+        measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
+        inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
+        if inserted and kind != "measured":  # with measured depth tracking alone is better
             self.mapper.add_keyframe(keyframe, track)
-        if track.status == "initial" and not adopted:
+        if track.status == "initial" and not inserted:
             return replace(track, status="lost", reason="too little of its depth is known to start from")
         return track

@@ -29,7 +29,7 @@ from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.submaps import Submap, corrected_frame
-from scopemap.pipeline import Estimators, Percept, Pipeline, Step
+from scopemap.pipeline import Estimators, Pipeline, PreprocessedFrame, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of
 from scopemap.tracking.track import FrameTracker
 
@@ -176,15 +176,15 @@ class _Clock:
 def _steps(sequence: Sequence, pipeline: Pipeline, clock: _Clock) -> Iterator[Step]:
     frames = sequence.frames()
 
-    def perceive_next() -> Percept | None:
+    def preprocess_next() -> PreprocessedFrame | None:
         frame = clock.timed("read", next, frames, None)
-        return None if frame is None else clock.timed("perceive", pipeline.perceive, frame)
+        return None if frame is None else clock.timed("preprocess", pipeline.preprocess, frame)
 
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="perceive") as ahead:
-        coming: Future[Percept | None] = ahead.submit(perceive_next)
-        while (percept := coming.result()) is not None:
-            coming = ahead.submit(perceive_next)
-            yield clock.timed("track and fuse", pipeline.step, percept)
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="preprocess") as ahead:
+        coming: Future[PreprocessedFrame | None] = ahead.submit(preprocess_next)
+        while (preprocessed := coming.result()) is not None:
+            coming = ahead.submit(preprocess_next)
+            yield clock.timed("track and fuse", pipeline.step, preprocessed)
 
 
 def _refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:

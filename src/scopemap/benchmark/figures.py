@@ -155,12 +155,14 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
     yield folder / f"depth_change_{name}.png"
     matcher = FrameMatcher(frames.camera)
     matcher.match(previous.rgb, previous.valid)
-    link = matcher.match(current.rgb, current.valid)
+    correspondence = matcher.match(current.rgb, current.valid)
     T_previous, T_current = (None if truth is None else truth.T_world_camera for truth in (true_previous, true_current))
-    if T_previous is None or T_current is None or link is None:
+    if T_previous is None or T_current is None or correspondence is None:
         return
     poses = (T_previous, T_current)
-    found = {method: displacements(link.matches, *maps, frames.camera, poses) for method, maps in depths.items()}
+    found = {
+        method: displacements(correspondence.matches, *maps, frames.camera, poses) for method, maps in depths.items()
+    }
     points = {method: (ends.previous_mm, ends.current_mm) for method, ends in found.items()}
     draw_matched_points(points, folder / f"orb_points_{name}.png")
     yield folder / f"orb_points_{name}.png"

@@ -214,7 +214,7 @@ def _consistency(
         # Highlights move with the lamp, and pixels outside the field of view show no tissue: one mask for all methods.
         valid = masker(frame).valid
         found = (None, None) if before is None else flow_to_previous(estimator, frame.index, before, frame.rgb, folder)
-        link = matcher.match(frame.rgb, valid, *found)
+        correspondence = matcher.match(frame.rgb, valid, *found)
         before = frame.rgb
         depth_mm = depth.read(frame.index)
         meter.add(
@@ -225,7 +225,7 @@ def _consistency(
                 None if truth is None else truth.T_world_camera,
                 None if truth is None else truth.depth_mm,
             ),
-            link,
+            correspondence,
         )
     return {"consistency": meter.report() | {"flow": estimator.name}}
 

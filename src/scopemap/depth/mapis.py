@@ -5,7 +5,7 @@ blended with the current estimate by a weight from their perceptual distance. Th
 where the images are alike, its equation does the reverse; `blend = "paper-equation"` is the latter, taken literally.
 
 Where the estimator gives a standard deviation, the odds of that weight are multiplied by the ratio of inverse
-variances: a pixel with glare keeps its earlier depth. The standard deviation is propagated as a share of depth.
+variances: a pixel with glare keeps its earlier depth. The standard deviation is propagated relative to depth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scopemap.config import MapisSettings
 from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.depth.estimate import DepthKind
 from scopemap.errors import check_shape
-from scopemap.geometry.uncertainty import blended_share, by_variance, faded_share, sigma_share
+from scopemap.geometry.uncertainty import blended_sigma, by_variance, faded_sigma, relative_sigma
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 
 _MIN_OVERLAP = 0.02  # share of the image that must be known in both depths for a scale to be fitted
@@ -44,10 +44,10 @@ class RefinedDepth:
 
 
 class _Carried(NamedTuple):
-    """Depth (H, W) mm for the next frame, and its standard deviation as a share of it, NaN = unknown."""
+    """Depth (H, W) mm for the next frame, and its relative standard deviation, NaN = unknown."""
 
     depth_mm: np.ndarray
-    share: np.ndarray
+    relative_sigma: np.ndarray
 
 
 class Mapis:
@@ -63,7 +63,7 @@ class Mapis:
         raw_mm: np.ndarray,
         kind: DepthKind,
         camera: PinholeCamera,
-        link: DenseCorrespondence | None,
+        correspondence: DenseCorrespondence | None,
         T_current_previous: np.ndarray | None,
         *,
         sigma_mm: np.ndarray | None = None,
@@ -71,32 +71,32 @@ class Mapis:
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
-        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where unknown; `link` is None for
-        the first frame. With a motion the previous depth is transformed by it; with None its values are warped
-        unchanged, as in the paper. A frame just `anchored` to a metric depth starts a new chain of scales.
+        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where unknown; the first frame of
+        a sequence has no `correspondence`. With a motion the previous depth is transformed by it; with None its values
+        are warped unchanged, as in the paper. A frame just `anchored` to a metric depth starts a new chain of scales.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         if anchored:
-            self._scale, link = 1.0, None
-        share = sigma_share(raw_mm, sigma_mm)
-        warped_mm, warped_share = self._warped(camera, link, T_current_previous, share)
+            self._scale, correspondence = 1.0, None
+        sigma = relative_sigma(raw_mm, sigma_mm)
+        warped_mm, warped_sigma = self._warped(camera, correspondence, T_current_previous, sigma)
         overlap = float(np.isfinite(warped_mm).mean())
         if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
-            if link is not None and self._carried is not None:
-                self._scale = self._pulled_back(self._scale, overlap / max(link.usable_share, 1e-6))
+            if correspondence is not None and self._carried is not None:
+                self._scale = self._pulled_back(self._scale, overlap / max(correspondence.usable_share, 1e-6))
         scaled_mm = raw_mm * np.float32(self._scale)
-        depth_mm, refined_share = scaled_mm, share
+        depth_mm, refined_sigma = scaled_mm, sigma
         blend = self._blend(kind)
-        if link is not None and blend != "none":
-            weight = np.where(np.isfinite(warped_mm), self._weight(blend, link.distance), np.float32(0.0))
-            weight = by_variance(weight, warped_share, share)
+        if correspondence is not None and blend != "none":
+            weight = np.where(np.isfinite(warped_mm), self._weight(blend, correspondence.distance), np.float32(0.0))
+            weight = by_variance(weight, warped_sigma, sigma)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
-            refined_share = blended_share(weight, warped_share, share)
+            refined_sigma = blended_sigma(weight, warped_sigma, sigma)
         self._carried = (
-            _Carried(depth_mm, refined_share) if self.settings.paper.recursive else _Carried(scaled_mm, share)
+            _Carried(depth_mm, refined_sigma) if self.settings.paper.recursive else _Carried(scaled_mm, sigma)
         )
-        return RefinedDepth(depth_mm, self._scale, overlap, refined_share * depth_mm)
+        return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
 
     def needs_previous(self, kind: DepthKind) -> bool:
         """Return whether depth of this kind is compared with the previous frame at all."""
@@ -110,12 +110,12 @@ class Mapis:
         frame_scale = self.settings.advanced.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
-    def _pulled_back(self, scale: float, linked_share: float) -> float:
-        """Return the scale pulled back towards 1, the more the fewer pixels are linked to the previous frame.
+    def _pulled_back(self, scale: float, matched_share: float) -> float:
+        """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame.
 
         Errors of chained scales accumulate, and fast motion biases them: depth would grow or shrink without limit.
         """
-        return float(scale ** (1 - self.settings.advanced.scale_pull * max(1 - linked_share, 0.0) ** 2))
+        return float(scale ** (1 - self.settings.advanced.scale_pull * max(1 - matched_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
         if self.settings.paper.blend != "auto":
@@ -125,23 +125,23 @@ class Mapis:
     def _warped(
         self,
         camera: PinholeCamera,
-        link: DenseCorrespondence | None,
+        correspondence: DenseCorrespondence | None,
         T_current_previous: np.ndarray | None,
-        share: np.ndarray,
+        sigma: np.ndarray,
     ) -> _Carried:
-        """Warp the previous depth and its uncertainty to the current frame, whose own relative sigma is `share`."""
-        if link is None or self._carried is None:
+        """Warp the previous depth and its uncertainty to the current frame, whose own relative sigma is `sigma`."""
+        if correspondence is None or self._carried is None:
             nothing = np.full((camera.height, camera.width), np.nan, np.float32)
             return _Carried(nothing, nothing)
-        warped_mm = pull(self._carried.depth_mm, link.to_previous)
-        warped_mm = np.where(link.consistent, warped_mm, np.float32(np.nan))
+        warped_mm = pull(self._carried.depth_mm, correspondence.to_previous)
+        warped_mm = np.where(correspondence.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
-            warped_mm = moved_depth(warped_mm, link.to_previous, camera, T_current_previous)
+            warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
         filtered_mm = bilateral_filtered(
             warped_mm, self.settings.advanced.filter_sigma_px, self.settings.advanced.filter_sigma_mm
         )
-        warped_share = pull(self._carried.share, link.to_previous)
-        return _Carried(filtered_mm, faded_share(warped_share, share, self.settings.advanced.sigma_fading))
+        warped_sigma = pull(self._carried.relative_sigma, correspondence.to_previous)
+        return _Carried(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.advanced.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""

@@ -32,7 +32,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.least_squares import robust_sigma
 from scopemap.geometry.se3 import se3, so3_exp, transform
-from scopemap.geometry.uncertainty import sigma_share
+from scopemap.geometry.uncertainty import relative_sigma
 from scopemap.geometry.warp import pull
 from scopemap.io.sequence import Sequence
 from scopemap.masking.mask_files import create_masks
@@ -191,7 +191,7 @@ def _pair_fit(
 ) -> PairFit | None:
     """Return the fit with the first partner that flow reaches; None where there is none or it is rejected."""
     estimator, depth_mm, camera = DisFlow(), estimate.values, reference.camera
-    share = None if estimate.sigma is None else sigma_share(depth_mm, estimate.sigma)
+    share = None if estimate.sigma is None else relative_sigma(depth_mm, estimate.sigma)
     for partner in partners:
         flow = _flow_to(reference, partner, estimator, consistency_px)
         if flow is None:

@@ -1,7 +1,7 @@
 """Relative standard deviation of depth per pixel, and the weight that follows from it.
 
-Shares, not millimetres, since an error of predicted depth grows with depth. An unknown sigma (None or NaN)
-is NaN as a share and 1 as a weight, that of the image's median pixel.
+Relative, not in millimetres, since an error of predicted depth grows with depth. An unknown sigma (None or NaN)
+is NaN here and 1 as a weight, that of the image's median pixel.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import numpy as np
 from scopemap.errors import check_shape
 
 # A sigma of 0 or of infinity must not make weights infinite or undefined.
-_MIN_SHARE, _MAX_SHARE = 1e-4, 1e3
+_MIN_SIGMA, _MAX_SIGMA = 1e-4, 1e3
 
 
-def sigma_share(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray:
+def relative_sigma(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray:
     """Return the standard deviation of depth as a share of it, (H, W) float32, 1e-4..1e3; NaN where either is unknown.
 
     depth_mm : (H, W), mm, NaN = unknown. sigma_mm : (H, W), mm, one standard deviation, NaN = unknown; None: all is.
@@ -24,27 +24,27 @@ def sigma_share(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray
     check_shape("sigma_mm", sigma_mm, np.shape(depth_mm))
     with np.errstate(invalid="ignore"):
         known = (depth_mm > 0) & (sigma_mm >= 0)
-        share = np.divide(sigma_mm, depth_mm, out=np.full(np.shape(depth_mm), np.nan, np.float32), where=known)
-    return np.clip(share, _MIN_SHARE, _MAX_SHARE)
+        sigma = np.divide(sigma_mm, depth_mm, out=np.full(np.shape(depth_mm), np.nan, np.float32), where=known)
+    return np.clip(sigma, _MIN_SIGMA, _MAX_SIGMA)
 
 
 def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: float) -> np.ndarray:
     """Return the weight of each pixel's depth relative to the image's median pixel, (H, W) float32, positive.
 
-    (f^2 + m^2) / (f^2 + s^2) with s the pixel's share of `sigma_share`, m its median over the image and f the
-    `floor_share`: the minimum relative error of every pixel. That is the inverse
-    variance of both errors together, 1 at the median: sigma in proportion to depth changes nothing, and neither does
-    any sigma where f is large. 1 where sigma is unknown.
+    (f^2 + m^2) / (f^2 + s^2) with s the pixel's `relative_sigma`, m its median over the image and f the
+    `floor_share`: the minimum relative error of every pixel. That is the inverse variance of both errors together, 1 at
+    the median: sigma in proportion to depth changes nothing, and neither does any sigma where f is large. 1 where sigma
+    is unknown.
     """
-    share = sigma_share(depth_mm, sigma_mm)
-    known = np.isfinite(share)
+    sigma = relative_sigma(depth_mm, sigma_mm)
+    known = np.isfinite(sigma)
     if not known.any():
-        return np.ones(share.shape, dtype=np.float32)
-    floor, median = np.float32(floor_share**2), np.median(share[known]) ** 2
-    return np.where(known, (floor + median) / (floor + share**2), 1.0).astype(np.float32)
+        return np.ones(sigma.shape, dtype=np.float32)
+    floor, median = np.float32(floor_share**2), np.median(sigma[known]) ** 2
+    return np.where(known, (floor + median) / (floor + sigma**2), 1.0).astype(np.float32)
 
 
-def faded_share(carried: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
+def faded_sigma(carried: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
     """Return the relative sigma of a depth from the previous frame, (H, W) float32, after one frame of growth.
 
     Per frame, variance grows by `fading` (0..1) of its difference to the current frame's; it never shrinks. NaN where
@@ -54,24 +54,24 @@ def faded_share(carried: np.ndarray, current: np.ndarray, fading: float) -> np.n
     return np.sqrt(carried**2 + np.float32(fading) * excess)
 
 
-def by_variance(weight: np.ndarray, share: np.ndarray, share_other: np.ndarray) -> np.ndarray:
+def by_variance(weight: np.ndarray, sigma: np.ndarray, sigma_other: np.ndarray) -> np.ndarray:
     """Return the `weight` (H, W) 0..1 of one of two depths, changed by how certain both are, (H, W) float32 0..1.
 
-    The odds weight / (1 - weight) are multiplied by the ratio of the inverse variances, (share_other / share)^2; where
-    either share is NaN the weight stays. Equal shares change nothing, to the last bit.
+    The odds weight / (1 - weight) are multiplied by the ratio of the inverse variances, (sigma_other / sigma)^2; where
+    either is NaN the weight stays. Equal sigmas change nothing, to the last bit.
     """
-    ratio = (share / share_other) ** 2
+    ratio = (sigma / sigma_other) ** 2
     ratio = np.where(np.isfinite(ratio), ratio, np.float32(1.0))
     return weight / (weight + (1 - weight) * ratio)
 
 
-def blended_share(weight: np.ndarray, share: np.ndarray, share_other: np.ndarray) -> np.ndarray:
-    """Return the share of weight * one + (1 - weight) * other, (H, W) float32, where their errors are the same kind.
+def blended_sigma(weight: np.ndarray, sigma: np.ndarray, sigma_other: np.ndarray) -> np.ndarray:
+    """Return the relative sigma of weight * one + (1 - weight) * other, (H, W) float32, their errors correlated.
 
-    weight * share + (1 - weight) * share_other: the standard deviation of a sum of fully correlated errors, since a
+    weight * sigma + (1 - weight) * sigma_other: the standard deviation of a sum of fully correlated errors, since a
     network errs alike on neighbouring frames and their mean is no better than they are. The known one where the other
     is NaN, whatever the weight.
     """
-    one = np.where(np.isfinite(share), share, share_other)
-    other = np.where(np.isfinite(share_other), share_other, share)
+    one = np.where(np.isfinite(sigma), sigma, sigma_other)
+    other = np.where(np.isfinite(sigma_other), sigma_other, sigma)
     return weight * one + (1 - weight) * other

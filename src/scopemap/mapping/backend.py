@@ -19,14 +19,14 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import Solution, adjust, errors_px
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px
 from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_correction
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.map_merging import merge_maps
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
-from scopemap.mapping.reprojection import Points, Priors, Problem, State
+from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
 
 # Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
 _TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
@@ -162,7 +162,7 @@ class Backend:
 
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
-    ) -> tuple[Problem, int]:
+    ) -> tuple[BundleProblem, int]:
         """Return the bundle adjustment of chosen keyframes, from the optimised pose graph, and its accepted loops."""
         settings, own = self.settings, [self._tracked[k] for k in chosen]
         T_world_camera = np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
@@ -172,7 +172,7 @@ class Backend:
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
         pairs = tracked_pairs([self._frames[k] for k in chosen], own)
-        problem = Problem(inverse(T_world_camera), points, observations, priors, pairs, camera.fx)
+        problem = BundleProblem(inverse(T_world_camera), points, observations, priors, pairs, camera.fx)
         loops = [loop.among(chosen, log_unit) for loop in self._loops if {loop.past, loop.new} <= set(chosen)]
         if not loops:
             return problem, 0
@@ -181,7 +181,9 @@ class Backend:
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted_loops
 
-    def _correction(self, index: np.ndarray, problem: Problem, found: Solution, loops: int) -> FrameCorrection:
+    def _correction(
+        self, index: np.ndarray, problem: BundleProblem, found: BundleSolution, loops: int
+    ) -> FrameCorrection:
         """Return the correction by a solution; one that changes nothing where a rigid scene does not explain it."""
         points, state = problem.points, found.state
         if refused := contradiction(points, found, self.settings):
@@ -197,7 +199,7 @@ class Backend:
             depth_mm=_median_depth_mm(points) if len(points.log_depth) else 1.0,
         )
 
-    def _depth_fields(self, points: Points, found: Solution) -> tuple[DepthCorrectionField, ...]:
+    def _depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
         """Fit the depth correction field of each keyframe to its adjusted points."""
         camera, fields = self._camera, []
         assert camera is not None
@@ -211,7 +213,7 @@ class Backend:
         return tuple(fields)
 
 
-def contradiction(points: Points, found: Solution, settings: MappingAdvanced) -> str:
+def contradiction(points: Points, found: BundleSolution, settings: MappingAdvanced) -> str:
     """Return why a rigid scene does not explain the observations, "" where it does."""
     if not found.sigma_px <= settings.max_sigma_px:
         return f"reprojection errors stay at {found.sigma_px:.2f} px (robust standard deviation)"
@@ -232,6 +234,6 @@ def _sigma_px(length_px: np.ndarray) -> float:
     return robust_sigma_2d(length_px) if len(length_px) else float("nan")
 
 
-def _depth_change(points: Points, found: Solution) -> np.ndarray:
+def _depth_change(points: Points, found: BundleSolution) -> np.ndarray:
     """Change of ln depth (P,) of each point, without its keyframe's scale."""
     return found.state.log_depth - points.log_depth - found.state.log_scale[points.host]

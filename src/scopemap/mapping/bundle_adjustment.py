@@ -23,16 +23,16 @@ from scipy import sparse
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, PointBlock, SchurModel, cauchy, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
-from scopemap.mapping.reprojection import Problem, Reprojection, State, jacobians, reproject
+from scopemap.mapping.reprojection import BundleProblem, Reprojection, State, jacobians, reproject
 
-_OWN = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
+_PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 
 
 @dataclass(frozen=True)
-class Solution:
+class BundleSolution:
     """Where the adjustment ended.
 
     Attributes
@@ -52,7 +52,7 @@ class Solution:
         return self.state.sigma_px
 
 
-def adjust(problem: Problem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> Solution:
+def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
     """Return the solution that the search finds from the start; without observations everything stays as tracked.
 
     The scale of the reprojection errors is estimated anew after every accepted step: which are outliers is judged as
@@ -60,7 +60,7 @@ def adjust(problem: Problem, *, max_iterations: int = 20, min_decrease: float = 
     """
     start = problem.tracked if problem.start is None else problem.start
     if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
-        return Solution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
+        return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
     def rescaled(state: State) -> State:
         reprojection = reproject(problem, state)
@@ -71,10 +71,10 @@ def adjust(problem: Problem, *, max_iterations: int = 20, min_decrease: float = 
     search = least_squares.Problem(partial(linearised, problem), partial(_retract, problem), rescaled)
     found = minimise(search, rescaled(start), options)
     state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
-    return Solution(state, _log_depth_sigma(problem, state), found.iterations)
+    return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
-def errors_px(problem: Problem, found: Solution) -> np.ndarray:
+def errors_px(problem: BundleProblem, found: BundleSolution) -> np.ndarray:
     """Return the lengths of the reprojection errors (N,), px; infinite behind a camera."""
     if not len(problem.observations.point):
         return np.zeros(0)
@@ -86,28 +86,30 @@ def _weights(state: State, seen: Reprojection) -> np.ndarray:
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, _CAUCHY)[1], 0) / state.sigma_px**2
 
 
-def linearised(problem: Problem, state: State) -> SchurModel:
+def linearised(problem: BundleProblem, state: State) -> SchurModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
     count, lens = len(state.T_camera_world), 0 if problem.lens is None else 2
     seen = reproject(problem, state)
-    chain = _chain(problem, state)
-    held = [6 + _OWN * np.arange(count)] if problem.priors.scale == 0 else []
-    free = np.setdiff1d(np.arange(_OWN * count + lens), np.concatenate([np.arange(6), *held]))
+    edges = _odometry_edges(problem, state)
+    held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
+    free = np.setdiff1d(np.arange(_PER_KEYFRAME * count + lens), np.concatenate([np.arange(6), *held]))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
         parts = _Rows(seen.error, _weights(state, seen), *jacobians(problem, state, seen))
         hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
-        return hosts, _camera_blocks(problem, state, chain)
+        return hosts, _camera_blocks(problem, state, edges)
 
-    return SchurModel(_cost(problem, state, seen, chain), build, free, _OWN * count + lens, len(state.log_depth))
+    return SchurModel(
+        _cost(problem, state, seen, edges), build, free, _PER_KEYFRAME * count + lens, len(state.log_depth)
+    )
 
 
-def _cost(problem: Problem, state: State, seen: Reprojection, chain: list[_Link]) -> float:
+def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[_OdometryEdge]) -> float:
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
     cost = cauchy(square, _CAUCHY)[0].sum() + cauchy(depth**2, _CAUCHY)[0].sum()
-    cost += 0.5 * sum(float(link.error @ (link.information * link.error)) for link in chain)
+    cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
     if problem.lens is not None:
@@ -115,34 +117,36 @@ def _cost(problem: Problem, state: State, seen: Reprojection, chain: list[_Link]
     return float(cost)
 
 
-class _Link(NamedTuple):
+class _OdometryEdge(NamedTuple):
     i: int
     j: int
     error: np.ndarray  # (6,) twist
     information: np.ndarray  # (6,)
 
 
-def _chain(problem: Problem, state: State) -> list[_Link]:
+def _odometry_edges(problem: BundleProblem, state: State) -> list[_OdometryEdge]:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
     information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
     return [
-        _Link(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
+        _OdometryEdge(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
         for i, j in problem.neighbours
     ]
 
 
-def _camera_blocks(problem: Problem, state: State, chain: list[_Link]) -> list[CameraBlock]:
+def _camera_blocks(problem: BundleProblem, state: State, edges: list[_OdometryEdge]) -> list[CameraBlock]:
     T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
-    for i, j, error, information in chain:
-        own = np.append(_OWN * i + np.arange(6), _OWN * j + np.arange(6))
+    for i, j, error, information in edges:
+        own = np.append(_PER_KEYFRAME * i + np.arange(6), _PER_KEYFRAME * j + np.arange(6))
         J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
         blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
     if problem.priors.scale > 0:
         information = np.full(len(T), problem.priors.scale**-2.0)
-        blocks.append(CameraBlock(6 + _OWN * np.arange(len(T)), np.diag(information), information * state.log_scale))
+        blocks.append(
+            CameraBlock(6 + _PER_KEYFRAME * np.arange(len(T)), np.diag(information), information * state.log_scale)
+        )
     if problem.lens is not None:
-        information, own = problem.lens.sigma**-2.0, _OWN * len(T) + np.arange(2)
+        information, own = problem.lens.sigma**-2.0, _PER_KEYFRAME * len(T) + np.arange(2)
         blocks.append(CameraBlock(own, np.diag(information), information * (state.lens - problem.tracked.lens)))
     return blocks
 
@@ -158,7 +162,7 @@ class _Rows(NamedTuple):
     by_lens: np.ndarray  # (N, 2, 2), or (N, 2, 0)
 
 
-def _host_block(problem: Problem, state: State, host: int, parts: _Rows) -> PointBlock:
+def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -> PointBlock:
     """Return the normal equations of the points of one host."""
     points, observations = problem.points, problem.observations
     here = slice(*np.searchsorted(points.host, (host, host + 1)))
@@ -166,10 +170,10 @@ def _host_block(problem: Problem, state: State, host: int, parts: _Rows) -> Poin
     error, weight, by_camera, by_host, by_depth, by_lens = (part[some] for part in parts)
     keyframes = np.union1d(observations.keyframe[some], host)
     size, count, at = len(error), here.stop - here.start, int(np.searchsorted(keyframes, host))
-    J: np.ndarray = np.zeros((size, 2, len(keyframes), _OWN))
+    J: np.ndarray = np.zeros((size, 2, len(keyframes), _PER_KEYFRAME))
     J[np.arange(size), :, np.searchsorted(keyframes, observations.keyframe[some]), :6] = by_camera
     J[:, :, at, :6] += by_host
-    J = np.concatenate([J.reshape(size, 2, _OWN * len(keyframes)), by_lens], -1)
+    J = np.concatenate([J.reshape(size, 2, _PER_KEYFRAME * len(keyframes)), by_lens], -1)
     rows = J.reshape(2 * size, J.shape[-1])
     A = rows.T @ (np.repeat(weight, 2)[:, None] * rows)
     number = observations.point[some] - here.start
@@ -180,17 +184,17 @@ def _host_block(problem: Problem, state: State, host: int, parts: _Rows) -> Poin
         for by in (by_depth, error)
     )
     # The prior of the estimated depth, up to the host's scale.
-    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], _OWN * at + 6
+    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], _PER_KEYFRAME * at + 6
     held = cauchy((off / points.sigma[here]) ** 2, _CAUCHY)[1] / points.sigma[here] ** 2
     E[:, column] -= held
     A[column, column] += held.sum()
     scores[:, column] -= held * off
-    columns = (_OWN * keyframes[:, None] + np.arange(_OWN)).ravel()
-    columns = np.append(columns, _OWN * len(state.T_camera_world) + np.arange(by_lens.shape[2]))
+    columns = (_PER_KEYFRAME * keyframes[:, None] + np.arange(_PER_KEYFRAME)).ravel()
+    columns = np.append(columns, _PER_KEYFRAME * len(state.T_camera_world) + np.arange(by_lens.shape[2]))
     return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
 
 
-def _log_depth_sigma(problem: Problem, state: State) -> np.ndarray:
+def _log_depth_sigma(problem: BundleProblem, state: State) -> np.ndarray:
     seen = reproject(problem, state)
     by_depth = jacobians(problem, state, seen)[2]
     information = _weights(state, seen) * (by_depth**2).sum(1)
@@ -206,10 +210,10 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
-def _retract(problem: Problem, state: State, step: np.ndarray) -> State:
+def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
-    count = _OWN * len(state.T_camera_world)
-    own = step[:count].reshape(-1, _OWN)
+    count = _PER_KEYFRAME * len(state.T_camera_world)
+    own = step[:count].reshape(-1, _PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
     lens = state.lens if problem.lens is None else state.lens + step[count : count + 2]

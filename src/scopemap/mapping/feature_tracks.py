@@ -14,7 +14,7 @@ from scopemap.config import MappingSettings
 from scopemap.flow.corners import detect_corners, match_corners
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
-from scopemap.geometry.uncertainty import sigma_share
+from scopemap.geometry.uncertainty import relative_sigma
 from scopemap.mapping.loop_closure import Loop
 from scopemap.mapping.reprojection import Observations, Points
 
@@ -65,7 +65,7 @@ class FeatureTracks:
         rows, columns = corners[:, 1], corners[:, 0]
         self._camera = keyframe.camera
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
-        share = sigma_share(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
+        share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self._keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         recent = self._recent[map_number]
         number_in_map = recent[-1].number_in_map + 1 if recent else 0

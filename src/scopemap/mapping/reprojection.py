@@ -67,7 +67,7 @@ class UnknownLens:
 
 
 @dataclass(frozen=True)
-class Problem:
+class BundleProblem:
     """What is adjusted.
 
     Attributes
@@ -120,7 +120,7 @@ class Reprojection(NamedTuple):
     straight: np.ndarray  # (N, 2) px, through a lens without distortion
 
 
-def reproject(problem: Problem, state: State) -> Reprojection:
+def reproject(problem: BundleProblem, state: State) -> Reprojection:
     """Return where the points of a state are projected, against where they were observed."""
     points, observations, T = problem.points, problem.observations, state.T_camera_world
     focal, host = np.exp(state.lens[0]), points.host[observations.point]
@@ -137,7 +137,7 @@ def reproject(problem: Problem, state: State) -> Reprojection:
     return Reprojection(error, ahead, seen, in_host, R, straight)
 
 
-def _square(problem: Problem, pixel: np.ndarray) -> np.ndarray:
+def _square(problem: BundleProblem, pixel: np.ndarray) -> np.ndarray:
     """Squared distance (n, 1) from the principal point in half widths; 0 where the lens is known."""
     if problem.lens is None:
         return np.zeros((len(pixel), 1))
@@ -145,12 +145,12 @@ def _square(problem: Problem, pixel: np.ndarray) -> np.ndarray:
     return square
 
 
-def _undistorted(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
+def _undistorted(problem: BundleProblem, pixel: np.ndarray, b: float) -> np.ndarray:
     undistorted: np.ndarray = pixel * (1 + b * _square(problem, pixel))
     return undistorted
 
 
-def _distorted(problem: Problem, straight: np.ndarray, b: float) -> np.ndarray:
+def _distorted(problem: BundleProblem, straight: np.ndarray, b: float) -> np.ndarray:
     """Return the pixels (n, 2) that `_undistorted` takes to `straight`, by Newton's method on the radius."""
     if problem.lens is None or b == 0:
         return straight
@@ -162,7 +162,7 @@ def _distorted(problem: Problem, straight: np.ndarray, b: float) -> np.ndarray:
 
 
 def jacobians(
-    problem: Problem, state: State, seen: Reprojection
+    problem: BundleProblem, state: State, seen: Reprojection
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivatives of pixels by twists of the observing camera and of the host (N, 2, 6), ln depth and lens.
 
@@ -192,7 +192,7 @@ def jacobians(
     return _by_twist(by_point, seen.point, unit_mm), -_by_twist(by_host, seen.in_host, unit_mm), by_depth, by_lens
 
 
-def _by_straight(problem: Problem, pixel: np.ndarray, b: float) -> np.ndarray:
+def _by_straight(problem: BundleProblem, pixel: np.ndarray, b: float) -> np.ndarray:
     """Derivative (n, 2, 2) of `_distorted` where it leads to `pixel`: the inverse of that of `_undistorted`."""
     assert problem.lens is not None
     square = _square(problem, pixel)[..., None]

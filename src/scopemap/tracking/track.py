@@ -51,10 +51,10 @@ class FrameTracker(Protocol):
         The first usable frame is "initial" and fixes the world.
         """
 
-    def wants_keyframe(self) -> bool:
+    def needs_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a reference for those to come."""
 
-    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its refined depth and its pose, the reference; False where it cannot be one."""
 
 

@@ -88,7 +88,7 @@ class Tracker:
             return self._lost(frame, f"rejected: {rejected}", alignment)
         return self._accept(frame, self._keyframe, alignment, reason)
 
-    def wants_keyframe(self) -> bool:
+    def needs_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
         if self._keyframe is None:
             return True
@@ -99,7 +99,7 @@ class Tracker:
         few_corners = self._coverage < _KEYFRAME_COVERAGE
         return (is_due or fits_worse or few_corners) and not self._is_unsharp
 
-    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
 
         measured : whether the depth is measured, not predicted; only then tangent planes are taken from it.

@@ -143,11 +143,11 @@ class Open3dTracker:
         self._T_world_last = reference.frame.T_world_camera @ T_reference_current
         return Track(frame.index, "ok", "", self._T_world_last, index)
 
-    def wants_keyframe(self) -> bool:
+    def needs_keyframe(self) -> bool:
         """Return True: every tracked frame is the reference of the next one."""
         return True
 
-    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame the reference; False where too little of its depth is known.
 
         `measured` makes no difference. Raises `ValueError` for a frame without pose.

@@ -32,10 +32,10 @@ class StandingStill:
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
         return Track(frame.index, "ok", "", np.eye(4), reference)
 
-    def wants_keyframe(self) -> bool:
+    def needs_keyframe(self) -> bool:
         """Return False: it uses no keyframes."""
         return False
 
-    def adopt(self, frame: Frame, *, measured: bool) -> bool:
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Return False: it uses no keyframes."""
         return False

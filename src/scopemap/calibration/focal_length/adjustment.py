@@ -16,7 +16,7 @@ import numpy as np
 
 from scopemap.calibration.focal_length.windows import Window
 from scopemap.mapping.bundle_adjustment import adjust, linearised
-from scopemap.mapping.reprojection import Observations, Points, Priors, Problem, State, UnknownLens
+from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors, State, UnknownLens
 
 _LOG_DEPTH_SIGMA, _DISTORTION_SIGMA, _LOG_FOCAL_SIGMA = 1.0, 0.3, 1.0
 _NO_DISTORTION_SIGMA = 1e-4
@@ -67,7 +67,7 @@ def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
     return WindowFit(float(state.lens[0]), deviation, state.sigma_px, tilt_deg, float(state.lens[1]))
 
 
-def _problem(window: Window, focal_px: float) -> Problem:
+def _problem(window: Window, focal_px: float) -> BundleProblem:
     """Return the bundle adjustment of a window: the host is keyframe 0, its partners follow."""
     squeeze = np.array([1.0, window.aspect])
     corners, partners = window.seen.shape[:2]
@@ -78,10 +78,12 @@ def _problem(window: Window, focal_px: float) -> Problem:
     observations = Observations(corner, partner + 1, window.seen[corner, partner] / squeeze)
     T_camera_world, neighbours = np.tile(np.eye(4), (partners + 1, 1, 1)), np.zeros((0, 2), int)
     priors = Priors(scale=0.0)
-    return Problem(T_camera_world, points, observations, priors, neighbours, focal_px, least_sigma_px=_MIN_SIGMA_PX)
+    return BundleProblem(
+        T_camera_world, points, observations, priors, neighbours, focal_px, least_sigma_px=_MIN_SIGMA_PX
+    )
 
 
-def _log_focal_deviation(problem: Problem, state: State) -> float:
+def _log_focal_deviation(problem: BundleProblem, state: State) -> float:
     """Return the cluster-robust standard deviation of ln f, all else marginalised; NaN where it is undetermined."""
     model = linearised(problem, state)
     (block,), free = model.blocks[0], model.free
