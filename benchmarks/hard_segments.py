@@ -1,6 +1,6 @@
 """What becomes of frames that show nothing, of places seen again, and of a wall without texture; as Markdown.
 
-    python benchmarks/hard_stretches.py [--only veiled|loop|cut|bare]
+    python benchmarks/hard_segments.py [--only veiled|loop|cut|bare]
 
 Phantoms drawn by our own code, scopenet, DIS flow, no surface. veiled: 200 frames, of which 10 are black, 10 blurred
 and 10 full of smoke; errors of the clear frames alone, in the same run without that and in this one. loop: 601 frames
