@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from drawn_bags import write_bag1, write_mcap, write_ros2
 from drawn_calibrations import CAMERAS, write_forms
+from drawn_climb import write_clip
 from drawn_dicom import write_dicom_video, write_frames
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
@@ -70,6 +71,7 @@ WRITERS: dict[str, Writer] = {
     "endoslam:real": lambda folder: write_real(folder / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1"),
     "stereomis": write_stereomis,
     "endomapper": write_endomapper_with_model,
+    "climb": write_clip,
     "endomapper-sim": write_sim,
     "colmap:txt": write_colmap,
     "colmap:bin": lambda folder: write_colmap(folder, "bin"),

@@ -25,7 +25,7 @@ from stored_frames import (
     scene_points,
 )
 from test_datasets_colmap import CAMERA as COLMAP_CAMERA
-from test_datasets_colmap import binary_images, write_model
+from test_datasets_colmap import binary_images, text_images, write_model
 from test_datasets_endomapper import archive_of, write_models
 from test_datasets_endomapper_sim import HEADER as SIM_HEADER
 from test_datasets_endonerf import llff
@@ -142,6 +142,17 @@ def _model_archive(folder: Path, content: Content) -> None:
     posed = [(f"out{number + 1}.png", 1, _world_to_camera(T)) for number, T in content.poses.items()]
     write_models(archive_of(folder), {0: binary_images(posed)})
     _damaged(archive_of(folder), content)
+
+
+def _climb_reference(folder: Path, content: Content) -> None:
+    posed = []
+    for number, T in sorted(content.poses.items()):
+        stored = T.copy()
+        stored[:3, 3] /= 2  # scales.csv: 2 mm per unit
+        posed.append((f"{number + 1:06d}.png", 1, _world_to_camera(stored)))
+    file = folder / "results_txt" / "images.txt"
+    file.write_text(text_images(posed))
+    _damaged(file, content)
 
 
 def _model(form: str) -> Put:
@@ -276,6 +287,7 @@ KINDS: dict[str, Kind] = {
         poses="quaternions",
     ),
     "endomapper": Kind((movie("Seq_001.mov"), _model_archive), pictures="video", poses="quaternions"),
+    "climb": Kind((movie("../Seq_001_a.mp4"), _climb_reference), pictures="video", poses="quaternions"),
     "endomapper-sim": Kind(
         (
             pictures("rgb/image_{:04d}.png"),

@@ -25,7 +25,8 @@ from scopemap.trajectory.trajectory import write_tum
 
 KNOWS_POSES = sorted(
     {"c3vd", "c3vd:v2", "c3vd:endogslam", "7-scenes", "scared", "scared-c", "endonerf", "tum", "oneslam", "simcol3d"}
-    | {"endoslam:unity", "endoslam:real", "stereomis", "endomapper", "endomapper-sim", "colmap:txt", "colmap:bin"}
+    | {"endoslam:unity", "endoslam:real", "stereomis", "endomapper", "climb", "endomapper-sim"}
+    | {"colmap:txt", "colmap:bin"}
 )
 KNOWS_DEPTH_ONLY = ["hamlyn", "hamlyn-tracking", "serv-ct"]
 

@@ -66,7 +66,7 @@ def reconstruct(
     """
     config, clock = config or Config(), _Clock()
     folder = None if out is None else Path(out)
-    estimators = create_estimators(config, sequence)
+    estimators = clock.timed("prepare", create_estimators, config, sequence)
     write = None
     if folder is not None:
         _refuse_own_input(folder, sequence, config)

@@ -15,6 +15,7 @@ from scopemap.cli.calibrate import calibrate
 from scopemap.cli.compare import compare
 from scopemap.cli.demo import demo
 from scopemap.cli.evaluate import evaluate
+from scopemap.cli.export import export
 from scopemap.cli.inspect import inspect
 from scopemap.cli.phantom import phantom
 from scopemap.cli.run import run
@@ -26,7 +27,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, demo, inspect, evaluate, compare, bench, phantom, calibrate):
+for command in (run, demo, inspect, evaluate, compare, bench, export, phantom, calibrate):
     app.command()(command)
 app.add_typer(models.app, name="models")
 app.add_typer(datasets.app, name="datasets")

@@ -58,7 +58,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             help="Also another protocol's figures, may be repeated: evo, af, endogslam, surgcut3r, free-surgs, simcol, "
-            "robust-pose-estimator, oneslam."
+            "robust-pose-estimator, oneslam, climb."
         ),
     ] = None,
     icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,

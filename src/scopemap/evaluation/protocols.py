@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.special import stdtrit
 
+from scopemap.evaluation.climb import LEAST_FRAMES, climb_figures
 from scopemap.evaluation.poses import (
     ErrorSummary,
     frame_pairs,
@@ -41,13 +42,13 @@ class Protocol:
     name : as in `PROTOCOLS`.
     description : one sentence: alignment, pairs, unit, deviations from evo.
     source : the repository and file that define it.
-    measure : from estimated and reference camera-to-world poses, (N, 4, 4) mm, to figures without the name's prefix.
+    measure : from estimate and reference to figures without the name's prefix.
     """
 
     name: str
     description: str
     source: str
-    measure: Callable[[np.ndarray, np.ndarray], dict[str, float]]
+    measure: Callable[[Trajectory, Trajectory], dict[str, float]]
 
     def __call__(self, estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
         """Return the figures over the tracked frames; each name begins with the protocol's and ends with its unit.
@@ -55,11 +56,20 @@ class Protocol:
         NaN where too few frames give a figure. Raises `AlignmentError` where fewer than 3 tracked frames match or a fit
         is degenerate.
         """
-        matched = match(estimate, reference, "none")
-        ok = matched.tracked
         prefix = self.name.replace("-", "_")
-        figures = self.measure(matched.estimated[ok], matched.reference[ok])
-        return {f"{prefix}_{name}": float(value) for name, value in figures.items()}
+        return {f"{prefix}_{name}": float(value) for name, value in self.measure(estimate, reference).items()}
+
+
+def _of_poses(
+    measure: Callable[[np.ndarray, np.ndarray], dict[str, float]],
+) -> Callable[[Trajectory, Trajectory], dict[str, float]]:
+    """Return a measure of trajectories by the matched poses of tracked frames, (N, 4, 4) each, camera-to-world, mm."""
+
+    def measured(estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
+        matched = match(estimate, reference, "none")
+        return measure(matched.estimated[matched.tracked], matched.reference[matched.tracked])
+
+    return measured
 
 
 def _errors(aligned: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> dict[str, ErrorSummary]:
@@ -240,7 +250,7 @@ _ALL = (
         "evo_ape and evo_rpe with no, SE3 (-a) and Sim3 (-as) alignment on all matched frames, mm and deg, RPE over "
         "1 frame.",
         "MichaelGrupp/evo: evo/core/metrics.py",
-        _evo,
+        _of_poses(_evo),
     ),
     Protocol(
         "af",
@@ -249,14 +259,14 @@ _ALL = (
         "(not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and deviation over "
         "snippets.",
         "ShuweiShao/AF-SfMLearner: evaluate_pose.py; BeileiCui/EndoDAC: evaluate_pose.py",
-        _af,
+        _of_poses(_af),
     ),
     Protocol(
         "endogslam",
         "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first camera "
         "(as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
         "Loping151/EndoGSLAM: utils/eval_helpers.py",
-        _endogslam,
+        _of_poses(_endogslam),
     ),
     Protocol(
         "surgcut3r",
@@ -264,35 +274,43 @@ _ALL = (
         "least-squares scale, RMSE in mm: global over the path, local over successive windows of 16 frames, each "
         "aligned on its own, the rest dropped.",
         "chumo-xu/SurgCUT3R: unified_evaluation_framework/core/pose_evaluator.py",
-        _surgcut3r,
+        _of_poses(_surgcut3r),
     ),
     Protocol(
         "free-surgs",
         "Sim3 alignment of world-to-camera matrices taken as poses, world = first camera (c2w: of camera-to-world "
         "poses), ATE RMSE in mm, mean RPE over 1 frame in mm and deg.",
         "wrld/Free-SurGS: train.py, utils/geometry_utils.py",
-        _free_surgs,
+        _of_poses(_free_surgs),
     ),
     Protocol(
         "simcol",
         "First cameras put onto each other, one least-squares scale between the translations from frame to frame, "
         "median position error, median relative error over 1 frame in mm and deg.",
         "anitarau/simcol: evaluation/eval_synthetic_pose.py",
-        _simcol,
+        _of_poses(_simcol),
     ),
     Protocol(
         "robust-pose-estimator",
         "Horn's SE3 alignment without scale on all matched frames, RMSE of the position in mm, mean of the relative "
         "error over 1 frame in mm and rad.",
         "aimi-lab/robust-pose-estimator: alley_oop/metrics/trajectory_metrics.py",
-        _robust_pose_estimator,
+        _of_poses(_robust_pose_estimator),
     ),
     Protocol(
         "oneslam",
         "evo after Sim3 alignment on all matched frames, RMSE in mm and deg, RPE over all pairs 1 mm apart (within "
         "10 %) along the aligned estimate, not along the reference.",
         "MUZAMMILATEO/OneSLAM: README.md",
-        _oneslam,
+        _of_poses(_oneslam),
+    ),
+    Protocol(
+        "climb",
+        "Every submap aligned by its own Sim3, frames of an earlier submap left out, submaps with fewer than "
+        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in mm "
+        "and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
+        "EndoCartoScope/climb-challenge: evaluation/evaluation_utils.py, 79d7435",
+        climb_figures,
     ),
 )
 PROTOCOLS = {protocol.name: protocol for protocol in _ALL}

@@ -17,6 +17,7 @@ from scopemap.cameras.rectification import Rectifier, working_camera, working_si
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.c3vd import C3vdFolder
+from scopemap.io.datasets.climb import ClimbClip
 from scopemap.io.datasets.colmap import ColmapFolder
 from scopemap.io.datasets.dicom import Dicom
 from scopemap.io.datasets.endomapper import EndoMapperSequence
@@ -52,6 +53,7 @@ _KINDS: tuple[type[Reader], ...] = (
     EndoSlamFolder,
     SimColFolder,
     EndoMapperSequence,
+    ClimbClip,
     EndoMapperSimFolder,
     StereoMisFolder,
     C3vdFolder,

@@ -28,6 +28,7 @@ class Trajectory:
     status : (N,) of str: "initial", "ok" or "lost".
     has_indices : False where the file gave only times; `indices` then are row numbers and match nothing.
     source : what was read, and the convention and unit that were stated or assumed; empty where nothing was read.
+    others : the other submaps, each in a world and a scale of its own.
     """
 
     indices: np.ndarray
@@ -36,6 +37,7 @@ class Trajectory:
     status: np.ndarray
     has_indices: bool = True
     source: str = ""
+    others: tuple[Trajectory, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.indices)

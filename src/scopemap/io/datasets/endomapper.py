@@ -38,10 +38,7 @@ class EndoMapperSequence(PosedVideo):
         named = [file for file in videos if _PROCEDURE.fullmatch(file.stem)] or videos
         video = only_video(path, named, "an EndoMapper procedure holds one Seq_NNN.mov")
         super().__init__(path, video)
-        if self.camera is None:
-            file = self._calibration_file(path / f"{video.stem}_info.json")
-            if file is not None:
-                self._set_camera(stated_calibration(file, (self.width, self.height)).camera, file)
+        self._use_endoscope(path / f"{video.stem}_info.json")
         self._take_poses(path / "meta-data" / "colmap" / f"{video.stem}.zip")
 
     @staticmethod
@@ -49,6 +46,12 @@ class EndoMapperSequence(PosedVideo):
         """Return whether `path` holds `Seq_NNN.mov`, or a video of another name beside a geometrical calibration."""
         videos = videos_in(path, ".mov")
         return any(_PROCEDURE.fullmatch(file.stem) or any(path.glob(f"*{_GEOMETRICAL}")) for file in videos)
+
+    def _use_endoscope(self, info: Path) -> None:
+        """Take the calibration of the endoscope that the info file names, unless the folder has its own camera."""
+        file = self._calibration_file(info) if self.camera is None else None
+        if file is not None:
+            self._set_camera(stated_calibration(file, (self.width, self.height)).camera, file)
 
     def _calibration_file(self, info: Path) -> Path | None:
         number = read_endoscope(info) if info.is_file() else None

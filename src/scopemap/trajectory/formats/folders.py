@@ -20,11 +20,22 @@ from scopemap.trajectory.trajectory import MM_PER_UNIT, SKIPPED, STATUSES, Traje
 _SAME_TIME_S = 2e-3
 
 
+def submap_folders(run: Path) -> list[Path]:
+    """Return the folders of a run's submaps, its own first, then `maps/1`, `maps/2`, ..."""
+    found = [file.parent for file in run.glob("maps/*/trajectory.tum") if file.parent.name.isdecimal()]
+    return [run, *sorted(found, key=lambda folder: int(folder.name))]
+
+
 def read_run(folder: Path, unit: Unit) -> Trajectory:
-    """Read `trajectory.tum` and `frames.csv` of a run, always mm, with frame numbers and lost frames.
+    """Read `trajectory.tum` and `frames.csv` of a run and its submaps, always mm, with frame numbers and lost frames.
 
     Frames that the run skipped have no pose, and are left out.
     """
+    first, *others = map(_read_run_submap, submap_folders(folder))
+    return replace(first, others=tuple(others))
+
+
+def _read_run_submap(folder: Path) -> Trajectory:
     table = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
     indices, times_s, status = _read_frames(folder / "frames.csv")
     same_run = len(indices) == len(table.values) and np.abs(times_s - table.values[:, 0]).max() <= _SAME_TIME_S

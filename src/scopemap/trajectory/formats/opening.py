@@ -9,7 +9,7 @@ from pathlib import Path
 
 from scopemap.cameras.formats.colmap import is_image_line
 from scopemap.errors import InputError, SettingsError
-from scopemap.trajectory.formats import colmap, folders, open3d_log, scared, splatam, text
+from scopemap.trajectory.formats import climb, colmap, folders, open3d_log, scared, splatam, text
 from scopemap.trajectory.trajectory import Trajectory, Unit
 
 Reader = Callable[[Path, Unit], Trajectory]
@@ -28,6 +28,7 @@ READERS: dict[str, Reader] = {
     "open3d": open3d_log.read_open3d,
     "endo-depth": open3d_log.read_endo_depth,
     "colmap": colmap.read_colmap,
+    "climb": climb.read_climb,
 }
 KINDS = ("auto", *READERS)
 
@@ -75,6 +76,7 @@ _FOLDERS: tuple[tuple[str, tuple[str, ...], Reader], ...] = (
     ("endogslam, splatam", (splatam.PARAMS_FILE,), splatam.read_params),
     ("open3d, endo-depth", (open3d_log.LOG_FILE,), _refuse_log),
     ("colmap", colmap.COLMAP_FILES, colmap.read_colmap),
+    ("climb", climb.CLIMB_FILES, climb.read_climb),
 )
 
 

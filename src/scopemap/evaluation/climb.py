@@ -1,0 +1,59 @@
+"""Pose errors as the CLiMB challenge (EndoVis at MICCAI 2026) computes them: every submap by its own Sim(3).
+
+Source: EndoCartoScope/climb-challenge at 79d7435, evaluation/evaluation_utils.py. One difference: where no two frames
+are as far apart as an RPE asks for, it is NaN here and 0 there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.evaluation.poses import ErrorSummary, associate, relative_errors, translation_errors_mm
+from scopemap.geometry.align import align_trajectories
+from scopemap.trajectory.trajectory import Trajectory
+
+LEAST_FRAMES = 250
+"""Frames of the reference that a submap needs to count, 5 s of video; 100 before the challenge's commit 79d7435."""
+
+_RPE_FRAMES = (1, 10, 20, 40)
+_RPE_NAMES = tuple(f"rpe_{step}_mean_{unit}" for step in _RPE_FRAMES for unit in ("mm", "deg"))
+_ERRORS = ("ate_mean_mm", "ate_median_mm", "ate_std_mm", *_RPE_NAMES)
+
+
+def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
+    """Return ATE, RPE, TFR and counts of the estimate and its other submaps; errors are NaN where no submap counts.
+
+    A submap takes the reference frames that no earlier one has, and counts with at least `LEAST_FRAMES` of them. Errors
+    are means over the submaps, weighted by these frames (`matched_poses`). `tfr_percent` is the share of the
+    reference's poses that are matched. Raises `AlignmentError` for a submap that stands still or moves on a line.
+    """
+    known = free = reference.rows(reference.tracked)
+    errors: list[list[float]] = []
+    matched: list[int] = []
+    for submap in (estimate, *estimate.others):
+        own = submap.rows(submap.tracked)
+        rows, rows_free = associate(own, free)
+        if len(rows) < LEAST_FRAMES:
+            continue
+        errors.append(_errors(own.T_world_camera[rows], free.T_world_camera[rows_free], free.indices[rows_free]))
+        matched.append(len(rows))
+        free = free.rows(np.setdiff1d(np.arange(len(free)), rows_free))
+    means = np.average(errors, axis=0, weights=matched) if matched else np.full(len(_ERRORS), np.nan)
+    return dict(zip(_ERRORS, means.tolist(), strict=True)) | {
+        "tfr_percent": 100.0 * sum(matched) / max(len(known), 1),
+        "submaps": float(len(matched)),
+        "matched_poses": float(sum(matched)),
+        "reference_poses": float(len(known)),
+    }
+
+
+def _errors(estimated: np.ndarray, reference: np.ndarray, frames: np.ndarray) -> list[float]:
+    """Return the errors, named by `_ERRORS`, of poses (N, 4, 4) of `frames` (N,), ascending, after Sim(3)."""
+    aligned, _ = align_trajectories(estimated, reference, "sim3")
+    ate = ErrorSummary.of(translation_errors_mm(aligned, reference))
+    errors = [ate.mean, ate.median, ate.std]
+    for step in _RPE_FRAMES:
+        _, first, second = np.intersect1d(frames, frames - step, return_indices=True)
+        rpe_mm, rpe_rad = relative_errors(aligned, reference, np.stack([first, second], axis=1))
+        errors += [ErrorSummary.of(rpe_mm).mean, float(np.degrees(ErrorSummary.of(rpe_rad).mean))]
+    return errors

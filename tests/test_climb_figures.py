@@ -1,0 +1,205 @@
+"""The CLiMB protocol: a case worked out by hand, evo as referee, submaps, and the files that it reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_climb import frames_of, path_of, submap_text, write_foreign_run, write_reference
+from front_door import refused
+from typer.testing import CliRunner
+
+from scopemap.cli import app
+from scopemap.errors import AlignmentError, InputError
+from scopemap.evaluation import climb
+from scopemap.evaluation.climb import LEAST_FRAMES, climb_figures
+from scopemap.evaluation.protocols import PROTOCOLS
+from scopemap.geometry.align import Similarity
+from scopemap.geometry.se3 import se3_exp, so3_exp
+from scopemap.trajectory.formats.climb import read_climb_reference, read_submap, write_submap
+from scopemap.trajectory.formats.opening import read_trajectory
+
+QUARTER_TURN = Similarity(10.0, so3_exp(np.array([0, 0, np.pi / 2])), np.array([5.0, -3.0, 2.0]))
+
+
+def at(*positions: tuple[float, float, float], turned_deg: float = 0.0) -> np.ndarray:
+    """Poses at these positions, each turned about its x axis by `turned_deg` more than the one before."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    poses[:, :3, :3] = [so3_exp(np.array([np.radians(turned_deg * k), 0, 0])) for k in range(len(positions))]
+    return poses
+
+
+def by_hand() -> tuple[np.ndarray, np.ndarray]:
+    """A cross whose arms are 3 and 1 mm long, and its estimate, whose arms are 2 mm.
+
+    No rotation fits better than none, and the best scale is sum p.q / sum p.p = (6 + 6 + 2 + 2) / 16 = 1: every
+    position is 1 mm off, by (-1, 0), (0, 1), (1, 0), (0, -1). From frame to frame these change by (1, 1), (1, -1) and
+    (-1, -1): sqrt 2 mm each.
+    """
+    true = at((3, 0, 0), (0, 1, 0), (-3, 0, 0), (0, -1, 0))
+    return at((2, 0, 0), (0, 2, 0), (-2, 0, 0), (0, -2, 0)), true
+
+
+def evaluated(run: Path, truth: Path) -> dict[str, float]:
+    done = CliRunner().invoke(app, ["evaluate", str(run), "--truth", str(truth), "--protocol", "climb", "--json"])
+    assert done.exit_code == 0, (done.output, done.exception)
+    return json.loads(done.stdout)["climb"]
+
+
+def test_a_case_worked_out_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(climb, "LEAST_FRAMES", 4)
+    estimate, true = by_hand()
+    # Frames 5 to 14 as they are, but turned by 2 degrees more from frame to frame.
+    rest = at(*((k, k % 3, k * k / 10) for k in range(10)))
+    turned = at(*((k, k % 3, k * k / 10) for k in range(10)), turned_deg=2.0)
+    truth = write_reference(tmp_path / "truth", np.concatenate([true, rest, at(*((9, 9, k) for k in range(6)))]))
+    first = (QUARTER_TURN.transform_poses(estimate), [1, 2, 3, 4])
+    # It has frames 1 and 4, too, far off: they are the first submap's.
+    second = (np.concatenate([at((70, 0, 0), (0, 0, 70)), turned]), [1, 4, *range(5, 15)])
+    third = (at((0, 0, 0), (0, 1, 0), (2, 0, 0)), [15, 16, 17])
+    figures = evaluated(write_foreign_run(tmp_path / "run", first, second, third), truth)
+    # Submaps of 4 and 10 frames; 14 of the reference's 20 frames; a third submap is too short.
+    expected = {
+        "climb_ate_mean_mm": (4 * 1 + 10 * 0) / 14,
+        "climb_ate_median_mm": 4 / 14,
+        "climb_ate_std_mm": 0.0,
+        "climb_rpe_1_mean_deg": (4 * 0 + 10 * 2) / 14,
+        "climb_tfr_percent": 70.0,
+        "climb_submaps": 2,
+        "climb_matched_poses": 14,
+        "climb_reference_poses": 20,
+    }
+    assert {name: figures[name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    assert figures["climb_rpe_40_mean_mm"] is None
+    alone = evaluated(write_foreign_run(tmp_path / "alone", first), truth)
+    assert alone["climb_rpe_1_mean_mm"] == pytest.approx(np.sqrt(2), abs=1e-6)
+    assert alone["climb_tfr_percent"] == pytest.approx(20)
+
+
+def test_evo_agrees(tmp_path: Path) -> None:
+    from evo.core import metrics
+    from evo.core.trajectory import PosePath3D
+
+    true = path_of(700)
+    noise = np.stack([se3_exp(twist) for twist in np.random.default_rng(1).normal(0, [0.01] * 3 + [0.3] * 3, (700, 6))])
+    parts = [(0, 300), (300, 700)]
+    worlds = (QUARTER_TURN, Similarity(0.2, so3_exp(np.array([1, 0, 2.0])), np.ones(3)))
+    submaps = [
+        frames_of(world.transform_poses(true[slice(*part)] @ noise[slice(*part)]), part[0])
+        for world, part in zip(worlds, parts, strict=True)
+    ]
+    figures = climb_figures(replace(submaps[0], others=(submaps[1],)), frames_of(true))
+    theirs: dict[str, list[float]] = {}
+    for submap, part in zip(submaps, parts, strict=True):
+        paths = (submap.T_world_camera, true[slice(*part)])
+        estimated, reference = (PosePath3D(poses_se3=list(poses.copy())) for poses in paths)
+        estimated.align(reference, correct_scale=True)
+        relation = metrics.PoseRelation
+        measures = {"ate": metrics.APE(relation.translation_part)}
+        for step in (1, 10, 20, 40):
+            for unit, kind in (("mm", relation.translation_part), ("deg", relation.rotation_angle_deg)):
+                measures[f"rpe_{step}_mean_{unit}"] = metrics.RPE(kind, step, metrics.Unit.frames, all_pairs=True)
+        for name, measure in measures.items():
+            measure.process_data((reference, estimated))
+            statistics = measure.get_all_statistics()
+            if name == "ate":
+                for key in ("mean", "median", "std"):
+                    theirs.setdefault(f"ate_{key}_mm", []).append(statistics[key])
+            else:
+                theirs.setdefault(name, []).append(statistics["mean"])
+    means = {name: np.average(values, weights=[300, 400]) for name, values in theirs.items()}
+    assert {name: figures[name] for name in means} == pytest.approx(means, rel=1e-6)
+    assert figures["tfr_percent"] == 100
+
+
+def test_submaps_count_with_enough_frames_that_are_their_own() -> None:
+    true = path_of(3 * LEAST_FRAMES)
+    whole, half = frames_of(true[:LEAST_FRAMES]), frames_of(true[: LEAST_FRAMES - 1])
+    assert climb_figures(whole, frames_of(true))["submaps"] == 1
+    dropped = climb_figures(half, frames_of(true))
+    assert (dropped["submaps"], dropped["tfr_percent"]) == (0, 0)
+    assert np.isnan(dropped["ate_mean_mm"])
+    # A dropped submap takes no frame from the next; a frame of two submaps is the first one's.
+    assert climb_figures(replace(half, others=(whole,)), frames_of(true))["matched_poses"] == LEAST_FRAMES
+    beyond = frames_of(true[1 : LEAST_FRAMES + 1], 1)
+    assert climb_figures(replace(whole, others=(beyond,)), frames_of(true))["submaps"] == 1
+    lost = replace(whole, status=np.where(whole.indices == 7, "lost", whole.status))
+    assert climb_figures(lost, frames_of(true))["submaps"] == 0
+
+
+def test_a_camera_at_rest_is_refused() -> None:
+    still = frames_of(np.tile(np.eye(4), (LEAST_FRAMES, 1, 1)))
+    with pytest.raises(AlignmentError, match="in one place"):
+        PROTOCOLS["climb"](still, frames_of(path_of(LEAST_FRAMES)))
+
+
+# ---- files
+
+
+def test_a_reference_is_in_mm_and_counts_from_1(tmp_path: Path) -> None:
+    true = path_of(5)
+    found = read_trajectory(write_reference(tmp_path, true, scale=3.0))
+    np.testing.assert_allclose(found.T_world_camera, true, atol=1e-9)
+    assert found.indices.tolist() == [0, 1, 2, 3, 4]
+    assert "mm by scales.csv" in found.source
+    unscaled = read_climb_reference(write_reference(tmp_path / "other", true, clip="Seq_002", scale=None))
+    np.testing.assert_allclose(unscaled.T_world_camera, true, atol=1e-9)
+    assert "scale unknown" in unscaled.source
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "sequence,scale_to_target\nSeq_001_a,big\n"])
+def test_scales_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
+    folder = write_reference(tmp_path, path_of(5))
+    (tmp_path / "scales.csv").write_text(text)
+    with pytest.raises(InputError, match=r"scales\.csv: every row needs sequence and scale_to_target"):
+        read_climb_reference(folder)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    poses = path_of(6)
+    written = replace(frames_of(poses, 3), status=np.array(["initial", "ok", "lost", "ok", "ok", "ok"]))
+    write_submap(tmp_path / "submap.txt", written)
+    lines = (tmp_path / "submap.txt").read_text().splitlines()
+    assert lines[0] == "# timestamp, name_image, tx, ty, tz, qw, qx, qy, qz"
+    assert lines[1].startswith("0.000000,000004.png,0.000000000,0.000000000,0.000000000,1.000000000,")
+    found = read_submap(tmp_path / "submap.txt")
+    assert found.indices.tolist() == [3, 4, 6, 7, 8]
+    np.testing.assert_allclose(found.T_world_camera, poses[[0, 1, 3, 4, 5]], atol=1e-8)
+
+
+def test_rows_without_a_position_are_left_out_and_more_columns_read(tmp_path: Path) -> None:
+    text = submap_text(path_of(3), [9, 8, 7]) + "0,000010.png,nan,0,0,1,0,0,0\n"
+    (tmp_path / "submap.txt").write_text(text)
+    assert read_submap(tmp_path / "submap.txt").indices.tolist() == [6, 7, 8]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0,000001.png,0,0,0,1,0,0", "line 2: found 8 fields, expected 9"),
+        ("0 000001.png 0 0 0 1 0 0 0", "line 2: found 1 fields"),
+        ("0,000000.png,0,0,0,1,0,0,0", "'000000.png' must begin with its only number, the frame's, from 1"),
+        ("0,image.png,0,0,0,1,0,0,0", "'image.png' must begin"),
+        ("0,1_v2.png,0,0,0,1,0,0,0", "'1_v2.png' must begin"),
+        ("0,000002.png,a,0,0,1,0,0,0", "line 2: expected numbers"),
+        ("0,000002.png,0,0,0,nan,0,0,0", "line 2: the quaternion has length nan"),
+        ("0,000002.png,0,0,0,1,1,0,0", "line 2: the quaternion has length 1.41"),
+        ("0,000002.png,0,0,0,1,0,0,0\n1,2.png,0,0,0,1,0,0,0", "line 3: frame 2 comes again"),
+        ("0,000002.png,nan,0,0,1,0,0,0", "it holds no pose"),
+    ],
+)
+def test_rows_that_cannot_be_scored_are_refused(row: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "submap.txt").write_text(f"# header\n{row}\n")
+    with pytest.raises(InputError, match=message):
+        read_submap(tmp_path / "submap.txt")
+
+
+def test_a_run_without_trajectories_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    truth = write_reference(tmp_path, path_of(5))
+    (tmp_path / "run").mkdir()
+    said = refused(capfd, "evaluate", tmp_path / "run", "--kind", "climb", "--truth", truth)
+    assert "looked for camera_trajectory/cam_traj_map_*.txt" in said
