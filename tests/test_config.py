@@ -129,8 +129,30 @@ def test_smoothing_weights_that_sum_to_one_are_taken() -> None:
     assert (chosen.alpha, chosen.beta, chosen.gamma) == (0.5, 0.25, 0.25)
 
 
+def test_a_range_replaces_the_anchor_of_a_preset(tmp_path: Path) -> None:
+    """`--preset paper --near-far 10:80` must not be ignored: only the same source can name another anchor."""
+    near_far = {"depth.near_far_mm": (10, 80)}
+    assert Config.load("paper").depth.anchor == "depth-pro"
+    assert Config.load("paper", settings=near_far).depth.anchor == "near-far"
+    assert Config.load("paper", settings=near_far | {"depth.anchor": "depth-pro"}).depth.anchor == "depth-pro"
+    assert Config.load(settings=near_far).depth.anchor == "auto"
+    anchor = _write(tmp_path, '[depth]\nanchor = "shading"\n')
+    assert Config.load("paper", anchor).depth.anchor == "shading"
+    assert Config.load("paper", anchor, near_far).depth.anchor == "near-far"
+    both = _write(tmp_path, '[depth]\nanchor = "shading"\nnear_far_mm = [10, 80]\n')
+    assert Config.load("paper", both).depth.anchor == "shading"
+
+
+def test_another_network_does_not_get_the_weights_of_the_preset() -> None:
+    v1 = Config.load("paper-strict").depth.model
+    assert Config.load("paper-strict", settings={"depth.backend": "scopenet"}).depth.model == ""
+    assert Config.load("paper-strict", settings={"depth.backend": "depth-anything"}).depth.model == v1 != ""
+    own = {"depth.backend": "depth-pro", "depth.model": "mine"}
+    assert Config.load("paper-strict", settings=own).depth.model == "mine"
+
+
 def test_an_unknown_preset_is_refused() -> None:
-    with pytest.raises(SettingsError, match="choose one of default, paper, realtime"):
+    with pytest.raises(SettingsError, match="choose one of default, paper, paper-strict, realtime"):
         Config.load("fast")  # type: ignore[arg-type]
 
 

@@ -70,7 +70,7 @@ def test_the_data_sets_own_convention_comes_back_from_near_and_far() -> None:
 def test_disparity_of_any_scale_and_shift_becomes_the_depth_of_the_reference(scale: float, shift: float) -> None:
     anchor = anchored(anchor="depth-pro")
     np.testing.assert_allclose(anchor.depth_mm(disparity(scale, shift), frame(7)), TRUTH_MM, rtol=2e-3)
-    assert anchor.description == "Depth Pro on frame 7"
+    assert anchor.description.startswith("Depth Pro on frame 7")
 
 
 def test_the_conversion_is_fitted_once_and_held() -> None:
@@ -107,10 +107,60 @@ def test_without_shift_it_is_the_papers_baseline_and_frame_1_keeps_the_metric_de
     estimate, first = disparity(), frame()
     np.testing.assert_array_equal(anchor.depth_mm(estimate, first), TRUTH_MM)
     second_mm = anchor.depth_mm(estimate, frame(1))
-    baseline_mm = baseline_closed_form(TRUTH_MM[first.valid], estimate.values[first.valid], 75.0)
+    baseline_mm = baseline_closed_form(TRUTH_MM[first.valid], estimate.values[first.valid], 75.0, 0.1)
     known = np.isfinite(second_mm)
     assert known.mean() > 0.9
     np.testing.assert_allclose(second_mm[known], (75.0 * baseline_mm / estimate.values)[known], rtol=1e-4)
+
+
+def test_the_floor_of_disparity_leaves_the_far_end_out_of_the_baseline() -> None:
+    """Half of the pixels have a twentieth of the largest disparity, and a depth that no baseline explains."""
+    levels = np.ones((40, 60), np.float32)
+    levels[20:] = 0.05
+    metric = Metric()
+    for floor, expected_mm in ((0.1, 50.0), (0.0, 200.0)):
+        anchor = anchored(metric, anchor="depth-pro", fit_shift=False, disparity_floor=floor, max_depth_mm=1e5)
+        with pytest.MonkeyPatch.context() as patch:
+            depth_mm = np.where(levels == 1, np.float32(50.0), np.float32(200.0 * 20))
+            patch.setattr(metric, "estimate", lambda frame, d=depth_mm: DepthEstimate(d, "depth", 75.0))
+            anchor.depth_mm(DepthEstimate(levels, "disparity"), frame())
+        nearest_mm = anchor.depth_mm(DepthEstimate(levels, "disparity"), frame(1))[1, 1]
+        assert nearest_mm == pytest.approx(expected_mm, rel=0.02)
+
+
+def test_a_partly_clipped_anchor_names_the_share_and_the_setting() -> None:
+    anchor = anchored(anchor="depth-pro", max_depth_mm=60.0)
+    assert np.isfinite(anchor.depth_mm(disparity(), frame())).any()
+    share = np.mean(TRUTH_MM[1:] > 60)
+    assert f"; {share:.0%} of its depth is beyond depth.max_depth_mm = 60 (median" in anchor.description
+    assert anchor.description.endswith("and left the fit")
+    whole = anchored(anchor="depth-pro")
+    whole.depth_mm(disparity(), frame())
+    assert "max_depth_mm" not in whole.description
+
+
+def test_an_anchor_beyond_the_limit_says_so() -> None:
+    metric = anchored(anchor="depth-pro", max_depth_mm=5.0).metric(disparity(), frame())
+    assert np.isnan(metric.depth_mm).all()
+    assert metric.limit_note.startswith("no scale by depth-pro: 100% of its depth is beyond depth.max_depth_mm = 5 (")
+    own = anchored(backend="depth-pro", max_depth_mm=5.0).metric(DepthEstimate(TRUTH_MM, "depth"), frame())
+    assert own.limit_note.startswith("100% of its depth is beyond depth.max_depth_mm = 5 (")
+    assert anchored(anchor="depth-pro").metric(disparity(), frame()).limit_note == ""
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "whose", "words"),
+    [
+        (75.0, "camera", ", times 0.800: the camera's focal length is 60 px, it finds 75 px"),
+        (75.0, "network", ", by the focal length that it finds, 75 px"),
+        (60.0, "camera", ", by the focal length that it finds, 60 px"),
+        (None, "camera", ""),
+    ],
+)
+def test_the_description_says_what_scaled_depth_pro(focal_px: float | None, whose: str, words: str) -> None:
+    anchor = anchored(Metric(focal_px=focal_px), anchor="depth-pro", depth_pro_focal=whose)
+    anchor.depth_mm(disparity(), frame())
+    assert anchor.description == f"Depth Pro on frame 0{words}"
 
 
 @pytest.mark.parametrize("factor", [0.02, 1.0, 40.0])
@@ -174,7 +224,7 @@ def test_an_unusable_first_frame_leaves_the_anchor_to_the_next() -> None:
     assert anchor.conversion is None
     assert "not anchored" in anchor.description
     assert np.isfinite(anchor.depth_mm(disparity(), frame(1))).all()
-    assert anchor.description == "Depth Pro on frame 1"
+    assert anchor.description.startswith("Depth Pro on frame 1")
 
 
 def test_constant_disparity_is_refused() -> None:

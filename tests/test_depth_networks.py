@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from transformers import (
-    DepthAnythingConfig,
-    DepthAnythingForDepthEstimation,
-    DepthProConfig,
-    DepthProForDepthEstimation,
-    DepthProImageProcessor,
-    DPTImageProcessor,
-)
+from chosen_settings import chosen
+from small_networks import saved, small_depth_anything, small_depth_pro
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import DepthSettings
+from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.depth_anything import DepthAnything
 from scopemap.depth.depth_pro import DepthPro
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 
 HEIGHT, WIDTH = 50, 61
-_VIT = {
-    "model_type": "dinov2",
-    "hidden_size": 8,
-    "num_attention_heads": 2,
-    "intermediate_size": 16,
-}
 
 
 @pytest.fixture(scope="module")
@@ -38,59 +29,6 @@ def frame() -> Frame:
     rgb = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     camera = PinholeCamera(40.0, 40.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
     return Frame(0, 0.0, rgb, camera, np.ones((HEIGHT, WIDTH), bool))
-
-
-def _anything(kind: str = "relative") -> tuple[Any, Any]:
-    torch.manual_seed(5)
-    backbone = _VIT | {
-        "num_hidden_layers": 4,
-        "patch_size": 14,
-        "image_size": 28,
-        "out_indices": [1, 2, 3, 4],
-        "reshape_hidden_states": False,
-    }
-    config = DepthAnythingConfig(
-        backbone_config=backbone,
-        reassemble_hidden_size=8,
-        neck_hidden_sizes=[4, 4, 8, 8],
-        fusion_hidden_size=8,
-        head_hidden_size=4,
-        depth_estimation_type=kind,
-        max_depth=20 if kind == "metric" else 1,
-    )
-    processor = DPTImageProcessor(size={"height": 56, "width": 56}, keep_aspect_ratio=True, ensure_multiple_of=14)
-    network = DepthAnythingForDepthEstimation(config).eval()
-    with torch.no_grad():
-        network.head.conv3.bias.fill_(1.0)  # keeps the untrained output off the ReLU's dead side
-    return network, processor
-
-
-def _pro(use_fov_model: bool = True) -> tuple[Any, Any]:
-    torch.manual_seed(7)
-    vit = _VIT | {"num_hidden_layers": 2, "patch_size": 4, "image_size": 16}
-    config = DepthProConfig(
-        patch_size=16,
-        fusion_hidden_size=16,
-        intermediate_hook_ids=[1, 0],
-        intermediate_feature_dims=[8, 8],
-        scaled_images_feature_dims=[8, 8, 8],
-        image_model_config=dict(vit),
-        patch_model_config=dict(vit),
-        fov_model_config=dict(vit),
-        use_fov_model=use_fov_model,
-    )
-    network = DepthProForDepthEstimation(config).eval()
-    with torch.no_grad():
-        network.head.layers[-2].bias.fill_(1000.0)  # keeps the untrained output off the ReLU's dead side
-        if use_fov_model:
-            network.fov_model.head.layers[-1].bias.fill_(60.0)
-    return network, DepthProImageProcessor(size={"height": 64, "width": 64})
-
-
-def _saved(pair: tuple[Any, Any], folder: Path) -> Path:
-    for part in pair:
-        part.save_pretrained(folder)
-    return folder
 
 
 def _by_hand(pair: tuple[Any, Any], frame: Frame) -> dict[str, Any]:
@@ -103,8 +41,8 @@ def _by_hand(pair: tuple[Any, Any], frame: Frame) -> dict[str, Any]:
 
 
 def test_depth_anything_gives_disparity(frame: Frame, tmp_path: Path) -> None:
-    pair = _anything()
-    estimator = DepthAnything.from_folder_or_hub(str(_saved(pair, tmp_path)), "cpu")
+    pair = small_depth_anything()
+    estimator = DepthAnything.from_folder_or_hub(str(saved(pair, tmp_path)), "cpu")
     estimate = estimator.estimate(frame)
     assert estimate.kind == "disparity"
     assert estimate.focal_px is None
@@ -118,15 +56,15 @@ def test_depth_anything_gives_disparity(frame: Frame, tmp_path: Path) -> None:
 
 
 def test_metric_depth_anything_gives_millimetres(frame: Frame) -> None:
-    pair = _anything("metric")
+    pair = small_depth_anything("metric")
     estimate = DepthAnything(*pair, device="cpu").estimate(frame)
     assert estimate.kind == "depth"
     np.testing.assert_allclose(estimate.values, 1000 * _by_hand(pair, frame)["predicted_depth"].numpy(), rtol=1e-4)
 
 
 def test_depth_pro_with_its_own_focal_length(frame: Frame, tmp_path: Path) -> None:
-    pair = _pro()
-    estimator = DepthPro.from_folder_or_hub(str(_saved(pair, tmp_path)), "cpu", use_known_focal=False)
+    pair = small_depth_pro()
+    estimator = DepthPro.from_folder_or_hub(str(saved(pair, tmp_path)), "cpu", use_known_focal=False)
     estimate = estimator.estimate(frame)
     expected = _by_hand(pair, frame)
     assert estimate.kind == "depth"
@@ -140,7 +78,7 @@ def test_depth_pro_with_its_own_focal_length(frame: Frame, tmp_path: Path) -> No
 
 
 def test_depth_pro_scales_with_the_known_focal_length(frame: Frame) -> None:
-    pair = _pro()
+    pair = small_depth_pro()
     own = DepthPro(*pair, device="cpu", use_known_focal=False).estimate(frame)
     known = DepthPro(*pair, device="cpu").estimate(frame)
     assert own.focal_px is not None
@@ -149,7 +87,7 @@ def test_depth_pro_scales_with_the_known_focal_length(frame: Frame) -> None:
 
 
 def test_depth_pro_without_a_field_of_view_needs_the_camera(frame: Frame) -> None:
-    pair = _pro(use_fov_model=False)
+    pair = small_depth_pro(use_fov_model=False)
     estimate = DepthPro(*pair, device="cpu").estimate(frame)
     assert estimate.focal_px is None
     canonical_depth = _by_hand(pair, frame)["predicted_depth"].numpy()
@@ -160,11 +98,11 @@ def test_depth_pro_without_a_field_of_view_needs_the_camera(frame: Frame) -> Non
 
 
 def test_provenance_names_the_weights(tmp_path: Path) -> None:
-    estimator = DepthAnything.from_folder_or_hub(str(_saved(_anything(), tmp_path)), "cpu")
+    estimator = DepthAnything.from_folder_or_hub(str(saved(small_depth_anything(), tmp_path)), "cpu")
     provenance = estimator.provenance()
     assert provenance["depth"] == "depth-anything"
     assert len(provenance["sha256 model.safetensors"]) == 64
-    assert DepthPro(*_pro(), device="cpu").provenance()["focal"] == "camera"
+    assert DepthPro(*small_depth_pro(), device="cpu").provenance()["focal"] == "camera"
 
 
 @pytest.mark.parametrize("adapter", [DepthAnything, DepthPro])
@@ -177,7 +115,7 @@ def test_missing_weights_name_the_command(adapter: Any, tmp_path: Path, monkeypa
 
 
 def test_a_folder_of_another_model_is_refused(tmp_path: Path) -> None:
-    _saved(_anything(), tmp_path)
+    saved(small_depth_anything(), tmp_path)
     with pytest.raises(WeightsError, match="'depth_anything', but 'depth_pro' is needed"):
         DepthPro.from_folder_or_hub(str(tmp_path), "cpu")
 
@@ -185,7 +123,7 @@ def test_a_folder_of_another_model_is_refused(tmp_path: Path) -> None:
 def test_incomplete_and_broken_weights_are_refused(tmp_path: Path) -> None:
     from safetensors.torch import load_file, save_file
 
-    folder = _saved(_anything(), tmp_path)
+    folder = saved(small_depth_anything(), tmp_path)
     file = folder / "model.safetensors"
     state = load_file(file)
     del state["head.conv3.weight"]
@@ -202,8 +140,59 @@ def test_incomplete_and_broken_weights_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_hub_s_own_name_of_the_processor_loads(frame: Frame, tmp_path: Path) -> None:
-    folder = _saved(_pro(), tmp_path)
+    folder = saved(small_depth_pro(), tmp_path)
     settings = folder / "preprocessor_config.json"
     content = json.loads(settings.read_text()) | {"image_processor_type": "DepthProImageProcessorFast"}
     settings.write_text(json.dumps(content))
     assert DepthPro.from_folder_or_hub(str(folder), "cpu").estimate(frame).values.shape == (HEIGHT, WIDTH)
+
+
+def test_one_image_goes_through_depth_pro_once(frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run reads the focal length of frame 1 first, then its depth with the camera that follows from it."""
+    network, processor = small_depth_pro()
+    estimator, passes, forward = DepthPro(network, processor, device="cpu"), [], network.forward
+    monkeypatch.setattr(network, "forward", lambda *args, **kwargs: passes.append(1) or forward(*args, **kwargs))
+    first = estimator.estimate(frame)
+    again = estimator.estimate(replace(frame, camera=replace(frame.camera, fx=80.0, fy=80.0)))
+    np.testing.assert_allclose(again.values, 2 * first.values, rtol=1e-4)
+    assert (len(passes), again.focal_px) == (1, first.focal_px)
+    estimator.estimate(replace(frame, rgb=255 - frame.rgb))
+    assert len(passes) == 2
+
+
+@pytest.mark.parametrize("place", ["setting", "weights folder"])
+@pytest.mark.parametrize("role", ["anchor", "depth"])
+def test_depth_pro_by_hand(
+    place: str, role: str, frame: Frame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that was copied, without a record of a download: named by a setting, or in the weights folder."""
+    folder = saved(small_depth_pro(), tmp_path / "depth-pro")
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path if place == "weights folder" else tmp_path / "empty"))
+    model = str(folder) if place == "setting" else ""
+    if role == "anchor":
+        settings = DepthSettings(anchor="depth-pro", backend="depth-anything", anchor_model=model)
+        estimator = create_anchor(settings, "cpu").reference
+    else:
+        estimator = create_depth(DepthSettings(backend="depth-pro", model=model), None, "cpu")  # type: ignore[arg-type]
+    assert estimator.estimate(frame).focal_px is not None
+    facts = estimator.provenance()
+    assert len(facts["sha256 model.safetensors"]) == 64
+    assert "revision" not in facts  # nothing tells which one was copied
+
+
+def test_the_error_about_depth_pro_names_folder_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    with pytest.raises(WeightsError) as caught:
+        create_anchor(DepthSettings(anchor="depth-pro", backend="depth-anything"), "cpu")
+    for words in ("models pull depth-pro", "apple/DepthPro-hf", str(tmp_path / "depth-pro"), "depth.anchor_model"):
+        assert words in str(caught.value)
+
+
+def test_depth_pro_is_scaled_by_the_focal_length_of_the_settings(frame: Frame, tmp_path: Path) -> None:
+    folder = str(saved(small_depth_pro(), tmp_path))
+    depths = {}
+    for focal in ("camera", "network"):
+        settings = chosen(DepthSettings, anchor="depth-pro", anchor_model=folder, depth_pro_focal=focal)
+        depths[focal] = create_anchor(settings, "cpu").reference.estimate(frame)
+    ratio = frame.camera.fx / depths["network"].focal_px
+    np.testing.assert_allclose(depths["camera"].values, ratio * depths["network"].values, rtol=1e-4)

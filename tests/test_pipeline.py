@@ -12,14 +12,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from chosen_settings import chosen
 from scipy.spatial import KDTree
+from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
+from scopemap.config import PRESETS
 from scopemap.errors import InputError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
@@ -40,42 +38,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("phantom") / "interrupted", "black:4-4")
-
-
-class _SpyDepth:
-    """Asks another estimator, and keeps what it was asked."""
-
-    def __init__(self, inner: Any, name: str = "spy", focal_px: float | None = None) -> None:
-        self.inner, self.name, self.focal_px = inner, name, focal_px
-        self.seen: list[Frame] = []
-        self.threads: set[str] = set()
-        self.fails_at: int | None = None
-
-    def estimate(self, frame: Frame) -> DepthEstimate:
-        self.seen.append(frame)
-        self.threads.add(threading.current_thread().name)
-        if len(self.seen) == self.fails_at:
-            raise RuntimeError("the network broke")
-        return replace(self.inner.estimate(frame), focal_px=self.focal_px)
-
-    def provenance(self) -> dict[str, str]:
-        return {"depth": self.name}
-
-
-def _spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any) -> list[_SpyDepth]:
-    """Put a spy into every run from here on, as its depth or as its anchor's reference; they appear in the list."""
-    create, spies = create_estimators, []
-
-    def spying(config: Config, sequence: Any) -> Estimators:
-        parts = create(config, sequence)
-        if anchor_too:
-            spies.append(_SpyDepth(parts.anchor.reference, **spy))
-            return replace(parts, anchor=AnchoredDepth(chosen(DepthSettings, anchor="depth-pro"), spies[-1]))
-        spies.append(_SpyDepth(parts.depth, **spy))
-        return replace(parts, depth=spies[-1])
-
-    monkeypatch.setattr("scopemap.runner.create_estimators", spying)
-    return spies
 
 
 def _called(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, note: Callable[..., None]) -> None:
@@ -131,7 +93,7 @@ def test_the_same_input_gives_the_same_result(folder: Path) -> None:
 
 
 def test_truth_is_never_handed_to_an_estimator(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spies = _spied(monkeypatch)
+    spies = spied(monkeypatch)
     tracked: list[Any] = []
     _called(monkeypatch, Tracker, "track", tracked.append)
     reconstruct(open_sequence(folder), with_true_depth(folder))
@@ -244,7 +206,7 @@ def test_nothing_but_black_is_an_input_error(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "trajectory.tum").exists()
 
 
-@pytest.mark.parametrize("preset", ["default", "paper", "realtime"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_tracks_all_frames(preset: str, folder: Path) -> None:
     config = with_true_depth(folder, preset, **WITHOUT_NETWORKS, depth__anchor="auto")
     result = reconstruct(open_sequence(folder), config)
@@ -316,41 +278,8 @@ def test_fusion_can_be_turned_off(folder: Path) -> None:
     assert result.provenance["tracked"] == FRAMES
 
 
-@pytest.mark.parametrize("anchor_too", [False, True])
-def test_an_unknown_camera_takes_depth_pros_focal_length(
-    anchor_too: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spies = _spied(monkeypatch, anchor_too, name="depth-pro", focal_px=83.25)
-    sequence = open_sequence(only_images(folder, tmp_path / "bare"))
-    result = reconstruct(sequence, Config.load())
-    assert result.camera.fx == pytest.approx(83.25)
-    assert result.camera.fy == pytest.approx(83.25)
-    assert (result.camera.width, result.camera.height) == SIZE
-    assert result.provenance["camera"]["source"] == "estimated: Depth Pro on frame 0"
-    assert spies[0].seen[-1].camera.fx == pytest.approx(83.25)
-    assert sequence.camera.fx != pytest.approx(83.25)
-
-
-@pytest.mark.parametrize(("name", "focal_px"), [("depth-anything", 83.0), ("depth-pro", None)])
-def test_an_unknown_camera_stays_assumed_without_a_focal_length(
-    name: str, focal_px: float | None, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _spied(monkeypatch, name=name, focal_px=focal_px)
-    sequence = open_sequence(only_images(folder, tmp_path / "bare"))
-    result = reconstruct(sequence, Config.load())
-    assert result.camera == sequence.camera
-    assert "assumed" in result.provenance["camera"]["source"]
-    assert any("assumed" in note for note in result.provenance["notes"])
-
-
-def test_a_known_camera_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _spied(monkeypatch, name="depth-pro", focal_px=500.0)
-    sequence = open_sequence(folder)
-    assert reconstruct(sequence, with_true_depth(folder)).camera == sequence.camera
-
-
 def test_perception_runs_ahead_in_another_thread(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spies = _spied(monkeypatch)
+    spies = spied(monkeypatch)
     done: list[int] = []
     ahead = threading.Event()
 
@@ -371,7 +300,7 @@ def test_an_error_in_the_look_ahead_comes_out(fails_at: int, folder: Path, monke
 
     def breaking(config: Config, sequence: Any) -> Estimators:
         parts = create(config, sequence)
-        spy = _SpyDepth(parts.depth)
+        spy = SpyDepth(parts.depth)
         spy.fails_at = fails_at
         return replace(parts, depth=spy)
 

@@ -128,6 +128,30 @@ def test_repository_is_held_to_its_first_pull(folder: Path, hub: dict[str, bytes
         weights.locate(name)
 
 
+def test_a_model_copied_by_hand_is_found_without_a_record(folder: Path) -> None:
+    place = folder / "depth-pro"
+    place.mkdir()
+    for name in ("config.json", "preprocessor_config.json"):
+        (place / name).write_text("{}")
+    assert not weights.is_present("depth-pro")
+    (place / "model.safetensors").write_bytes(b"weights")
+    assert weights.locate("depth-pro") == place
+    assert {row.name: row.state for row in weights.overview()}["depth-pro"] == "by hand"
+    assert weights.recorded_revision("depth-pro") == ""
+    said = CliRunner().invoke(models.app, ["verify", "depth-pro", "--json"]).stdout
+    assert json.loads(said) == {"depth-pro": "by hand, no hash to check"}
+
+
+def test_pulling_records_a_model_that_was_copied_by_hand(folder: Path, hub: dict[str, bytes]) -> None:
+    place = folder / "depth-pro"
+    place.mkdir()
+    for name in ("config.json", "preprocessor_config.json", "model.safetensors"):
+        (place / name).write_bytes(b"an old copy")
+    weights.pull("depth-pro")
+    assert (place / "model.safetensors").read_bytes() == hub["model.safetensors"]
+    assert {row.name: row.state for row in weights.overview()}["depth-pro"] == "present"
+
+
 def test_every_registered_repository_is_pinned_by_revision() -> None:
     hub = [checkpoint for checkpoint in REGISTRY.values() if checkpoint.source == "hub"]
     assert {checkpoint.name for checkpoint in hub} == {"depth-anything", "depth-pro"}

@@ -46,12 +46,16 @@ class Estimators:
 
 @dataclass(frozen=True)
 class PreprocessedFrame:
-    """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale."""
+    """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale.
+
+    depth_note : that most of its depth is beyond the limit; else "".
+    """
 
     frame: Frame
     kind: DepthKind
     correspondence: DenseCorrespondence | None
     anchored: bool
+    depth_note: str = ""
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,8 @@ class Pipeline:
         raw = self.estimators.anchor.metric(estimate, shown)
         correspondence = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.needs_previous(estimate.kind))
         frame = replace(frame, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
-        return PreprocessedFrame(frame, estimate.kind, correspondence, self.estimators.anchor.just_fitted)
+        anchored = self.estimators.anchor.just_fitted
+        return PreprocessedFrame(frame, estimate.kind, correspondence, anchored, raw.limit_note)
 
     def step(self, preprocessed: PreprocessedFrame) -> Step:
         """Track a frame, refine its depth, make it a keyframe where one is due, store or fuse it."""
@@ -109,7 +114,7 @@ class Pipeline:
             self._reset()
         refined = refined or self._refine(preprocessed, motion_between(last, track))
         frame = replace(preprocessed.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
-        track = self._with_keyframe(track, frame, preprocessed.kind)
+        track = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
         else:
@@ -136,15 +141,16 @@ class Pipeline:
         self._mapis.reset()
         self._smooth.reset()
 
-    def _with_keyframe(self, track: Track, frame: Frame, kind: DepthKind) -> Track:
+    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> Track:
         """Make a frame the keyframe where one is due; the first one of a map that cannot be one is lost."""
         if track.status == "lost" or not self._tracker.needs_keyframe():
             return track
-        keyframe = replace(frame, T_world_camera=track.T_world_camera)
+        keyframe, kind = replace(frame, T_world_camera=track.T_world_camera), preprocessed.kind
         measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
         inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
         if inserted and kind != "measured":  # with measured depth tracking alone is better
             self.mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not inserted:
-            return replace(track, status="lost", reason="too little of its depth is known to start from")
+            unknown = preprocessed.depth_note or "too little of its depth is known to start from"
+            return replace(track, status="lost", reason=unknown)
         return track

@@ -111,7 +111,8 @@ class _Run:
             self.records.append(FrameRecord.of(step))
         if all(record.track.status == "lost" for record in self.records):
             reason = self.records[0].track.reason
-            raise InputError(f"no frame of {self.sequence.path} could be used: {reason} (black or constant?)")
+            guess = "" if "max_depth_mm" in reason else " (black or constant?)"
+            raise InputError(f"no frame of {self.sequence.path} could be used: {reason}{guess}")
 
     def result(self, notes: list[str]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others."""

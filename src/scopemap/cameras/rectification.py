@@ -11,13 +11,16 @@ import numpy as np
 from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
 from scopemap.errors import CalibrationError, check_shape
 
-LONGEST_WORKING_SIDE_PX = 400
+LONGEST_SIDE_PX = 400
 _BLUR_PER_SHRINK = 0.4
 
 
-def working_size(width: int, height: int) -> tuple[int, int]:
-    """Return (width, height) divided, rounding down, by the smallest whole number that brings both sides to 400 px."""
-    divisor = -(-max(width, height) // LONGEST_WORKING_SIDE_PX)
+def working_size(width: int, height: int, longest_side_px: int = LONGEST_SIDE_PX) -> tuple[int, int]:
+    """Return (width, height) divided, rounding down, by the smallest whole number that brings both to the longest side.
+
+    longest_side_px : 0 means no limit; the size stays.
+    """
+    divisor = -(-max(width, height) // longest_side_px) if longest_side_px else 1
     return width // divisor, height // divisor
 
 

@@ -40,11 +40,12 @@ def verify(
     quiet: Quiet = False,
 ) -> None:
     """Hash weights anew and compare them with the pinned or recorded hashes."""
-    there = [row.name for row in weights.overview() if row.state != "missing"]
-    names = [name] if name else there
+    states = {row.name: row.state for row in weights.overview() if row.state != "missing"}
+    names = [name] if name else list(states)
     faults = {each: fault for each in names if (fault := _fault(each))}
-    verdict = {each: faults.get(each, "ok") for each in names}
-    sound = [f"{each}: ok" for each in names if each not in faults]
+    sounds = {each: "by hand, no hash to check" if states.get(each) == "by hand" else "ok" for each in names}
+    verdict = sounds | faults
+    sound = [f"{each}: {sounds[each]}" for each in names if each not in faults]
     if as_json or sound or not faults:
         _say(verdict, "\n".join(sound) or "no weights are there", as_json, quiet)
     if faults:

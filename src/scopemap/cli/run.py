@@ -26,8 +26,11 @@ def run(
     ],
     out: Annotated[Path, typer.Option(help="Folder for the result.")],
     preset: Annotated[
-        Literal["paper", "default", "realtime"] | None,
-        typer.Option(help="paper: the method as published; default: best of what needs no download; realtime: fast."),
+        Literal["default", "paper", "paper-strict", "realtime"] | None,
+        typer.Option(
+            help="default: best of what needs no download; paper: the method as published, made robust; paper-strict: "
+            "without what it does beyond the text; realtime: fast."
+        ),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
@@ -67,7 +70,10 @@ def run(
         typer.Option("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
     ] = False,
     near_far: Annotated[
-        str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
+        str | None,
+        typer.Option(
+            metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces a preset's anchor."
+        ),
     ] = None,
     depth: Annotated[
         str | None,

@@ -1,10 +1,11 @@
-"""Every setting of every stage, with unit and source; presets `paper`, `default`, `realtime`.
+"""Every setting of every stage, with unit and source; presets `default`, `paper`, `paper-strict`, `realtime`.
 
 Order of precedence: defaults < preset < TOML file < single settings (`--set tracking.huber=2`); the preset itself may
-be named by any of them. An unknown key is an error that names the nearest key. METHOD below is arXiv 2508.11282;
-it publishes none of its constants (section "WEMA-RTDL"), so values are ours: those of the tracker were chosen by trial
-on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that
-were not searched.
+be named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
+one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
+that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its constants (section "WEMA-RTDL"),
+so values are ours: those of the tracker were chosen by trial on the sequences of BENCHMARK.md; tau, the filter's
+sigmas, rho and WEMA's weights and omega are plausible values that were not searched.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from scopemap.config.settings import Settings
 from scopemap.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.errors import SettingsError
 
-Preset = Literal["paper", "default", "realtime"]
+Preset = Literal["default", "paper", "paper-strict", "realtime"]
 RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
 RENAMED = {
     "mapping.depth_share": "mapping.advanced.depth_sigma_share",
@@ -83,7 +84,7 @@ class Config(Settings):
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
         tree: dict[str, Any] = {}
-        for key, value in (PRESETS[chosen] | in_file | settings | {"preset": chosen}).items():
+        for key, value in _merged(PRESETS[chosen], in_file, settings, {"preset": chosen}).items():
             _insert(tree, key, value)
         try:
             return cls.model_validate(tree)
@@ -131,6 +132,23 @@ def _of_earlier_versions(flat: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a file by their present names, without removed ones: an old config.toml stays valid."""
     renamed = {new_name(key): value for key, value in flat.items()}
     return {key: value for key, value in renamed.items() if key not in REMOVED}
+
+
+def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a preset and of other sources, of which later ones win.
+
+    Another backend does not get the preset's weights, and a range of depth replaces an earlier anchor.
+    """
+    flat = dict(preset)
+    for source in others:
+        other_network = source.get("depth.backend") not in (None, preset.get("depth.backend"))
+        if other_network and flat.get("depth.model") == preset.get("depth.model"):
+            flat.pop("depth.model", None)
+        flat |= source
+        has_range = source.get("depth.near_far_mm") is not None and "depth.anchor" not in source
+        if has_range and flat.get("depth.anchor", "auto") != "auto":
+            flat["depth.anchor"] = "near-far"
+    return flat
 
 
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:

@@ -29,6 +29,18 @@ class DepthPaper(Settings):
     """What only the paper's preset and its ablations change."""
 
     fit_shift: bool = Field(True, description="fit scale and shift to the anchor; False: the pseudo-stereo baseline")
+    disparity_floor: float = Field(
+        0.1,
+        ge=0,
+        lt=1,
+        description="inert unless fit_shift = False: pixels below this share of the largest disparity (the far end) "
+        "are left out of the baseline's fit; 0: only those without disparity (the paper)",
+    )
+    depth_pro_focal: Literal["camera", "network"] = Field(
+        "camera",
+        description="focal length that scales Depth Pro's depth, camera: of the frames' camera; network: the one that "
+        "Depth Pro finds (the paper)",
+    )
     factor: float = Field(
         30.0, gt=0, description="inert unless anchor = factor: nearest tissue of frame 1 is at 1000 mm / factor"
     )
@@ -42,11 +54,16 @@ class DepthSettings(Settings):
         "",
         description="weights of the network: hub id or folder, for scopenet a .safetensors file; empty: the default",
     )
+    anchor_model: str = Field(
+        "", description="inert unless anchor = depth-pro: weights of Depth Pro, hub id or folder; empty: the default"
+    )
     anchor: Literal["auto", "near-far", "depth-pro", "shading", "factor"] = Field(
         "auto",
         description="metric anchor in frame 1; auto: near-far where given, else the network's own mm, else shading",
     )
-    near_far_mm: tuple[float, float] | None = Field(None, description="nearest and farthest tissue in frame 1, mm")
+    near_far_mm: tuple[float, float] | None = Field(
+        None, description="nearest and farthest tissue in frame 1, mm; replaces a preset's anchor by near-far"
+    )
     shading_median_mm: float = Field(
         35.0, gt=0, description="inert unless the anchor is shading: assumed median distance of tissue in frame 1, mm"
     )

@@ -28,6 +28,12 @@ class InputSettings(Settings):
         description="two views in one image, of which the left or upper is used; auto: detected in a video",
     )
     deinterlace: bool = Field(False, description="use one field of each interlaced image, interpolate the missing rows")
+    longest_side_px: int = Field(
+        400,
+        ge=0,
+        description="longest side of the working size unless that is given (--size): the input's is divided by the "
+        "smallest whole number that brings it to this, px; 0: the input's size",
+    )
     fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
     skip_duplicates: bool = Field(True, description="leave out images of a video that repeat the one before")
 
@@ -35,6 +41,7 @@ class InputSettings(Settings):
 class MaskAdvanced(Settings):
     """Constants of masking."""
 
+    exposure: bool = Field(True, description="mask under-exposed and over-exposed pixels")
     dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
     files_grow_px: int = Field(3, ge=0, description="px by which masks from files are widened")
 

@@ -61,6 +61,9 @@ class MappingSettings(Settings):
 class FusionAdvanced(Settings):
     """Constants of fusion."""
 
+    weighted: bool = Field(
+        True, description="weight pixels by incidence, distance and uncertainty, voxels behind a surface less; False: 1"
+    )
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     depth_sigma_share: float = Field(
         0.2, gt=0, description="relative error that all depth has; more uncertain pixels weigh less; large: off"

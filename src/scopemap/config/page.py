@@ -18,7 +18,8 @@ _HEAD = """# Settings
 
 Every setting can be set on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by
 a preset. The order is defaults < preset < file < command line. A result's `config.toml` holds all settings and is a
-valid file. A cell "presets" names what `paper` and `realtime` change. `scopemap.config.page` writes this page.
+valid file. A cell "presets" names what presets change;
+`paper-strict` changes what `paper` does, too. `scopemap.config.page` writes this page.
 """
 _SECTIONS = (
     ("", "User settings", "What one may want to choose."),
@@ -65,7 +66,10 @@ def _rows(model: type[Settings], prefix: str) -> Iterator[str]:
 
 
 def _changes(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    yield from ((preset, values) for preset, values in PRESETS.items() if name in values)
+    for preset, values in PRESETS.items():
+        of_paper = preset == "paper-strict" and values.get(name) == PRESETS["paper"].get(name)
+        if name in values and not of_paper:
+            yield preset, values
 
 
 def _meaning(field: FieldInfo) -> str:

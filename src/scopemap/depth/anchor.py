@@ -20,6 +20,7 @@ from scopemap.frame import Frame
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02
+_MAX_SHARE_BEYOND = 0.5  # of the depth that may be beyond the limit without a note
 _FACTOR_MM = 1000.0
 
 
@@ -41,10 +42,14 @@ class DepthScale:
 
 @dataclass(frozen=True)
 class MetricDepth:
-    """Depth of one frame, (H, W) float32, mm, NaN = unknown, and its standard deviation or None (not estimated)."""
+    """Depth of one frame, (H, W) float32, mm, NaN = unknown, and its standard deviation or None (not estimated).
+
+    limit_note : says where most of the depth is unknown because it is beyond the limit; else "".
+    """
 
     depth_mm: np.ndarray
     sigma_mm: np.ndarray | None
+    limit_note: str = ""
 
 
 @dataclass(frozen=True)
@@ -113,14 +118,25 @@ class AnchoredDepth:
         """
         estimate = self._after_power_law(estimate, frame)
         self._frames_held += 1
-        first_mm = self._anchor(estimate, frame) if self._is_due(estimate) else None
+        first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
         if self._conversion is None:
-            return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None)
+            return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None, limit_note)
         depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         sigma_mm = self._conversion.sigma_mm(estimate.sigma) if first_mm is None else None
         if estimate.kind != "measured":
+            share, note = self._beyond_limit(depth_mm, frame.valid)
+            limit_note = note if share > _MAX_SHARE_BEYOND else ""
             depth_mm = np.where(depth_mm <= max_depth_mm(self._settings), depth_mm, np.float32(np.nan))
-        return MetricDepth(depth_mm, sigma_mm)
+        return MetricDepth(depth_mm, sigma_mm, limit_note)
+
+    def _beyond_limit(self, depth_mm: np.ndarray, usable: np.ndarray) -> tuple[float, str]:
+        """Return the share of the usable positive depths that are beyond `max_depth_mm`, and that in words."""
+        positive_mm, limit_mm = depth_mm[usable & (depth_mm > 0)], max_depth_mm(self._settings)
+        if not positive_mm.size:
+            return 0.0, ""
+        share, median_mm = float(np.mean(positive_mm > limit_mm)), float(np.median(positive_mm))
+        limit = f"depth.max_depth_mm = {limit_mm:g}"
+        return share, f"{share:.0%} of its depth is beyond {limit} (median {median_mm:.0f} mm)"
 
     def _after_power_law(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
         """Return the estimate after the power law; its relative error is multiplied by the exponent."""
@@ -153,12 +169,16 @@ class AnchoredDepth:
         every = self._settings.advanced.reanchor_every
         return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
-    def _anchor(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray | None:
-        """Fit the conversion; return the depth (H, W) of this frame where the anchor gives it directly, else None."""
+    def _anchor(self, estimate: DepthEstimate, frame: Frame) -> tuple[np.ndarray | None, str]:
+        """Fit the conversion if the frame allows it.
+
+        Returns the depth (H, W) of this frame where the anchor gives it directly, else None, and why the frame does not
+        allow it where that is due to `max_depth_mm`.
+        """
         usable = frame.valid & np.isfinite(estimate.values)
         if usable.mean() < _MIN_SHARE:
-            return None
-        first_mm = None
+            return None, ""
+        first_mm, details = None, ""
         source = self._source(estimate)
         if source == "own":
             self._conversion = DepthScale(1.0)
@@ -168,17 +188,19 @@ class AnchoredDepth:
             self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
         else:
             reference = self._reference.estimate(frame)
+            beyond, limit_note = self._beyond_limit(reference.values, usable)
             known = usable & (reference.values > 0) & (reference.values <= max_depth_mm(self._settings))
             if known.mean() < _MIN_SHARE:
-                return None
+                return None, f"no scale by {self._reference.name}: {limit_note}" if beyond else ""
+            details = self._details(reference, frame) + (f"; {limit_note}, and left the fit" if beyond > 0 else "")
             focal_px = reference.focal_px or frame.camera.fx
             target = _Target(estimate.values[known], reference.values[known], focal_px)
             self._conversion = self._fitted(estimate, target)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
             first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
-        self._description = self._describe(source, estimate, frame)
-        return first_mm
+        self._description = self._describe(source, estimate, frame) + details
+        return first_mm, ""
 
     def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
         anchor = self._settings.anchor
@@ -210,7 +232,8 @@ class AnchoredDepth:
             return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
         if self._settings.paper.fit_shift:
             return fit_affine_disparity(target.depth_mm, target.values, max_depth_mm(self._settings))
-        baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px)
+        floor = self._settings.paper.disparity_floor
+        baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px, floor)
         return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
@@ -224,6 +247,16 @@ class AnchoredDepth:
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
         return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"
+
+    def _details(self, reference: DepthEstimate, frame: Frame) -> str:
+        """Return what scales the depth of the reference, "" unless it finds a focal length (Depth Pro)."""
+        if reference.focal_px is None:
+            return ""
+        found_px, known_px = reference.focal_px, frame.camera.fx
+        if self._settings.paper.depth_pro_focal == "network" or np.isclose(known_px, found_px, rtol=1e-3):
+            return f", by the focal length that it finds, {found_px:.0f} px"
+        ratio = known_px / found_px
+        return f", times {ratio:.3f}: the camera's focal length is {known_px:.0f} px, it finds {found_px:.0f} px"
 
 
 def max_depth_mm(settings: DepthSettings) -> float:

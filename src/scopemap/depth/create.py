@@ -43,7 +43,7 @@ def create_depth(
 
         return ScopeNetDepth.from_file(settings.model, device, rays_known=calibrated)
     if settings.backend == "depth-pro":
-        return _depth_pro(settings.model, device)
+        return _depth_pro(settings.model, settings, device)
     if settings.backend == "depth-anything":
         from scopemap.depth.depth_anything import DepthAnything
 
@@ -65,10 +65,11 @@ def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
     its weights are missing.
     """
     needs_network = settings.anchor == "depth-pro" and settings.backend != "depth-pro"
-    return AnchoredDepth(settings, _depth_pro("", device) if needs_network else ShadingDepth(settings))
+    reference = _depth_pro(settings.anchor_model, settings, device) if needs_network else ShadingDepth(settings)
+    return AnchoredDepth(settings, reference)
 
 
-def _depth_pro(model: str, device: str) -> DepthEstimator:
+def _depth_pro(model: str, settings: DepthSettings, device: str) -> DepthEstimator:
     from scopemap.depth.depth_pro import DepthPro
 
-    return DepthPro.from_folder_or_hub(model, device)
+    return DepthPro.from_folder_or_hub(model, device, use_known_focal=settings.paper.depth_pro_focal == "camera")

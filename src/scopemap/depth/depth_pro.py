@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.pretrained import load_pretrained
 from scopemap.errors import WeightsError
@@ -12,6 +14,7 @@ from scopemap.frame import Frame
 from scopemap.io.device import choose_device
 
 if TYPE_CHECKING:
+    import torch
     from transformers import DepthProForDepthEstimation, DepthProImageProcessor
 
 MM_PER_M = 1000.0
@@ -37,13 +40,16 @@ class DepthPro:
         origin: dict[str, str] | None = None,
     ) -> None:
         if not (use_known_focal or network.config.use_fov_model):
-            raise WeightsError("this Depth Pro model finds no focal length: name another, or calibrate the camera")
+            raise WeightsError(
+                "this Depth Pro model finds no focal length: name another, or set depth.paper.depth_pro_focal=camera"
+            )
         self.use_known_focal = use_known_focal
         self._device = choose_device(device)
         untyped: Any = network
         self._network = untyped.to(self._device).eval()
         self._processor: Any = processor
         self._origin = origin or {}
+        self._last: tuple[np.ndarray, Any, torch.Tensor | None] | None = None
 
     @classmethod
     def from_folder_or_hub(cls, model: str = "", device: str = "auto", *, use_known_focal: bool = True) -> DepthPro:
@@ -59,14 +65,18 @@ class DepthPro:
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth, mm, of the frame's size, and the focal length that the network found (None if it cannot).
 
-        Every pixel has a value; what the network holds for infinitely far is 1e7 mm.
+        Every pixel has a value; what the network holds for infinitely far is 1e7 mm. The image estimated last is not
+        passed through the network again: a run reads the focal length of frame 1 first, and its depth afterwards.
         """
         import torch
 
-        inputs = self._processor(images=frame.rgb, input_data_format="channels_last", return_tensors="pt")
-        with torch.inference_mode():
-            outputs = self._network(inputs["pixel_values"].to(self._device))
-        found_deg = outputs.field_of_view
+        if self._last is None or not np.array_equal(self._last[0], frame.rgb):
+            inputs = self._processor(images=frame.rgb, input_data_format="channels_last", return_tensors="pt")
+            with torch.inference_mode():
+                outputs = self._network(inputs["pixel_values"].to(self._device))
+            self._last = frame.rgb.copy(), outputs, outputs.field_of_view
+        _, outputs, found_deg = self._last
+        outputs.field_of_view = found_deg
         width = frame.camera.width
         if self.use_known_focal:
             known_deg = 2.0 * math.degrees(math.atan(0.5 * width / frame.camera.fx))

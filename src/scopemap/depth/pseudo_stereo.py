@@ -13,8 +13,6 @@ from scipy.optimize import minimize
 from scopemap.errors import InputError
 from scopemap.geometry.least_squares import huber_weight, robust_sigma
 
-# A pixel below this share of the largest disparity is left out: depth f B / d of d near 0 would own the whole sum.
-_FLOOR_SHARE = 0.1
 _HUBER_SIGMAS = 1.345
 _ITERATIONS = 30
 
@@ -44,23 +42,29 @@ class AffineDisparity:
         return None
 
 
-def baseline_closed_form(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float) -> float:
+def baseline_closed_form(
+    depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float, floor_share: float = 0.0
+) -> float:
     """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2: B = sum(D g) / sum(g g), g = f / d.
 
-    depth_mm, disparity : arrays of one shape; pixels that are not finite or have a disparity near 0 are left out.
+    depth_mm, disparity : arrays of one shape; pixels that are not finite and positive are left out.
+    floor_share : pixels below this share of the largest disparity are left out, too: f / d of d near 0 would dominate
+        the sum.
     Raises `InputError` if no pixel is left.
     """
-    depth, disparity = _usable(depth_mm, disparity)
+    depth, disparity = _usable(depth_mm, disparity, floor_share)
     per_baseline = focal_px / disparity
     return float(np.sum(depth * per_baseline) / np.sum(per_baseline**2))
 
 
-def fit_baseline_lbfgsb(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float) -> float:
+def fit_baseline_lbfgsb(
+    depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float, floor_share: float = 0.0
+) -> float:
     """Return the same baseline as `baseline_closed_form`, found as the paper finds it, by L-BFGS-B.
 
     The variables are brought to order one first: the optimiser's tolerances are absolute in the gradient.
     """
-    depth, disparity = _usable(depth_mm, disparity)
+    depth, disparity = _usable(depth_mm, disparity, floor_share)
     per_baseline = focal_px / disparity
     depth_unit, baseline_unit = float(np.median(depth)), float(np.median(depth) / np.median(per_baseline))
     target, slope = depth / depth_unit, per_baseline * (baseline_unit / depth_unit)
@@ -105,10 +109,10 @@ def fit_affine_disparity(depth_mm: np.ndarray, disparity: np.ndarray, max_depth_
     return AffineDisparity(float(slope / spread), float(level - slope * origin / spread))
 
 
-def _usable(depth_mm: np.ndarray, disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _usable(depth_mm: np.ndarray, disparity: np.ndarray, floor_share: float) -> tuple[np.ndarray, np.ndarray]:
     depth, d = np.asarray(depth_mm, np.float64).ravel(), np.asarray(disparity, np.float64).ravel()
     known = np.isfinite(depth) & np.isfinite(d) & (depth > 0) & (d > 0)
-    known[known] = d[known] >= _FLOOR_SHARE * d[known].max(initial=0)
+    known[known] = d[known] >= floor_share * d[known].max(initial=0)
     if not known.any():
         raise InputError(
             "fitting the pseudo-stereo baseline: no pixel has both a depth and a positive disparity; "

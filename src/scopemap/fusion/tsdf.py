@@ -21,8 +21,6 @@ _RECENT = 1 << 15
 _SLOPE_STEP_PX = 3
 _COLOUR_BAND_VOXELS = 2.0
 _FIRST_CAPACITY = 256
-# Share of the truncation behind the surface from which on a voxel counts less and less.
-_FULL_WEIGHT_SHARE = 0.2
 
 
 class Voxels(NamedTuple):
@@ -56,11 +54,15 @@ class MeasuredSurface(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Voxel size and truncation in mm, and the largest relative change of depth per px that is one surface."""
+    """Voxel size and truncation in mm, and the largest relative change of depth per px that is one surface.
+
+    full_weight_share : share of the truncation behind the surface from which on a voxel counts less and less.
+    """
 
     voxel_mm: float
     truncation_mm: float
     largest_step: float
+    full_weight_share: float = 0.2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -232,7 +234,7 @@ def _integrate_block(
                 behind = -gap / (inverse_depth * truncation)
                 if behind >= 1.0:
                     continue
-                weight *= min(1.0, (1.0 - behind) / (1.0 - _FULL_WEIGHT_SHARE))
+                weight *= min(1.0, (1.0 - behind) / (1.0 - grid.full_weight_share))
                 distance = min(max(gap * plane_mm[row, col], -truncation), truncation)
                 total = weights[slot, i, j, k] + weight
                 tsdf[slot, i, j, k] += (distance - tsdf[slot, i, j, k]) * weight / total

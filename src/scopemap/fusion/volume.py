@@ -104,13 +104,16 @@ class TsdfVolume:
         pinhole = TsdfCamera(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         steepest = max(advanced.min_incidence, _MIN_COSINE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
-        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step)
+        # A share of 1: voxels have the full weight up to the truncation.
+        ramp = {} if advanced.weighted else {"full_weight_share": 1.0}
+        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, **ramp)
         with np.errstate(invalid="ignore"):
             usable = frame.valid & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
         surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
-        surface = surface._replace(weight=surface.weight * np.minimum(trust, np.float32(1.0)))
+        weight = surface.weight * np.minimum(trust, np.float32(1.0))
+        surface = surface._replace(weight=weight if advanced.weighted else (weight > 0).astype(np.float32))
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, frame.rgb, pinhole, grid)

@@ -57,4 +57,5 @@ def find(name: str) -> Checkpoint:
     if owner.strip(".") and model.strip(".") and "/" not in model:
         place = f"{owner}--{model}"
         return Checkpoint(name, "chosen by the user", "see its model card", 0.0, place, "hub", name)
-    raise WeightsError(f"unknown weights '{name}': choose one of {', '.join(REGISTRY)}, or a hub id (owner/model)")
+    known = ", ".join(REGISTRY)
+    raise WeightsError(f"unknown weights '{name}': choose one of {known}, a hub id, or a local folder")

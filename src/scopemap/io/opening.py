@@ -97,9 +97,9 @@ def open_sequence(
 
     `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
     camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
-    of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: the
-    input's, divided by the smallest whole number that brings it to 400 px. `frames` selects positions in the input.
-    `settings` are those of reading. Raises `InputError` and `CalibrationError`.
+    of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: by
+    `settings.longest_side_px`. `frames` selects positions in the input. `settings` are those of reading. Raises
+    `InputError` and `CalibrationError`.
     """
     selection, settings = frames or slice(None), settings or InputSettings()
     if selection.step is not None and selection.step <= 0:
@@ -109,7 +109,7 @@ def open_sequence(
         source = prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
     if size is None:
-        size, size_source = working_size(source.width, source.height), "chosen"
+        size, size_source = working_size(source.width, source.height, settings.longest_side_px), "chosen"
     else:
         size_source = "given (--size)"
     if min(size) < _SMALLEST_SIDE_PX:

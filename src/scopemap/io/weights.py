@@ -2,7 +2,7 @@
 
 All weights are in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. `pull` downloads.
 Files must have the hashes of `checkpoints.toml`, and those recorded in the folder's `weights.lock.json` when they were
-pulled, with their revision.
+pulled, with their revision. A model of the hub that has neither is taken as it is: it was copied by hand.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from typing import Any, Literal
 from scopemap.errors import WeightsError
 from scopemap.io.checkpoints import REGISTRY, Checkpoint, find
 
-State = Literal["present", "missing", "damaged"]
+State = Literal["present", "by hand", "missing", "damaged"]
 LOCK_NAME = "weights.lock.json"
+_CONFIGURATION = ("config.json", "preprocessor_config.json")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of `overview`: a checkpoint and the state of its files."""
+    """One line of `overview`: a checkpoint and the state of its files ("by hand": there, with no hash to check)."""
 
     name: str
     purpose: str
@@ -77,13 +78,13 @@ def overview() -> list[Row]:
 
 
 def pull(name: str, *, progress: bool = False) -> Path:
-    """Download the weights `name`, check and record them, and return their place; what is there is only checked.
+    """Download the weights `name`, check and record them, and return their place; known files are only checked.
 
     Raises `WeightsError` if they can only be fetched by hand, if `HF_HUB_OFFLINE` forbids the network, if the download
     fails, or if what came is not what is pinned.
     """
     checkpoint = find(name)
-    if _is_there(checkpoint):
+    if _is_there(checkpoint) and not _is_by_hand(checkpoint):
         return verify(name)
     if checkpoint.source == "hand":
         raise WeightsError(_advice([checkpoint]))
@@ -106,9 +107,10 @@ def sha256_of(path: Path) -> str:
 
 
 def recorded_revision(name: str) -> str:
-    """Return the commit that the weights `name` are pinned to or were pulled at; "" if there is none."""
+    """Return the commit that the weights `name` are of by their hashes or were pulled at; "" where unknown."""
     checkpoint = find(name)
-    return _read_lock().get(checkpoint.name, {}).get("revision", "") or checkpoint.revision
+    of_hashes = checkpoint.revision if checkpoint.files else ""
+    return _read_lock().get(checkpoint.name, {}).get("revision", "") or of_hashes
 
 
 @lru_cache(maxsize=64)
@@ -126,7 +128,17 @@ def _expected(checkpoint: Checkpoint) -> dict[str, list[str]]:
 
 def _is_there(checkpoint: Checkpoint) -> bool:
     expected = _expected(checkpoint)
-    return bool(expected) and all((weights_folder() / file).is_file() for file in expected)
+    if not expected:
+        return _is_by_hand(checkpoint)
+    return all((weights_folder() / file).is_file() for file in expected)
+
+
+def _is_by_hand(checkpoint: Checkpoint) -> bool:
+    """Return whether a model of the hub without known hashes is in its folder."""
+    if checkpoint.source != "hub" or _expected(checkpoint):
+        return False
+    place = weights_folder() / checkpoint.place
+    return all((place / file).is_file() for file in _CONFIGURATION) and any(place.glob("*.safetensors"))
 
 
 def _checked(checkpoint: Checkpoint) -> Path:
@@ -148,7 +160,7 @@ def _state(checkpoint: Checkpoint) -> State:
         _checked(checkpoint)
     except WeightsError:
         return "damaged"
-    return "present"
+    return "by hand" if _is_by_hand(checkpoint) else "present"
 
 
 def _advice(checkpoints: list[Checkpoint]) -> str:
@@ -161,7 +173,13 @@ def _how_to_fetch(checkpoint: Checkpoint) -> str:
         return f"put {checkpoint.place} there, {checkpoint.licence}, to be found {checkpoint.location}"
     size = f"{checkpoint.size_mb:.0f} MB, " if checkpoint.size_mb else ""
     command = f"run `scopemap models pull {checkpoint.name}` ({size}licence: {checkpoint.licence})"
-    return f"{command}, or name a local folder that holds the model" if checkpoint.source == "hub" else command
+    if checkpoint.source != "hub":
+        return command
+    return (
+        f"{command}, or copy {', '.join(_CONFIGURATION)} and *.safetensors of {checkpoint.location} to "
+        f"{weights_folder() / checkpoint.place}, or name a local folder that holds them (depth.model; for the anchor "
+        "depth.anchor_model)"
+    )
 
 
 def _download_from_torchvision(checkpoint: Checkpoint, progress: bool) -> str:
@@ -185,7 +203,7 @@ def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
         checkpoint.location,
         revision=commit,
         local_dir=weights_folder() / checkpoint.place,
-        allow_patterns=["config.json", "preprocessor_config.json", "*.safetensors", "*.safetensors.index.json"],
+        allow_patterns=[*_CONFIGURATION, "*.safetensors", "*.safetensors.index.json"],
     )
     return commit or ""
 

@@ -107,7 +107,7 @@ class Masker:
         darkest, middle = _darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
         lit = is_lit(frame.rgb, self.settings.advanced.dark_level)
-        valid = frame.valid & lit & ~clipped
+        valid = frame.valid & lit & ~clipped if self.settings.advanced.exposure else frame.valid
         field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         if self.settings.highlights:
             bright = clipped | specular(darkest, field, HIGHLIGHT_RATIO)
