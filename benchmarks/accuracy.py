@@ -61,9 +61,9 @@ PHOTOMETRIC: dict[str, dict[str, Any]] = {
     "Gauss-Newton": {"tracking.paper.solver": "gauss-newton"},
     "full resolution": {"tracking.advanced.finest_level": 0},
 }
-# ... and of the back end, with all of the front end.
+# ... of the back end, with all of the front end; of loop closure, where the camera returns.
+LOOPS: dict[str, dict[str, Any]] = {"no loops": {"mapping.min_loop_inliers": 0}}
 BACK_END: dict[str, dict[str, Any]] = {
-    "no loops": {"mapping.min_loop_inliers": 0},
     "links to the keyframe before only": {"mapping.advanced.keyframe_gaps": (1,)},
     "depth of keyframes hardly adjusted": {"mapping.advanced.scale_sigma": 1e-3},
     "back end, but no corners while tracking": {"tracking.advanced.corner_depth_sigma": 0.0},
@@ -72,12 +72,13 @@ BACK_END: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """One row: an input, how it is aligned for the measurement, and the settings that differ from the default."""
+    """One row: an input, how it is aligned, the settings that differ from the default, and the frames; None: all."""
 
     name: str
     source: Path
     align: str
     settings: dict[str, Any] = field(default_factory=dict)
+    frames: slice | None = None
 
 
 def real_runs(data: Path) -> Iterator[Run]:
@@ -149,16 +150,24 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
 
 
 def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
-    """Yield every ablation on the real clip (Depth Anything files) and on a phantom (scopenet, true depth)."""
-    cecum, colon = data / "endoscopy/c3vd/cecum_t1_a", folder / "ablated"
+    """Yield each ablation where its part can matter.
+
+    Fast motion: every third frame of the real clip (Depth Anything files). Predicted and true depth: a phantom. Loops:
+    a phantom that ends where it began.
+    """
+    cecum, colon, returning = data / "endoscopy/c3vd/cecum_t1_a", folder / "ablated", folder / "returning"
     write_phantom(PhantomSpec(scene="colon", frames=120, seed=5), colon)
+    write_phantom(PhantomSpec(scene="colon", frames=301, seed=5, loop=True), returning)
     files = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
-    for source, where, settings in ((cecum, "cecum_t1_a", files), (colon, "colon, scopenet", {})):
+    fast = (cecum, "cecum_t1_a, every third frame", files, slice(None, None, 3))
+    for source, where, settings, frames in (fast, (colon, "colon, scopenet", {}, None)):
         light = settings | NO_SURFACE | LIGHT
         for name, changes in ({"default": {}} | BACK_END).items():
-            yield Run(f"{name}: {where}", source, "sim3", light | changes)
+            yield Run(f"{name}: {where}", source, "sim3", light | changes, frames)
         for name, changes in ({"as tracked": {}} | FRONT_END).items():
-            yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes)
+            yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes, frames)
+    for name, changes in ({"default": {}} | LOOPS).items():
+        yield Run(f"{name}: colon that returns, scopenet", returning, "sim3", NO_SURFACE | LIGHT | changes)
     exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE | LIGHT
     for name, changes in ({"as tracked": {}} | PHOTOMETRIC).items():
         yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
@@ -168,7 +177,7 @@ def row(run: Run, out: Path | None) -> str:
     """Reconstruct, measure, and return the table row."""
     started = time.perf_counter()
     config = Config.load(settings=run.settings)
-    result = reconstruct(open_sequence(run.source, settings=config.input), config, out=out)
+    result = reconstruct(open_sequence(run.source, frames=run.frames, settings=config.input), config, out=out)
     ms = 1e3 * (time.perf_counter() - started) / len(result.records)
     matched = match(result.trajectory, read_reference(run.source), run.align)
     report, mesh_file = pose_report(matched), run.source / "mesh_truth.ply"
