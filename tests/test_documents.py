@@ -55,6 +55,23 @@ def test_the_readme_names_every_preset_and_all_weights() -> None:
         assert f"`{name}`" in _text("README.md").replace("--preset ", "")
 
 
+def test_reproducing_names_plans_and_weights_that_exist() -> None:
+    text = _text("docs/reproduce.md")
+    plans = {path.stem for path in (ROOT / "src/scopemap/benchmark/plans").glob("*.toml")}
+    assert (
+        {"scared", "scared-c", "scared-ablations", "hamlyn"}
+        <= set(re.findall(r"scopemap bench ([\w-]+)", text))
+        <= plans
+    )
+    assert set(re.findall(r"^\| `([\w-]+)` \| \d+ \|", text, flags=re.MULTILINE)) <= set(REGISTRY)
+    listed = text.split("**By hand**")[1].split("## 4.")[0]
+    places = {entry.place for entry in REGISTRY.values() if entry.source != "hand"} - {REGISTRY["raft-small"].place}
+    assert all(place in listed for place in places)
+    strict = PRESETS["paper-strict"]["depth.model"]
+    assert strict in text
+    assert strict.replace("/", "--") in text
+
+
 def test_the_columns_of_frames_csv_are_documented() -> None:
     table = _text("docs/formats.md").split("### frames.csv")[1].split("## What goes in")[0]
     assert re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) == list(_COLUMNS)
