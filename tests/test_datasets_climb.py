@@ -7,15 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_climb import path_of, write_clip, write_reference
+from drawn_climb import path_of, write_clip, write_foreign_run, write_reference
 from test_datasets_endomapper import KB4, SIZE
 
-from scopemap.benchmark.plan import found_sequences, read_plan
+from scopemap.benchmark.methods.registry import create_method
+from scopemap.benchmark.plan import MethodPlan, found_sequences, read_plan
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.errors import InputError
 from scopemap.io.datasets.reference import read_reference, reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.trajectory.formats.opening import read_trajectory
 
 
 def test_a_clip(tmp_path: Path) -> None:
@@ -65,3 +67,14 @@ def test_the_plan_finds_the_clips(tmp_path: Path) -> None:
     write_reference(tmp_path, path_of(6), clip="Seq_002_a")
     found, missing = found_sequences(read_plan("climb"), tmp_path)
     assert ([sequence.path for sequence in found], missing) == (["Seq_001_a"], [])
+
+
+def test_a_submission_of_another_system_is_imported_with_its_submaps(tmp_path: Path) -> None:
+    folder, poses = write_clip(tmp_path), path_of(6)
+    write_foreign_run(tmp_path / "theirs/Seq_001_a/1", (poses[:3], [1, 2, 3]), (poses[3:], [4, 5, 6]))
+    plan = MethodPlan(name="theirs", use="import", files="theirs/{sequence}/1")
+    create_method(plan, tmp_path, "Seq_001_a").run(open_sequence(folder), {}, tmp_path / "run")
+    found = read_trajectory(tmp_path / "run")
+    tracked = [np.flatnonzero(submap.tracked).tolist() for submap in (found, *found.others)]
+    assert tracked == [[0, 1, 2], [3, 4, 5]]
+    np.testing.assert_allclose(found.others[0].T_world_camera[3:], poses[3:], atol=1e-6)
