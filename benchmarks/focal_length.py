@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 
-from scopemap.calibration.focal_length import focal_from_motion, with_focal_from_motion
+from scopemap.calibration.focal_length.estimate import focal_from_motion, with_focal_from_motion
 from scopemap.config import Config
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence

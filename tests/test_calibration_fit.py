@@ -12,7 +12,7 @@ from drawn_inputs import write_c3vd
 from front_door import refused
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.calibration import Calibration, fitted, fitted_to
+from scopemap.cameras.formats.calibration import Calibration, fitted
 from scopemap.cameras.formats.reading import read_calibration, stated_calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
@@ -154,6 +154,7 @@ def test_what_a_data_set_publishes_is_scaled_by_its_reader_and_it_is_said(tmp_pa
     sequence = open_sequence(write_c3vd(tmp_path / "cecum", 3))
     assert sequence.rectifier.source.width < 1350
     assert sequence.camera_source.endswith(", rescaled from 1350x1080 px")
-    assert fitted_to(ROOMS["1"], (320, 240), "shipped").central.fx == ROOMS["1"].central.fx / 2
+    published = Calibration(ROOMS["1"], None, "shipped")
+    assert fitted(published, (320, 240), "scale").camera.central.fx == ROOMS["1"].central.fx / 2
     with pytest.raises(CalibrationError, match="another aspect, perhaps cropped"):
-        fitted_to(ROOMS["1"], (320, 250), "shipped")
+        fitted(published, (320, 250), "scale")

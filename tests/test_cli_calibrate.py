@@ -13,6 +13,7 @@ from drawn_inputs import save
 from drawn_videos import encode
 from front_door import call
 
+from scopemap.cameras.camera import source_pixel
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError
@@ -66,15 +67,13 @@ def test_a_calibration_that_every_command_reads(calibrate: Say, frames: Path, tm
     sequence = open_sequence(frames, camera=tmp_path / "calibration.yaml")
     assert sequence.calibrated
     assert sequence.camera_source == "calibration file calibration.yaml"
-    ray = sequence.camera.unproject(np.array([60.0, 60.0]))
-    assert sequence.rectifier.source_pixel(np.array(60.0), np.array(60.0)) == pytest.approx(PINHOLE.project(ray), abs=3)
+    pixel = np.array([60.0, 60.0])
+    expected = PINHOLE.project(sequence.camera.unproject(pixel))
+    assert source_pixel(pixel, sequence.camera, sequence.rectifier.source) == pytest.approx(expected, abs=3)
     # What is there stays, unless the word is given.
     code, out, err = calibrate(frames, *BOARD)
     assert (code, out) == (1, "")
-    assert (
-        err == "scopemap: writing the calibration: calibration.yaml is there already; give --overwrite or another "
-        "--out\n"
-    )
+    assert err == "scopemap: calibration.yaml exists; give another name with --out, or --overwrite\n"
     code, out, err = calibrate(frames, *BOARD, "--model", "pinhole", "--frames", "::2", "--json", "--overwrite")
     assert (code, [line for line in err.splitlines() if not line.startswith("warning: ")]) == (0, [])
     told = json.loads(out)
@@ -134,7 +133,7 @@ def test_a_board_that_is_not_there(calibrate: Say, frames: Path, tmp_path: Path)
         ((*BOARD, "--charuco"), "a ChArUco board needs the side of its markers: give --marker-mm"),
         ((*BOARD, "--legacy"), "are for a ChArUco board: give --charuco, too"),
         ((*BOARD, "--charuco", "--marker-mm", 2, "--dictionary", "DICT_1"), "unknown markers 'DICT_1'"),
-        ((*BOARD, "--out", "camera.txt"), "its name has to end in .yaml or .yml"),
+        ((*BOARD, "--out", "camera.txt"), "its name must end in .yaml or .yml"),
         ((*BOARD, "--out", "none/c.yaml"), "the folder none is not there or not writable"),
         ((*BOARD, "--frames", "a"), "cannot read the frames 'a'"),
         ((*BOARD, "--dataset", "moon"), "unknown data set 'moon'"),

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scopemap.config
+from docs.settings_page import settings_page
 from scopemap.config import PRESETS, Config, setting_names
 from scopemap.config.config import REMOVED, RENAMED
-from scopemap.config.page import settings_page
 from scopemap.errors import SettingsError
 
 SOURCE = Path(scopemap.config.__file__).parents[1]
@@ -265,7 +265,7 @@ def test_renamed_settings_exist_and_removed_ones_do_not() -> None:
 
 def test_the_page_of_settings_is_the_generated_one() -> None:
     page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
-    assert page == settings_page(), "docs/settings.md is out of date: the command in scopemap/config/page.py writes it"
+    assert page == settings_page(), "docs/settings.md is out of date: python docs/settings_page.py writes it"
     assert all(f"`{name}`" in page for name in setting_names() if "." in name)
 
 

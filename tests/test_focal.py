@@ -13,16 +13,14 @@ import numpy as np
 import pytest
 from turning_clip import SIZE, focal_of, write_clip
 
-from scopemap.calibration.focal_length import (
+from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
+from scopemap.calibration.focal_length.estimate import (
     FocalEstimate,
-    Window,
-    WindowFit,
-    adjust_window,
     combine,
     focal_from_motion,
-    windows_of,
     with_focal_from_motion,
 )
+from scopemap.calibration.focal_length.windows import Window, windows_of
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
@@ -278,7 +276,7 @@ def test_which_estimate_is_taken(
     still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, message: str
 ) -> None:
     estimate = ESTIMATES[name]
-    monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: estimate)
+    monkeypatch.setattr("scopemap.calibration.focal_length.estimate.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
     assert message in " ".join([found.camera_source, *notes])
     if taken:
@@ -289,7 +287,7 @@ def test_which_estimate_is_taken(
 
 
 def test_no_estimate_is_an_error_if_it_is_required(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.calibration.focal_length.choice.focal_from_motion", lambda *_: ESTIMATES["none"])
+    monkeypatch.setattr("scopemap.calibration.focal_length.estimate.focal_from_motion", lambda *_: ESTIMATES["none"])
     with pytest.raises(CalibrationError, match=r"input\.focal = flow.*0 windows"):
         reconstruct(still, _settings("flow"))
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
 from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
-from scopemap.cameras.rectification import DepthSensor, Rectifier, SensorRectifier, working_camera, working_size
+from scopemap.cameras.rectification import DepthSensor, Rectifier, working_camera, working_size
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import inverse, se3_exp, transform
 
@@ -57,7 +57,7 @@ def test_maps_lead_where_the_cameras_say(source: CameraModel) -> None:
     """A ramp image holds its own coordinates: rectified, it must hold the source pixel of each target pixel."""
     rectifier = Rectifier(source, working_camera(source, (160, 120)))
     u, v = coordinates(640, 480)
-    expected = rectifier.source_pixel(*coordinates(160, 120))
+    expected = source_pixel(np.stack(coordinates(160, 120), -1), rectifier.target, rectifier.source)
     inside = rectifier.valid
     for axis, ramp in enumerate((u, v)):
         np.testing.assert_allclose(rectifier.smooth(ramp)[inside], expected[inside][:, axis], atol=0.02)
@@ -69,7 +69,7 @@ def test_an_array_of_another_resolution_is_taken_from_the_same_place(source: Cam
     rectifier = Rectifier(source, working_camera(source, (160, 120)))
     u, _ = coordinates(int(640 * factor), int(480 * factor))
     ramp = (u + 0.5) / factor - 0.5  # u of the full-size image
-    expected = rectifier.source_pixel(*coordinates(160, 120))[..., 0]
+    expected = source_pixel(np.stack(coordinates(160, 120), -1), rectifier.target, rectifier.source)[..., 0]
     deep = rectifier.valid & (expected > 2) & (expected < 637)
     np.testing.assert_allclose(rectifier.smooth(ramp)[deep], expected[deep], atol=0.05)
     assert np.abs(rectifier.nearest(ramp)[deep] - expected[deep]).max() <= 0.501 / factor
@@ -169,8 +169,8 @@ def test_depth_of_a_sensor_beside_the_camera_lands_where_the_camera_sees_it(sour
     T = se3_exp(np.array([0.02, -0.03, 0.05, -25.0, 4.0, 2.0]))
     normal_mm = np.array([0.2, 0.1, 1.0]) / 1000  # normal . X = 1, in the sensor's frame
     rays = sensor.resized(*size).rays
-    rectifier = Rectifier(source, working_camera(source, (320, 240)))
-    found_mm = SensorRectifier(rectifier, DepthSensor(sensor, T)).nearest((1 / (rays @ normal_mm)).astype(np.float32))
+    rectifier = Rectifier(source, working_camera(source, (320, 240)), DepthSensor(sensor, T))
+    found_mm = rectifier.nearest((1 / (rays @ normal_mm)).astype(np.float32))
     known = np.isfinite(found_mm)
     points = transform(inverse(T), rectifier.target.rays[known] * found_mm[known, None])
     # Half a pixel either way on the slant, twice; and what a coarser sensor leaves empty stays empty.

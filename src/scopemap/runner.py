@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.calibration.focal_length import with_focal_from_motion
+from scopemap.calibration.focal_length.estimate import with_focal_from_motion
 from scopemap.config import Config, FusionSettings
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.power_law import fit_exponent

@@ -58,7 +58,11 @@ class CameraCalibration:
         """Return the figures as plain numbers and texts: px, mm, degrees."""
         fit = self.fit
         rows = zip(self.views, fit.view_rms_px, tilts_deg(fit), fit.T_camera_board, strict=True)
-        return {
+        unused = {
+            name: [{"frame": out.view.index, "name": out.view.name, "reason": out.reason} for out in views]
+            for name, views in (("left_out", self.left_out), ("blurred", self.blurred))
+        }
+        return unused | {
             "model": fit.form.model,
             "terms": list(fit.form.terms),
             "image_size": [fit.camera.width, fit.camera.height],
@@ -78,8 +82,6 @@ class CameraCalibration:
                 }
                 for view, error, tilt, pose in rows
             ],
-            "left_out": [out.summary() for out in self.left_out],
-            "blurred": [out.summary() for out in self.blurred],
             "warnings": self.warnings,
         }
 
@@ -93,22 +95,26 @@ def calibrate(
     the best. Raises `InputError` for fewer than 8 views that differ and agree, `CalibrationError` where no camera
     explains them.
     """
-    found, size = len(search.views), search.size
-    seen = f"the board was found in {found} of {search.looked_at} frames"
-    if found < FEWEST_VIEWS:
-        raise _too_few(seen, f"looked for a {target.described}; is it this one, and whole in the picture?")
+    found, size = f"the board was found in {len(search.views)} of {search.looked_at} frames", search.size
+    _check_count(search.views, found, f"looked for a {target.described}; is it this one, and whole in the picture?")
     selected, blurred = select_views(search.views, size)
-    if len(selected) < FEWEST_VIEWS:
-        differ = f"but {len(selected)} of these views are sharp and differ"
-        raise _too_few(f"{seen}, {differ}", "move the board through the picture and tilt it")
+    differ = f"{found}, but {len(selected)} of these views are sharp and differ"
+    _check_count(selected, differ, "move the board through the picture and tilt it")
     forms = [form for form in FORMS if model in ("auto", form.model)]
-    flexible = _flexible_fits(selected, size, forms)
+    # Of each model the form with most coefficients, the last, is fitted first.
+    flexible: dict[str, Fit] = {}
+    for last in {form.model: form for form in forms}.values():
+        with suppress(CalibrationError):
+            flexible[last.model] = fit_camera(selected, size, last)
+    if not flexible:
+        raise CalibrationError(
+            f"calibrating: no camera explains the {len(selected)} views; is the board flat and the one named?"
+        )
     best = min(flexible.values(), key=lambda fit: float(np.median(fit.view_rms_px)))
     views, out = without_outliers(selected, size, best.form)
     views.sort(key=lambda view: view.index)
-    if len(views) < FEWEST_VIEWS:
-        agree = f"{seen}, but only {len(views)} of {len(selected)} views agree"
-        raise _too_few(agree, "is the board flat and the zoom untouched?")
+    agree = f"{found}, but only {len(views)} of {len(selected)} views agree"
+    _check_count(views, agree, "is the board flat and the zoom untouched?")
     near = {model: fit.camera for model, fit in flexible.items()}
     errors = {form: held_out_error_px(views, size, form, near[form.model]) for form in forms if form.model in near}
     form = choose_form(errors)
@@ -157,18 +163,6 @@ def warnings_about(fit: Fit, covered: float) -> list[str]:
     return [message for applies, message in possible if applies]
 
 
-def _too_few(found: str, advice: str) -> InputError:
-    return InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")
-
-
-def _flexible_fits(views: list[BoardView], size: tuple[int, int], forms: list[LensForm]) -> dict[str, Fit]:
-    """Return the fit with most coefficients by model; `CalibrationError` where neither model fits."""
-    fits: dict[str, Fit] = {}
-    for model, form in {form.model: form for form in forms}.items():
-        with suppress(CalibrationError):
-            fits[model] = fit_camera(views, size, form)
-    if not fits:
-        raise CalibrationError(
-            f"calibrating: no camera explains the {len(views)} views; is the board flat and the one named?"
-        )
-    return fits
+def _check_count(views: list[BoardView], found: str, advice: str) -> None:
+    if len(views) < FEWEST_VIEWS:
+        raise InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")

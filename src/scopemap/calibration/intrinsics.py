@@ -17,7 +17,7 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError
 from scopemap.geometry.least_squares import robust_sigma_2d
-from scopemap.geometry.se3 import transform
+from scopemap.geometry.se3 import se3, transform
 
 _TERMS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 _FIX = {"k1": cv2.CALIB_FIX_K1, "k2": cv2.CALIB_FIX_K2, "k3": cv2.CALIB_FIX_K3, "p1": cv2.CALIB_ZERO_TANGENT_DIST}
@@ -98,11 +98,15 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
     `near` is a camera to start from, else several starts are tried. Raises `CalibrationError` where none converges.
     """
     w, h = size
-    starts: list[PinholeCamera | None] = [near.central] if near else []
-    if near is None:
+    starts: list[PinholeCamera | None]
+    if near is not None:
+        starts = [near.central]
+    else:
         starts = [PinholeCamera(f * w, f * w, (w - 1) / 2, (h - 1) / 2, w, h) for f in _FOCAL_GUESSES]
-        simple = _attempt(views, size, LensForm("pinhole", ("k1", "k2")), None) if form.model == "fisheye" else None
-        starts += [simple.camera.central] if simple else [None] if form.model == "pinhole" else []
+        if form.model == "pinhole":
+            starts.append(None)
+        elif simple := _attempt(views, size, LensForm("pinhole", ("k1", "k2")), None):
+            starts.append(simple.camera.central)
     fits = [_attempt(views, size, form, start) for start in starts]
     best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.rms_px, default=None)
     if best is None:
@@ -207,9 +211,7 @@ def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, star
     pinhole = PinholeCamera(fx, fy, cx, cy, *size)
     camera: CameraModel = FisheyeCamera(pinhole, terms) if is_fisheye else OpenCvCamera(pinhole, terms)
     camera = camera if form.terms else pinhole
-    poses = np.tile(np.eye(4), (len(views), 1, 1))
-    for pose, rotation, translation in zip(poses, found[3], found[4], strict=True):
-        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], np.ravel(translation)
+    poses = np.stack([se3(cv2.Rodrigues(r)[0], np.ravel(t)) for r, t in zip(found[3], found[4], strict=True)])
     residuals = tuple(
         view.corners.pixels - camera.project(transform(pose, view.corners.board_mm))
         for view, pose in zip(views, poses, strict=True)
@@ -228,8 +230,8 @@ def _resected(camera: CameraModel, corners: Corners, T_camera_board: np.ndarray)
     if seen.sum() >= _FEWEST_CORNERS:
         board, plane = corners.board_mm[seen], rays[seen, :2]
         rotation, translation = cv2.solvePnPRefineLM(board, plane, np.eye(3), None, rotation, translation)
-    points = corners.board_mm @ cv2.Rodrigues(rotation)[0].T + np.ravel(translation)
-    return corners.pixels - camera.project(points)
+    pose = se3(cv2.Rodrigues(rotation)[0], np.ravel(translation))
+    return corners.pixels - camera.project(transform(pose, corners.board_mm))
 
 
 def _lengths(residual_px: np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ def _draw_residuals(axes: Axes, calibration: CameraCalibration, colours: np.ndar
 
 
 def _draw_errors(axes: Axes, calibration: CameraCalibration, colours: np.ndarray) -> None:
-    places = np.arange(len(calibration.views))
+    places = range(len(calibration.views))
     axes.bar(places, calibration.fit.view_rms_px, color=colours)
     axes.axhline(calibration.fit.rms_px, color="black", linestyle="--", linewidth=1)
     axes.set_xticks(places, [str(view.index) for view in calibration.views], rotation=90, fontsize=7)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TypeAlias
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scopemap.errors import SettingsError
 
@@ -39,17 +40,6 @@ class Corners:
         return Corners(self.board_mm[kept], self.pixels[kept])
 
 
-class Target(Protocol):
-    """A printed calibration target."""
-
-    @property
-    def described(self) -> str:
-        """The target in a few words."""
-
-    def find(self, grey: np.ndarray) -> Corners | None:
-        """Return the target's corners in an image (h, w) uint8, None where too few are seen."""
-
-
 @dataclass(frozen=True)
 class Checkerboard:
     """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the image.
@@ -76,12 +66,12 @@ class Checkerboard:
         return grid * float(self.square_mm)
 
     def find(self, grey: np.ndarray) -> Corners | None:
-        """Return all corners, None where one is missing.
+        """Return all corners in an image (h, w) uint8, None where one is missing.
 
         Found by Duda and Frese (BMVC 2018) and refined to subpixels in the full image.
         """
         shrink = min(1.0, _SEARCH_SIDE_PX / max(grey.shape))
-        small = grey if shrink == 1 else cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         size = (self.columns, self.rows)
         found, pixels = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not found:
@@ -116,7 +106,7 @@ class CharucoBoard:
             raise SettingsError(f"a marker of {self.marker_mm:g} mm does not fit a square of {self.square_mm:g} mm")
         if self.dictionary not in DICTIONARIES:
             raise SettingsError(f"unknown markers '{self.dictionary}': choose one of {', '.join(DICTIONARIES)}")
-        known, wanted = len(_markers(self.dictionary).bytesList), self.columns * self.rows // 2
+        known, wanted = len(self._markers.bytesList), self.columns * self.rows // 2
         if wanted > known:
             raise SettingsError(
                 f"a ChArUco board of {self.columns}x{self.rows} squares has {wanted} markers, {self.dictionary} only "
@@ -131,19 +121,23 @@ class CharucoBoard:
             f"{self.marker_mm:g} mm from {self.dictionary}{', legacy layout' if self.legacy else ''}"
         )
 
+    @property
+    def _markers(self) -> cv2.aruco.Dictionary:
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+
     @cached_property
     def layout(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's board."""
         size = (self.columns, self.rows)
-        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, _markers(self.dictionary))
+        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, self._markers)
         board.setLegacyPattern(self.legacy)
         return board
 
     def find(self, grey: np.ndarray) -> Corners | None:
-        """Return the corners beside markers that were read, None for fewer than 8 or all in one line."""
+        """Return the corners beside markers that were read in an image (h, w) uint8, None for too few of them."""
         # In a small image markers have few pixels: doubled, more are read, and corners are twice as exact.
         grow = 2 if max(grey.shape) <= _SEARCH_SIDE_PX else 1
-        large = grey if grow == 1 else cv2.resize(grey, None, fx=grow, fy=grow, interpolation=cv2.INTER_CUBIC)
+        large = cv2.resize(grey, None, fx=grow, fy=grow, interpolation=cv2.INTER_CUBIC)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(self.layout).detectBoard(large)
         if ids is None or len(ids) < _FEWEST_CORNERS:
             return None
@@ -153,15 +147,14 @@ class CharucoBoard:
         return Corners(board_mm, (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) / grow - 0.5)
 
 
+Target: TypeAlias = Checkerboard | CharucoBoard
+"""A printed calibration target."""
+
+
 def nearest_px(pixels: np.ndarray) -> float:
     """Return the median distance of corners (N, 2) from their nearest neighbour, px."""
-    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.median(distance.min(axis=1)))
-
-
-def _markers(dictionary: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    distance, _ = cKDTree(pixels).query(pixels, k=2)
+    return float(np.median(distance[:, 1]))
 
 
 def _check(columns: int, rows: int, square_mm: float) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
@@ -53,10 +52,6 @@ class LeftOut:
     view: BoardView
     reason: str
 
-    def summary(self) -> dict[str, Any]:
-        """Return the frame's number and name, and the reason."""
-        return {"frame": self.view.index, "name": self.view.name, "reason": self.reason}
-
 
 def find_views(
     source: Source,
@@ -71,14 +66,14 @@ def find_views(
     of all. Raises `InputError` where the source cannot be read.
     """
     selection = selection or slice(None)
-    if selection.step is not None and selection.step <= 0:
-        raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
+    step = 1 if selection.step is None else selection.step
+    if step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {step}")
     count = None if source.count is None else len(range(*selection.indices(source.count)))
     every = every or max(1, (count or 0) // _FRAMES_SEARCHED)
     total = None if count is None else -(-count // every)
-    searched = slice(selection.start, selection.stop, every * (selection.step or 1))
     search = Search((source.width, source.height), every)
-    for frame in source.frames(searched):
+    for frame in source.frames(slice(selection.start, selection.stop, every * step)):
         search.looked_at += 1
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = target.find(grey)
@@ -94,11 +89,10 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     image = grey.astype(np.float32)
     slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
     reach = int(np.clip(0.4 * nearest_px(pixels), 2, _FARTHEST_EDGE_PX))
-    widths = []
-    for u, v in np.rint(pixels).astype(int):
-        window = np.s_[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1]
-        widths.append(float(np.ptp(image[window])) / max(float(slope[window].max()), 1e-6))
-    return float(np.median(widths))
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    widths = (cv2.dilate(image, window) - cv2.erode(image, window)) / np.maximum(cv2.dilate(slope, window), 1e-6)
+    u, v = np.rint(pixels).astype(int).clip(0, np.array(grey.shape[::-1]) - 1).T
+    return float(np.median(widths[v, u]))
 
 
 def select_views(
@@ -152,8 +146,7 @@ def _pose(view: BoardView, size: tuple[int, int]) -> np.ndarray:
 
 def _cells(view: BoardView, size: tuple[int, int]) -> np.ndarray:
     """Which cells of a grid over the image hold a corner, flat bool."""
-    side = size[0] / _CELLS_ACROSS
-    covered = np.zeros((max(1, round(size[1] / side)), _CELLS_ACROSS), dtype=bool)
-    across, down = np.clip((view.corners.pixels / side).astype(int), 0, np.array(covered.shape[::-1]) - 1).T
-    covered[down, across] = True
-    return covered.ravel()
+    bins = (_CELLS_ACROSS, max(1, round(_CELLS_ACROSS * size[1] / size[0])))
+    x, y = view.corners.pixels.T
+    count, _, _ = np.histogram2d(x, y, bins, range=((0, size[0]), (0, size[1])))
+    return count.ravel() > 0

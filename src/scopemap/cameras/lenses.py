@@ -15,43 +15,42 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from scipy.optimize.elementwise import find_root
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
 
 # Rays are written with z = 1, so a field must end before 90 deg: here at 88.9 deg.
 _WIDEST_RAD = float(np.arctan(50.0))
 _ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)
 _MAX_STEPS = 60
+_SMALL_STEP = 1e-9  # of the grid, to see whether a function increases
 
-_Radial = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+_Function = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class _RadialLens(ABC):
+class _RadialLens(CameraModel, ABC):
     """A lens that moves points of the plane z = 1 and then sees them through the pinhole camera `plane`."""
 
     plane: PinholeCamera
 
     @property
     def central(self) -> PinholeCamera:
-        """The pinhole camera that agrees with this one near its principal point."""
         return self.plane
 
     @property
     def width(self) -> int:
-        """Width of the image, px."""
         return self.plane.width
 
     @property
     def height(self) -> int:
-        """Height of the image, px."""
         return self.plane.height
 
     @abstractmethod
-    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance from the axis on the lens' plane of rays at `angle` from it, rad, and its derivative."""
+    def _radial(self, angle: np.ndarray) -> np.ndarray:
+        """Return the distance from the axis on the lens' plane of rays at `angle` from it, rad."""
 
-    @cached_property
+    @property
     def field_rad(self) -> float:
         """Largest angle from the axis, rad, that the lens maps one to one and that still points forward."""
         return float(self._grid[-1])
@@ -63,27 +62,23 @@ class _RadialLens(ABC):
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
         """Return where the lens moves points (..., 2) of the plane z = 1, NaN beyond its field."""
         angle = np.arctan(np.linalg.norm(xy, axis=-1))
-        return _with_radius(xy, self._radial(np.where(angle <= self.field_rad, angle, np.nan))[0])
+        return _with_radius(xy, self._radial(np.where(angle <= self.field_rad, angle, np.nan)))
 
     def _undistorted(self, xy: np.ndarray) -> np.ndarray:
         """Return the inverse of `_distorted`."""
         return _with_radius(xy, np.tan(_invert_increasing(self._radial, self._grid, np.linalg.norm(xy, axis=-1))))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
         xy = self._distorted(_on_plane(points))
         return xy * np.array([self.plane.fx, self.plane.fy]) + np.array([self.plane.cx, self.plane.cy])
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Return rays (..., 3) with z = 1 through pixels (..., 2); NaN beyond the field of the lens."""
         return _ray(self._undistorted(self.plane.unproject(pixels)[..., :2]))
 
     def resized(self, width: int, height: int) -> Self:
-        """Return the camera of the same view at another size; pixel centres stay pixel centres."""
         return replace(self, plane=self.plane.resized(width, height))
 
     def cropped(self, x: int, y: int, width: int, height: int) -> Self:
-        """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
         return replace(self, plane=self.plane.cropped(x, y, width, height))
 
 
@@ -100,17 +95,10 @@ class OpenCvCamera(_RadialLens):
         if len(self.distortion) not in (4, 5, 8):
             raise ValueError(f"OpenCvCamera.distortion: expected 4, 5 or 8 numbers, got {len(self.distortion)}")
 
-    @cached_property
-    def _fraction(self) -> tuple[Polynomial, Polynomial]:
+    def _radial(self, angle: np.ndarray) -> np.ndarray:
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * (8 - len(self.distortion)))
-        return Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
-
-    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        above, below = self._fraction
         r = np.tan(angle)
-        s, n, d = r * r, above(r * r), below(r * r)
-        slope = n / d + 2 * s * (above.deriv()(s) * d - n * below.deriv()(s)) / d**2
-        return r * n / d, slope * (1 + s)
+        return r * Polynomial([1, k1, k2, k3])(r * r) / Polynomial([1, k4, k5, k6])(r * r)
 
     def _tangential(self, xy: np.ndarray) -> np.ndarray:
         p1, p2 = self.distortion[2:4]
@@ -146,13 +134,8 @@ class FisheyeCamera(_RadialLens):
         if len(self.distortion) != 4:
             raise ValueError(f"FisheyeCamera.distortion: expected 4 numbers, got {len(self.distortion)}")
 
-    @cached_property
-    def _polynomial(self) -> Polynomial:
-        k1, k2, k3, k4 = self.distortion
-        return Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
-
-    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._polynomial(angle), self._polynomial.deriv()(angle)
+    def _radial(self, angle: np.ndarray) -> np.ndarray:
+        return angle * Polynomial([1, *self.distortion])(angle**2)
 
 
 @dataclass(frozen=True)
@@ -174,15 +157,11 @@ class FovCamera(_RadialLens):
     @property
     def central(self) -> PinholeCamera:
         """The pinhole camera that agrees with this one near its principal point."""
-        return replace(self.plane, fx=self.plane.fx * self._slope, fy=self.plane.fy * self._slope)
+        slope = float(2 * np.tan(self.omega / 2) / self.omega)
+        return replace(self.plane, fx=self.plane.fx * slope, fy=self.plane.fy * slope)
 
-    @property
-    def _slope(self) -> float:
-        return float(2 * np.tan(self.omega / 2) / self.omega)
-
-    def _radial(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        r, stretch = np.tan(angle), self._slope * self.omega
-        return np.arctan(stretch * r) / self.omega, self._slope * (1 + r * r) / (1 + (stretch * r) ** 2)
+    def _radial(self, angle: np.ndarray) -> np.ndarray:
+        return np.arctan(2 * np.tan(angle) * np.tan(self.omega / 2)) / self.omega
 
 
 @dataclass(frozen=True)
@@ -213,32 +192,23 @@ class OmnidirectionalCamera:
         a0, c = self.polynomial[0], self.stretch[0]
         return PinholeCamera(a0 * c, a0, self.cx, self.cy, self.width, self.height)
 
-    @cached_property
-    def _depth(self) -> Polynomial:
-        return Polynomial(self.polynomial)
-
-    @cached_property
+    @property
     def _stretch_matrix(self) -> np.ndarray:
         c, d, e = self.stretch
         return np.array([[c, d], [e, 1.0]])
 
     @cached_property
-    def field_rho_px(self) -> float:
-        """Largest rho, px, up to which the angle from the axis grows and the rays point forward."""
-        return float(self._grid[-1])
-
-    @cached_property
     def _grid(self) -> np.ndarray:
-        return _while_increasing(self._radial, self.polynomial[0] * np.tan(_ANGLES_RAD), most=_WIDEST_RAD)
+        """Ascending rho, px, while the angle from the axis grows and the rays point forward."""
+        return _while_increasing(self._angle, self.polynomial[0] * np.tan(_ANGLES_RAD), most=_WIDEST_RAD)
 
-    def _radial(self, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        z = self._depth(rho)
-        return np.arctan2(rho, z), (z - rho * self._depth.deriv()(rho)) / (rho**2 + z**2)
+    def _angle(self, rho: np.ndarray) -> np.ndarray:
+        return np.arctan2(rho, Polynomial(self.polynomial)(rho))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the field of the lens."""
         xy = _on_plane(points)
-        rho = _invert_increasing(self._radial, self._grid, np.arctan(np.linalg.norm(xy, axis=-1)))
+        rho = _invert_increasing(self._angle, self._grid, np.arctan(np.linalg.norm(xy, axis=-1)))
         return _with_radius(xy, rho) @ self._stretch_matrix.T + np.array([self.cx, self.cy])
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
@@ -246,7 +216,7 @@ class OmnidirectionalCamera:
         offset = np.asarray(pixels, dtype=np.float64) - np.array([self.cx, self.cy])
         offset = offset @ np.linalg.inv(self._stretch_matrix).T
         rho = np.linalg.norm(offset, axis=-1)
-        z = np.where(rho <= self.field_rho_px, self._depth(rho), np.nan)
+        z = np.where(rho <= self._grid[-1], Polynomial(self.polynomial)(rho), np.nan)
         return _ray(offset / z[..., None])
 
     def resized(self, width: int, height: int) -> OmnidirectionalCamera:
@@ -279,41 +249,28 @@ def _with_radius(xy: np.ndarray, radius: np.ndarray) -> np.ndarray:
     return xy * scale[..., None]
 
 
-def _while_increasing(function: _Radial, grid: np.ndarray, most: float = np.inf) -> np.ndarray:
+def _while_increasing(function: _Function, grid: np.ndarray, most: float = np.inf) -> np.ndarray:
     """Return the part of `grid` over which `function` increases up to `most`, its end moved to where it stops."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        value, slope = function(grid)
-        stops = np.flatnonzero(~((slope[1:] > 0) & (np.diff(value) > 0) & (value[1:] <= most)))
+        value = function(grid)
+        stops = np.flatnonzero(~((np.diff(value) > 0) & (value[1:] <= most)))
         if not stops.size:
             return grid
-        last = int(stops[0])
-        low, high = grid[last], grid[last + 1]
+        # A maximum may be in the interval before the first decrease.
+        first = max(int(stops[0]) - 1, 0)
+        low, high = grid[first], grid[first + 2]
         for _ in range(_MAX_STEPS):
             middle = 0.5 * (low + high)
-            value_there, slope_there = function(middle)
-            rises = slope_there > 0 and value[last] < value_there < np.inf and value_there <= most
-            low, high = (middle, high) if rises else (low, middle)
-    return np.append(grid[: last + 1], low)
+            here, ahead = function(middle + np.array([0, _SMALL_STEP * grid[-1]]))
+            low, high = (middle, high) if value[first] < here < ahead <= most else (low, middle)
+    return np.append(grid[: first + 1], low)
 
 
-def _invert_increasing(function: _Radial, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return x with function(x) = values (any shape), NaN outside the grid's range.
-
-    `function` gives value and slope and increases over `grid` (ascending). A table brackets each root; Newton's step is
-    taken while it stays in the bracket, else the bracket is halved, so that it ends also where the slope vanishes.
-    """
-    table = function(grid)[0]
+def _invert_increasing(function: _Function, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return x with function(x) = values (any shape), NaN outside the range of `function` over `grid` (ascending)."""
+    table = function(grid)
     inside = (values >= table[0]) & (values <= table[-1])
     values = np.where(inside, values, table[0])
     cell = np.clip(np.searchsorted(table, values, side="right") - 1, 0, len(grid) - 2)
-    low, high = grid[cell], grid[cell + 1]
-    x = np.interp(values, table, grid)
-    for _ in range(_MAX_STEPS):
-        value, slope = function(x)
-        low, high = np.where(value <= values, x, low), np.where(value > values, x, high)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            newton = x - (value - values) / slope
-        previous, x = x, np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-        if not np.any(np.abs(x - previous) > 1e-14 * (1 + np.abs(x))):
-            break
-    return np.where(inside, x, np.nan)
+    found = find_root(lambda x, value: function(x) - value, (grid[cell], grid[cell + 1]), args=(values,))
+    return np.where(inside, found.x, np.nan)

@@ -36,13 +36,15 @@ def working_camera(source: CameraModel, size: tuple[int, int], zoom: float = 1.0
 class Rectifier:
     """Moves images, depth and labels from a source camera to a pinhole camera with the same centre.
 
-    Raises `CalibrationError` where the two cameras share no view.
+    sensor : the camera of the depth where it is another one than the images', or None.
+
+    Raises `CalibrationError` where source and target share no view.
     """
 
-    def __init__(self, source: CameraModel, target: PinholeCamera) -> None:
-        self.source, self.target = source, target
+    def __init__(self, source: CameraModel, target: PinholeCamera, sensor: DepthSensor | None = None) -> None:
+        self.source, self.target, self._sensor = source, target, sensor
         u, v = np.meshgrid(np.arange(target.width), np.arange(target.height))
-        x, y = np.moveaxis(self.source_pixel(u, v), -1, 0)
+        x, y = np.moveaxis(source_pixel(np.stack([u, v], -1), target, source), -1, 0)
         # A pixel is an area: its outer half belongs to the image too.
         self._valid = (np.abs(x - (source.width - 1) / 2) <= source.width / 2) & (
             np.abs(y - (source.height - 1) / 2) <= source.height / 2
@@ -68,10 +70,6 @@ class Rectifier:
         is_pinhole = isinstance(self.source, PinholeCamera)
         return is_pinhole and np.allclose(same.matrix, self.target.matrix, rtol=0, atol=1e-6)
 
-    def source_pixel(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return source pixels (..., 2) of target pixels `u`, `v` (...); NaN where the source has none."""
-        return source_pixel(np.stack([u, v], -1), self.target, self.source)
-
     def image(self, image: np.ndarray) -> np.ndarray:
         """Return the rectified image.
 
@@ -80,7 +78,8 @@ class Rectifier:
         """
         check_shape("image", image[..., 0] if image.ndim == 3 else image, (self.source.height, self.source.width))
         if self.only_resizes:
-            return self._resize(image)
+            interpolation = cv2.INTER_AREA if self._shrink > 1 else cv2.INTER_LINEAR
+            return cv2.resize(image, (self.target.width, self.target.height), interpolation=interpolation)
         if self._shrink > 1:
             image = cv2.GaussianBlur(image, (0, 0), _BLUR_PER_SHRINK * self._shrink)
         rectified = cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -90,8 +89,11 @@ class Rectifier:
     def nearest(self, array: np.ndarray) -> np.ndarray:
         """Return depth or labels taken from the nearest pixel.
 
-        `array` (h, w, ...) shows the source's view at any size. Where not `valid`: NaN for floats, else 0.
+        `array` (h, w, ...) shows the view of the source, or of the depth sensor where there is one (mm then), at any
+        size. Where not `valid`: NaN for floats, else 0.
         """
+        if self._sensor is not None:
+            array = self._sensor.registered(array, self.source)
         x, y = self._maps(array)
         rows = np.clip(np.rint(y).astype(np.intp), 0, array.shape[0] - 1)
         columns = np.clip(np.rint(x).astype(np.intp), 0, array.shape[1] - 1)
@@ -123,12 +125,6 @@ class Rectifier:
             )
         return (self._x + 0.5) * np.float32(sx) - 0.5, (self._y + 0.5) * np.float32(sy) - 0.5
 
-    def _resize(self, image: np.ndarray) -> np.ndarray:
-        size = (self.target.width, self.target.height)
-        if size == (self.source.width, self.source.height):
-            return image.copy()
-        return cv2.resize(image, size, interpolation=cv2.INTER_AREA if self._shrink > 1 else cv2.INTER_LINEAR)
-
 
 @dataclass(frozen=True)
 class DepthSensor:
@@ -152,15 +148,3 @@ class DepthSensor:
         seen_mm = np.full((colour.height, colour.width), np.inf, dtype=np.float32)
         np.minimum.at(seen_mm, (pixels[inside, 1], pixels[inside, 0]), points[inside, 2].astype(np.float32))
         return np.where(np.isfinite(seen_mm), seen_mm, np.float32(np.nan))
-
-
-class SensorRectifier(Rectifier):
-    """Like the rectifier of the images, for depth that a sensor beside them took."""
-
-    def __init__(self, images: Rectifier, sensor: DepthSensor) -> None:
-        super().__init__(images.source, images.target)
-        self._sensor = sensor
-
-    def nearest(self, array: np.ndarray) -> np.ndarray:
-        """Return depth, mm, (h, w) as the sensor sees it, on the working camera's grid, NaN where it is not known."""
-        return super().nearest(self._sensor.registered(array, self.source))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scopemap.benchmark.result import without_nan
+from scopemap.cli.figures import print_json
 from scopemap.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ def bench(
     for note in [] if quiet else benchmark.notes:
         typer.echo(f"note: {note}", err=True)
     if as_json:
-        typer.echo(json.dumps([without_nan(asdict(result)) for result in benchmark.results], indent=2))
+        print_json([asdict(result) for result in benchmark.results])
     elif not quiet:
         typer.echo(f"{len(files)} tables and figures in {out}; results.md holds the tables")
 

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from enum import StrEnum
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from scopemap.cli.figures import without_nan
-from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_slice
+from scopemap.cli.figures import print_json, print_table
+from scopemap.cli.options import AsJson, Dataset, Frames, Quiet, check_output, parse_settings
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, SettingsError
 
@@ -25,17 +20,8 @@ if TYPE_CHECKING:
     from scopemap.calibration.targets import Target
     from scopemap.config import InputSettings
 
-_ENDINGS = (".yaml", ".yml")
 # All else about the input is for runs: the camera is not known yet, and frames are chosen by --frames and --every.
 _SETTINGS = ("input.stereo", "input.deinterlace")
-
-
-class ModelChoice(StrEnum):
-    """Camera models to fit."""
-
-    AUTO = "auto"
-    PINHOLE = "pinhole"
-    FISHEYE = "fisheye"
 
 
 def calibrate(
@@ -51,21 +37,17 @@ def calibrate(
     ] = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="It was laid out by OpenCV before 4.6.")] = False,
     model: Annotated[
-        ModelChoice, typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen.")
-    ] = ModelChoice.AUTO,
+        Literal["auto", "pinhole", "fisheye"],
+        typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen."),
+    ] = "auto",
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Calibration to write; its picture is written to the same folder.")
     ] = Path("calibration.yaml"),
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
-    ] = None,
+    frames: Frames = None,
     every: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Look at every N-th of them; else at about 300 in all.")
     ] = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="Name of a reader (see `scopemap datasets list`); recognised by content if left out."),
-    ] = None,
+    dataset: Dataset = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -77,9 +59,13 @@ def calibrate(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate the camera from images of a board; the file is for --camera of every command."""
-    picture = _prepared(out, overwrite)
+    picture = out.with_suffix(".png")
+    check_output(out, (".yaml", ".yml"), overwrite)
+    check_output(picture, (".png",), overwrite)
+    if not os.access(out.parent, os.W_OK):
+        raise InputError(f"writing the calibration: the folder {out.parent} is not there or not writable")
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
-    selection, reading = parse_slice(frames) if frames else None, _reading(settings or [])
+    reading = _reading(settings or [])
     # Imported here, so that --help does not wait for it.
     from scopemap.calibration import camera_calibration
     from scopemap.calibration.picture import draw_calibration
@@ -89,10 +75,10 @@ def calibrate(
     silent = quiet or as_json
     pictures = open_source(source, dataset=dataset, settings=reading)
     with count_progress("looking for the board", "looked at", silent=silent) as listener:
-        search = find_views(pictures, target, selection, every, listener)
+        search = find_views(pictures, target, frames, every, listener)
     if not silent:
         typer.echo(f"the board was found in {len(search.views)} of {search.looked_at} frames; fitting", err=True)
-    done = camera_calibration.calibrate(search, target, model.value)
+    done = camera_calibration.calibrate(search, target, model)
     camera_calibration.save_calibration(done, out)
     draw_calibration(done, picture)
     for note in [] if silent else pictures.notes:
@@ -102,23 +88,10 @@ def calibrate(
     if as_json:
         looked = {"looked_at": search.looked_at, "every": search.every, "found": len(search.views)}
         places = {"calibration": str(out), "picture": str(picture), "board": target.described}
-        typer.echo(json.dumps(without_nan(places | looked | done.summary()), indent=2))
+        print_json(places | looked | done.summary())
     elif not quiet:
         _print(done)
         typer.echo(f"calibration: {out} (use it as --camera {out}); picture: {picture}")
-
-
-def _prepared(out: Path, overwrite: bool) -> Path:
-    """Return where the picture goes; an error now rather than after the work where nothing can be written."""
-    if out.suffix.lower() not in _ENDINGS:
-        raise SettingsError(f"cannot write the calibration to {out}: its name has to end in {' or '.join(_ENDINGS)}")
-    picture = out.with_suffix(".png")
-    for file in (out, picture):
-        if file.is_dir() or (file.exists() and not overwrite):
-            raise InputError(f"writing the calibration: {file} is there already; give --overwrite or another --out")
-    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
-        raise InputError(f"writing the calibration: the folder {out.parent} is not there or not writable")
-    return picture
 
 
 def _reading(pairs: list[str]) -> InputSettings:
@@ -150,20 +123,12 @@ def _board(
 
 
 def _print(done: CameraCalibration) -> None:
-    facts, console = done.summary(), Console()
-    table = Table("frame", "name")
-    for title in ("corners", "error (px RMS)", "tilt (deg)", "distance (mm)"):
-        table.add_column(title, justify="right")
-    for view in facts["views"]:
-        figures = (f"{view['rms_px']:.3f}", f"{view['tilt_deg']:.0f}", f"{view['distance_mm']:.1f}")
-        table.add_row(str(view["frame"]), escape(view["name"]), str(view["corners"]), *figures)
-    console.print(table)
-    table = Table("camera")
-    for title in ("value", "standard deviation"):
-        table.add_column(title, justify="right")
-    for name, deviation in facts["deviations"].items():
-        table.add_row(name, f"{done.fit.parameters[name]:.5g}", f"{deviation:.2g}")
-    console.print(table)
+    facts = done.summary()
+    forms = {"frame": "", "name": "", "corners": "", "rms_px": ".3f", "tilt_deg": ".0f", "distance_mm": ".1f"}
+    views = [[format(view[key], form) for key, form in forms.items()] for view in facts["views"]]
+    print_table(("frame", "name"), views, numbers=("corners", "error (px RMS)", "tilt (deg)", "distance (mm)"))
+    values = [(name, f"{facts['parameters'][name]:.5g}", f"{sd:.2g}") for name, sd in facts["deviations"].items()]
+    print_table(("camera",), values, numbers=("value", "standard deviation"))
     for out in facts["left_out"]:
         typer.echo(f"left out: frame {out['frame']}, {out['reason']}")
     typer.echo(f"left out besides: {len(done.blurred)} blurred view(s), and views that show what another one shows")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scopemap.benchmark.result import without_nan
+from scopemap.cli.figures import print_json
 from scopemap.cli.options import Align, AsJson, Quiet, Unit
 
 
@@ -47,7 +46,7 @@ def compare(
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
     if as_json:
-        typer.echo(json.dumps(without_nan([asdict(result) for result in results]), indent=2))
+        print_json([asdict(result) for result in results])
     elif not quiet:
         overview = benchmark_tables(results)[0].without_empty()
         typer.echo(overview.markdown())

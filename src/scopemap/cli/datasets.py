@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import sys
 from collections import Counter
 from dataclasses import asdict
@@ -11,13 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from scopemap.benchmark.result import without_nan
-from scopemap.cli.figures import print_findings, value_table
-from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
+from scopemap.cli.figures import print_findings, print_json, print_table, print_values
+from scopemap.cli.options import AsJson, CameraFile, Dataset, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
 
@@ -25,8 +20,6 @@ if TYPE_CHECKING:
     from scopemap.io.datasets.checking import Finding
 
 app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
-
-_ASKED = "Whether "
 
 
 @app.command("list")
@@ -39,30 +32,21 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
         {
             "name": name,
             "what": _first_line(sys.modules[kind.__module__]),
-            "recognised": _first_line(kind.recognises).removeprefix(_ASKED),
+            "recognised": _first_line(kind.recognises).removeprefix("Whether "),
         }
         for name, kind in DATASETS.items()
     ]
     if as_json:
-        typer.echo(json.dumps(rows, indent=2))
+        print_json(rows)
     elif not quiet:
-        table = Table("name", "what it is", "recognised where")
-        for row in rows:
-            table.add_row(*map(escape, row.values()))
-        Console().print(table)
+        print_table(("name", "what it is", "recognised where"), (row.values() for row in rows))
 
 
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="A video, a folder of images or a data set's folder.")],
-    dataset: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE|NUMBERS", help="Calibration, as for `run`, instead of the data set's."),
-    ] = None,
+    dataset: Dataset = None,
+    camera: CameraFile = None,
     settings: SetPairs = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -86,8 +70,7 @@ def check(
             found = survey(sequence, listener)
         figures, findings = found.figures, findings_of(found)
     if as_json:
-        report = {"path": str(path), "figures": figures, "findings": [asdict(finding) for finding in findings]}
-        typer.echo(json.dumps(without_nan(report), indent=2))
+        print_json({"path": str(path), "figures": figures, "findings": [asdict(finding) for finding in findings]})
     elif not quiet:
         _print(path, figures, findings)
     errors = [finding for finding in findings if finding.severity == "error"]
@@ -103,7 +86,7 @@ def _first_line(documented: object) -> str:
 def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None:
     typer.echo(str(path))
     if figures:
-        Console().print(value_table(figures))
+        print_values(figures)
     print_findings([(finding.severity, finding.code, finding.message) for finding in findings])
     counts = Counter(finding.severity for finding in findings)
     typer.echo(f"errors: {counts['error']}, warnings: {counts['warning']}")

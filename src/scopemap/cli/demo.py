@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scopemap.benchmark.result import without_nan
+from scopemap.cli.figures import print_json
 from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import count_progress, run_progress
 
@@ -45,7 +44,7 @@ def demo(
     seconds = time.perf_counter() - started
     if as_json:
         paths = {"phantom": str(out / "phantom"), "run": str(out / "run"), "pictures": [str(file) for file in pictures]}
-        typer.echo(json.dumps(without_nan(figures) | paths | {"seconds": round(seconds, 1)}, indent=2))
+        print_json(figures | paths | {"seconds": round(seconds, 1)})
     elif not quiet:
         for line in _lines(figures, out, seconds):
             typer.echo(line)

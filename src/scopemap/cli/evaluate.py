@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from scopemap.cli.figures import OutputForm, show
+from scopemap.cli.figures import show
 from scopemap.cli.options import Align, AsJson, Unit
 from scopemap.errors import CalibrationError, InputError, SettingsError
 
 if TYPE_CHECKING:
+    from scopemap.cli.figures import OutputForm
     from scopemap.evaluation.poses import MatchedTrajectories
     from scopemap.io.sequence import Sequence
     from scopemap.trajectory.trajectory import Trajectory
@@ -80,18 +81,19 @@ def evaluate(
     """
     if as_json and as_csv:
         raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
+    from scopemap.benchmark.scoring import depth_groups
     from scopemap.evaluation.paper import paper_figures
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.io.datasets.reference import read_reference
     from scopemap.trajectory.formats.opening import read_trajectory
 
-    form = OutputForm.JSON if as_json else OutputForm.CSV if as_csv else OutputForm.LINE if quiet else OutputForm.TABLE
+    form: OutputForm = "json" if as_json else "csv" if as_csv else "line" if quiet else "table"
     estimate = read_trajectory(trajectory, unit=unit, kind=kind)
     reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:
         if not (depth or consistency):
             raise InputError(f"{truth} has no true poses; if it has depth: --depth median compares that alone")
-        show(_depths(trajectory, truth, depth, consistency=consistency), form)
+        show(depth_groups(trajectory, truth, depth, consistency=consistency), form)
         return
     matched = match(estimate, reference, align, first=align_first)
     figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
@@ -99,7 +101,7 @@ def evaluate(
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
     if depth or consistency:
-        figures |= _depths(trajectory, truth, depth, consistency=consistency)
+        figures |= depth_groups(trajectory, truth, depth, consistency=consistency)
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
         _warn(matched)
@@ -137,12 +139,6 @@ def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) ->
         raise SettingsError(f"unknown protocol '{unknown[0]}': choose from {', '.join(PROTOCOLS)}")
     chosen = [PROTOCOLS[name] for name in names]
     return {known.name: known(estimate, reference) | {"description": known.description} for known in chosen}
-
-
-def _depths(trajectory: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> dict[str, Any]:
-    from scopemap.benchmark.scoring import depth_groups
-
-    return depth_groups(trajectory, truth, scaling, consistency=consistency)
 
 
 def _warn(matched: MatchedTrajectories) -> None:

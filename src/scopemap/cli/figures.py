@@ -1,14 +1,13 @@
-"""Prints figures as tables, JSON or CSV."""
+"""Printing of results as tables, JSON or CSV."""
 
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum
-from typing import Any
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import typer
 from rich.console import Console
@@ -61,22 +60,17 @@ _PAPER_ROWS = (
 _COLOURS = {"error": "red", "warning": "yellow", "info": "default"}
 
 
-class OutputForm(Enum):
-    """Ways to show figures."""
-
-    TABLE = "table"
-    JSON = "json"
-    CSV = "csv"
-    LINE = "line"
+OutputForm = Literal["table", "json", "csv", "line"]
 
 
 def show(figures: dict[str, Any], form: OutputForm) -> None:
     """Print the figures of a trajectory, if any, and of the groups of further measures as dictionaries."""
-    if form is OutputForm.JSON:
-        typer.echo(json.dumps(without_nan(figures), indent=2))
-    elif form is OutputForm.CSV:
-        typer.echo(_csv(figures), nl=False)
-    elif form is OutputForm.LINE:
+    if form == "json":
+        print_json(figures)
+    elif form == "csv":
+        rows = [("figure", "value"), *_flat(without_nan(figures))]
+        csv.writer(sys.stdout, lineterminator="\n").writerows(rows)
+    elif form == "line":
         typer.echo(_one_line(figures))
     else:
         _tables(figures)
@@ -91,13 +85,6 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + key, value
 
 
-def _csv(figures: dict[str, Any]) -> str:
-    text = io.StringIO()
-    rows = ((name, "" if isinstance(value, float) and math.isnan(value) else value) for name, value in _flat(figures))
-    csv.writer(text, lineterminator="\n").writerows([("figure", "value"), *rows])
-    return text.getvalue()
-
-
 def _one_line(figures: dict[str, Any]) -> str:
     if "ate_rmse_mm" not in figures:  # no true poses: depth alone was measured
         return ", ".join(f"{name} {_text(value)}" for name, value in _flat(figures) if isinstance(value, float))
@@ -109,20 +96,19 @@ def _one_line(figures: dict[str, Any]) -> str:
 
 
 def _tables(figures: dict[str, Any]) -> None:
-    console = Console()
     if "ate_rmse_mm" in figures:
         title = (
             f"{figures['tracked']} of {figures['frames']} frames tracked, align {figures['align']}, "
             f"scale {figures['scale']:.5g}"
         )
         rows = {_LABELS[key]: _text(value) for key, value in figures.items() if key in _LABELS}
-        console.print(value_table(rows, title=title))
+        print_values(rows, title=title)
     for name, group in figures.items():
         if name == "paper":
             rows = {label: " +- ".join(_text(group[key]) for key in keys) for label, *keys in _PAPER_ROWS}
-            console.print(value_table(rows, title="in the paper's units"))
+            print_values(rows, title="in the paper's units")
         elif isinstance(group, dict) and name != "sources":
-            console.print(value_table({key: _text(value) for key, value in _flat(group)}, title=name))
+            print_values({key: _text(value) for key, value in _flat(group)}, title=name)
 
 
 def _text(value: Any) -> str:
@@ -131,13 +117,26 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def value_table(rows: Mapping[str, Any], *, title: str | None = None, head: str = "figure") -> Table:
-    """Return a table of one name and value per row."""
-    table = Table(head, title=title, title_justify="left")
-    table.add_column("value", justify="right")
-    for name, value in rows.items():
-        table.add_row(name, escape(value if isinstance(value, str) else _short(value)))
-    return table
+def print_json(content: Any) -> None:
+    """Print plain values, mappings and lists as JSON, NaN as null."""
+    typer.echo(json.dumps(without_nan(content), indent=2))
+
+
+def print_table(
+    heads: Sequence[str], rows: Iterable[Iterable[str]], *, numbers: Sequence[str] = (), title: str | None = None
+) -> None:
+    """Print a table with columns `heads`, then those of `numbers`, which are aligned right."""
+    table = Table(*heads, title=title, title_justify="left")
+    for head in numbers:
+        table.add_column(head, justify="right")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    Console().print(table)
+
+
+def print_values(values: Mapping[str, Any], *, title: str | None = None, head: str = "figure") -> None:
+    """Print a table of one name and value per row."""
+    print_table((head,), ((name, _short(value)) for name, value in values.items()), numbers=("value",), title=title)
 
 
 def print_findings(findings: Sequence[tuple[str, str, str]]) -> None:

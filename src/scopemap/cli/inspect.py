@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-from scopemap.benchmark.result import without_nan
-from scopemap.cli.figures import print_findings, value_table
-from scopemap.cli.options import AsJson, Quiet, parse_slice
+from scopemap.cli.figures import print_findings, print_json, print_values
+from scopemap.cli.options import AsJson, CameraFile, Dataset, Frames, Quiet, check_output
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError
 
@@ -35,17 +32,9 @@ def inspect(
             help="Write one mask of overlays and of pictures in the picture, for mask.files.",
         ),
     ] = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Its reader, where the guess is wrong (`scopemap datasets list`)."),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE|NUMBERS", help="Calibration, as for `run`: for the mask that a run finds."),
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:5000, ::10.")
-    ] = None,
+    dataset: Dataset = None,
+    camera: CameraFile = None,
+    frames: Frames = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier picture and masks.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -57,13 +46,11 @@ def inspect(
     """
     file = out or Path(f"{source.resolve().stem if source.is_file() else source.resolve().name}_inspection.png")
     _refuse(file, masks, overwrite)
-
     from scopemap.inspection.inspecting import inspect as inspection_of
     from scopemap.inspection.picture import MASK_NAME, draw_inspection, write_mask
 
     with count_progress("inspecting", "inspected", silent=quiet or as_json) as listener:
-        selection = parse_slice(frames) if frames else None
-        found = inspection_of(source, dataset=dataset, camera=camera, frames=selection, listener=listener)
+        found = inspection_of(source, dataset=dataset, camera=camera, frames=frames, listener=listener)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         draw_inspection(found, file)
@@ -71,8 +58,7 @@ def inspect(
     except OSError as error:
         raise InputError(f"writing the inspection of {source}: {error.strerror or error}") from None
     if as_json:
-        report = found.report | {"path": str(source), "picture": str(file)}
-        typer.echo(json.dumps(without_nan(report), indent=2))
+        print_json(found.report | {"path": str(source), "picture": str(file)})
     elif not quiet:
         _print(source, found)
         typer.echo(f"picture: {file}")
@@ -83,24 +69,22 @@ def inspect(
 def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
     from scopemap.inspection.picture import MASK_NAME
 
-    if file.suffix.lower() != ".png":
-        raise InputError(f"cannot write the picture {file}: its name must end in .png")
-    if file.is_dir():
-        raise InputError(f"cannot write the picture {file}: there is a folder of that name")
-    if file.exists() and not overwrite:
-        raise InputError(f"{file} exists; give another name with --out, or --overwrite")
-    if masks is not None and masks.exists() and not masks.is_dir():
+    check_output(file, (".png",), overwrite)
+    if masks is None or not masks.exists():
+        return
+    if not masks.is_dir():
         raise InputError(f"cannot write masks into {masks}: it is no folder")
-    if masks is not None and masks.is_dir() and any(masks.iterdir()) and not overwrite:
+    names = {file.name for file in masks.iterdir()}
+    if names and not overwrite:
         raise InputError(f"{masks} is not empty; give another folder with --masks, or --overwrite")
     # A run would take them for masks of single frames.
-    if masks is not None and masks.is_dir() and any(file.name != MASK_NAME for file in masks.iterdir()):
+    if names - {MASK_NAME}:
         raise InputError(f"{masks} holds other files than {MASK_NAME}; give another folder with --masks")
 
 
 def _print(source: Path, found: Inspection) -> None:
     typer.echo(str(source))
-    Console().print(value_table(found.facts, head="fact"))
+    print_values(found.facts, head="fact")
     print_findings([(finding.severity, finding.code, finding.message) for finding in found.findings])
     for finding in found.findings:
         if finding.advice:

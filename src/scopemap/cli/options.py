@@ -4,19 +4,39 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from scopemap.errors import SettingsError
+from scopemap.errors import InputError, SettingsError
 
 Align = Literal["none", "origin", "se3", "sim3", "scale"]
 Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
+Dataset = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE|NUMBERS", help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 [k3]]', px of the input's images."
+    ),
+]
 SetPairs = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.keyframe_every=5.")
 ]
+
+
+def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
+    """Raise `InputError` for a file that cannot be written, before the work: its name, or what is there already."""
+    if file.suffix.lower() not in endings:
+        raise InputError(f"cannot write {file}: its name must end in {' or '.join(endings)}")
+    if file.is_dir():
+        raise InputError(f"cannot write {file}: there is a folder of that name")
+    if file.exists() and not overwrite:
+        raise InputError(f"{file} exists; give another name with --out, or --overwrite")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -32,6 +52,12 @@ def parse_slice(text: str) -> slice:
     if not re.fullmatch(r"(-?\d+)?:(-?\d+)?(:\d*)?", text):
         raise SettingsError(f"cannot read the frames '{text}': expected START:STOP or START:STOP:STEP such as 0:100")
     return slice(*(int(part) if part else None for part in text.split(":")))
+
+
+Frames = Annotated[
+    slice | None,
+    typer.Option(parser=parse_slice, metavar="A:B:S", help="Which frames, as a Python slice: 0:5000, ::10."),
+]
 
 
 def parse_near_far(text: str) -> tuple[float, float]:

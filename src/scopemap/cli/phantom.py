@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from scopemap.cli.figures import print_json
 from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_size
 from scopemap.cli.progress import count_progress
 
@@ -49,13 +50,9 @@ def phantom(
     ).with_settings(parse_settings(settings or []))
     with count_progress("rendering", "rendered", silent=quiet or as_json) as progress:
         write_phantom(spec, folder, progress)
-    _report(folder, as_json, quiet)
-
-
-def _report(folder: Path, as_json: bool, quiet: bool) -> None:
     description = json.loads((folder / "phantom.json").read_text(encoding="utf-8"))
     if as_json:
-        typer.echo(json.dumps({"folder": str(folder)} | description, indent=2))
+        print_json({"folder": str(folder)} | description)
     elif not quiet:
         spec = description["spec"]
         typer.echo(

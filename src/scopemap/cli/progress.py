@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from scopemap.pipeline import Step
 
 _SECONDS_BETWEEN_LINES = 10.0
@@ -25,25 +23,14 @@ def run_progress(total: int | None, *, silent: bool) -> Iterator[tuple[Callable[
         yield ()
         return
     state = _State(total)
-    if not sys.stderr.isatty():
-        lines = _Lines()
+    # Before the first frame the camera may be estimated, kernels compiled and networks loaded.
+    with _display("tracking", "preparing") as show:
 
-        def write(step: Step) -> None:
+        def observe(step: Step) -> None:
             state.add(step)
-            lines.write(state.line, last=state.done == total)
+            show(state.done, total, f"{state.speed}{state.text}", state.line)
 
-        yield (write,)
-        return
-    with _bar("tracking", "{task.fields[rate]}", "{task.fields[state]}") as bar:
-        # Before the first frame the camera may be estimated, kernels compiled and networks loaded.
-        task = bar.add_task("tracking", total=total, rate="", state="preparing")
-
-        def show(step: Step) -> None:
-            state.add(step)
-            rate = "" if state.rate is None else f"{state.rate:.1f} frames/s"
-            bar.update(task, advance=1, rate=rate, state=state.text)
-
-        yield (show,)
+        yield (observe,)
 
 
 @contextmanager
@@ -51,21 +38,34 @@ def count_progress(doing: str, done: str, *, silent: bool) -> Iterator[Callable[
     """Yield a function that shows (frames done, all frames or None) in these words; None if `silent`."""
     if silent:
         yield None
-    elif sys.stderr.isatty():
-        with _bar(doing) as bar:
-            task = bar.add_task(doing, total=None)
-            yield lambda count, total: bar.update(task, completed=count, total=total)
-    else:
-        lines = _Lines()
-        yield lambda count, total: lines.write(f"{done} {count}{_of(total)} frames", last=count == total)
+        return
+    with _display(doing) as show:
+        yield lambda count, total: show(count, total, "", f"{done} {count}{_of(total)} frames")
 
 
-def _bar(doing: str, *fields: str) -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+@contextmanager
+def _display(doing: str, text: str = "") -> Iterator[Callable[[int, int | None, str, str], None]]:
+    """Yield a function of (frames done, all frames or None, text after the bar, line where there is no terminal)."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), *map(TextColumn, fields))
-    return Progress(*columns, console=Console(stderr=True))
+        last = TextColumn("{task.fields[text]}")
+        columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), last)
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task(doing, total=None, text=text)
+            yield lambda done, total, text, _: bar.update(task, completed=done, total=total, text=text)
+        return
+    written = time.perf_counter()
+
+    def write(done: int, total: int | None, _: str, line: str) -> None:
+        nonlocal written
+        now = time.perf_counter()
+        if done == total or now - written >= _SECONDS_BETWEEN_LINES:
+            written = now
+            typer.echo(line, err=True)
+
+    yield write
 
 
 def _of(total: int | None) -> str:
@@ -80,17 +80,17 @@ class _State:
         self._total = total
 
     @property
-    def rate(self) -> float | None:
-        """Frames per second since the first one, without start-up; None before the second."""
-        return (self.done - 1) / max(time.perf_counter() - self.started, 1e-9) if self.done > 1 else None
+    def speed(self) -> str:
+        """Frames per second since the first one, without start-up, and the time left; "" before the second."""
+        if self.done < 2:
+            return ""
+        rate = (self.done - 1) / max(time.perf_counter() - self.started, 1e-9)
+        left = f", {max(self._total - self.done, 0) / rate:.0f} s left" if self._total else ""
+        return f"{rate:.1f} frames/s{left}, "
 
     @property
     def line(self) -> str:
-        speed = ""
-        if self.rate is not None:
-            left = f", {max(self._total - self.done, 0) / self.rate:.0f} s left" if self._total else ""
-            speed = f"{self.rate:.1f} frames/s{left}, "
-        return f"frame {self.done}{_of(self._total)}: {speed}{self.text}"
+        return f"frame {self.done}{_of(self._total)}: {self.speed}{self.text}"
 
     def add(self, step: Step) -> None:
         if self.done == 0:
@@ -104,16 +104,3 @@ class _State:
         if self.done == self._total:
             # Seconds to minutes in which no frame passes.
             self.text += "; adjusting, fusing and writing"
-
-
-class _Lines:
-    """Writes a line if the last one was ten seconds ago."""
-
-    def __init__(self) -> None:
-        self._written = time.perf_counter()
-
-    def write(self, line: str, *, last: bool) -> None:
-        now = time.perf_counter()
-        if last or now - self._written >= _SECONDS_BETWEEN_LINES:
-            self._written = now
-            typer.echo(line, err=True)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_near_far, parse_settings, parse_size, parse_slice
+from scopemap.cli.figures import print_json
+from scopemap.cli.options import (
+    AsJson,
+    CameraFile,
+    Dataset,
+    Frames,
+    Quiet,
+    SetPairs,
+    parse_near_far,
+    parse_settings,
+    parse_size,
+)
 from scopemap.cli.progress import run_progress
 
 if TYPE_CHECKING:
@@ -35,17 +45,8 @@ def run(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
     ] = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="Name of a reader (`scopemap datasets list`); default: recognised by the files."),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE|NUMBERS",
-            help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 [k3]]', px of the input's images.",
-        ),
-    ] = None,
+    dataset: Dataset = None,
+    camera: CameraFile = None,
     camera_fit: Annotated[
         str | None,
         typer.Option(
@@ -83,9 +84,7 @@ def run(
         str | None,
         typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small with its weights, else dis."),
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B:S", help="Which frames, as a Python slice: 0:100, ::2.")
-    ] = None,
+    frames: Frames = None,
     fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
     size: Annotated[
         str | None,
@@ -100,7 +99,7 @@ def run(
     """Reconstruct camera poses, depth and a tissue surface from a video."""
     from scopemap.config import Config
 
-    given: dict[str, Any] = {
+    given = {
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
@@ -122,7 +121,7 @@ def run(
         camera=camera,
         fov_deg=fov,
         size=parse_size(size) if size else None,
-        frames=parse_slice(frames) if frames else None,
+        frames=frames,
         settings=resolved.input,
     )
     with run_progress(sequence.count, silent=quiet or as_json) as observers:
@@ -135,8 +134,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
     for warning in [] if quiet else provenance["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
     if as_json:
-        summary = provenance | {"out": str(out), "preset": config.preset, "mesh_faces": len(result.mesh.faces)}
-        typer.echo(json.dumps(summary, indent=2))
+        print_json(provenance | {"out": str(out), "preset": config.preset, "mesh_faces": len(result.mesh.faces)})
     elif not quiet:
         for line in summary_lines(result):
             typer.echo(line)

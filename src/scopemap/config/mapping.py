@@ -13,19 +13,14 @@ class MappingAdvanced(Settings):
     """Constants of bundle adjustment."""
 
     keyframe_gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (1, 2, 3, 5, 8),
-        min_length=1,
-        description="corners of a keyframe are tracked to the keyframes so many before it",
+        (1, 2, 3, 5, 8), min_length=1, description="a keyframe's corners are tracked to the keyframes so many before it"
     )
     depth_sigma_share: float = Field(
         0.15, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
     )
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     depth_step_sigma: float = Field(
-        0.1,
-        ge=0,
-        description="standard deviation of the change of ln depth from node to node of the depth correction field; "
-        "0: depth is only scaled",
+        0.1, ge=0, description="sigma of ln depth between nodes of the depth correction field; 0: depth is only scaled"
     )
     rotation_sigma_deg: float = Field(
         3.0, gt=0, description="standard deviation of the tracked rotation between keyframes, deg"
@@ -36,8 +31,7 @@ class MappingAdvanced(Settings):
     max_sigma_px: float = Field(
         0.8,
         gt=0,
-        description="poses stay as tracked where the adjusted reprojection errors are larger (robust standard "
-        "deviation), px",
+        description="poses stay as tracked where the robust sigma of adjusted reprojection errors is larger, px",
     )
     max_depth_change: float = Field(
         0.3, gt=0, description="poses stay as tracked where the median change of ln depth is larger"

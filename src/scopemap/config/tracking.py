@@ -13,10 +13,7 @@ class TrackingAdvanced(Settings):
     """Thresholds and resolution of tracking."""
 
     corner_depth_sigma: float = Field(
-        0.2,
-        ge=0,
-        description="relative standard deviation of predicted depth in reprojection errors; 0: no corners, photometric "
-        "alignment alone",
+        0.2, ge=0, description="relative standard deviation of predicted depth in reprojection errors; 0: no corners"
     )
     min_keyframe_agreement: float = Field(
         0.7,
@@ -30,9 +27,7 @@ class TrackingAdvanced(Settings):
     max_iterations: int = Field(30, ge=1, description="steps per pyramid level")
     huber: float = Field(1.0, gt=0, description="Huber threshold in robust standard deviations (MAD)")
     depth_weight: float = Field(
-        1.0,
-        ge=0,
-        description="weight of the point-to-plane distance to the frame's own depth where that is measured; 0: off",
+        1.0, ge=0, description="weight of the point-to-plane distance to the frame's measured depth; 0: off"
     )
     min_inlier_share: float = Field(
         0.4, ge=0, le=1, description="a frame with a smaller share is lost; unrelated fine texture: 0.37"
@@ -63,9 +58,7 @@ class TrackingPaper(Settings):
 class TrackingSettings(Settings):
     """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
 
-    keyframe_every: int = Field(
-        10, ge=1, description="every n-th frame becomes a keyframe (the paper's first alpha: 2)"
-    )
+    keyframe_every: int = Field(10, ge=1, description="every n-th frame becomes a keyframe (the paper: 2)")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with a smaller usable overlap is lost")
     min_sharpness: float = Field(
         0.6,
@@ -85,15 +78,11 @@ class SmoothingSettings(Settings):
     """WEMA: weighted mean of the last three poses, on the group (METHOD section WEMA)."""
 
     method: Literal["none", "wema"] = Field("none", description="wema: smooth poses; none: off, the others are inert")
-    alpha: float = Field(0.6, ge=0, le=1, description="inert unless method = wema: weight of pose i")
-    beta: float = Field(0.3, ge=0, le=1, description="inert unless method = wema: weight of pose i-1")
-    gamma: float = Field(0.1, ge=0, le=1, description="inert unless method = wema: weight of pose i-2")
-    omega: float = Field(
-        0.1, gt=0, description="inert unless method = wema: s = 1 - exp(-i omega); frames count from 0"
-    )
-    dynamic: bool = Field(
-        True, description="inert unless method = wema; False: s = 1 (the paper's ablation without DyEMA)"
-    )
+    alpha: float = Field(0.6, ge=0, le=1, description="weight of pose i")
+    beta: float = Field(0.3, ge=0, le=1, description="weight of pose i-1")
+    gamma: float = Field(0.1, ge=0, le=1, description="weight of pose i-2")
+    omega: float = Field(0.1, gt=0, description="s = 1 - exp(-i omega); frames count from 0")
+    dynamic: bool = Field(True, description="False: s = 1 (the paper's ablation without DyEMA)")
 
     @model_validator(mode="after")
     def _weights_sum_to_one(self) -> SmoothingSettings:

@@ -10,7 +10,7 @@ import numpy as np
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant
 from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, mean_difference
-from scopemap.masking.masker import BORDER_PX, BRIGHT_LEVEL, HIGHLIGHT_RATIO, FieldOfView, Masker, is_lit, specular
+from scopemap.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, is_lit, specular
 from scopemap.tracking.sharpness import sharpness
 
 SMALL_PX = 320
@@ -74,7 +74,7 @@ class FrameInspector:
     """Measures the frames of a video in their order; keeps the last one that was no repeat."""
 
     def __init__(self) -> None:
-        self._field, self._masker = FieldOfView(BORDER_PX), Masker(_MASK)
+        self._field, self._masker = FieldOfView(), Masker(_MASK)
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
@@ -93,7 +93,7 @@ class FrameInspector:
         clipped = (middle >= BRIGHT_LEVEL) & inside
         means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
         lit_share = np.count_nonzero(lit & inside) / count
-        highlights = specular(cv2.min(low, blue), inside, HIGHLIGHT_RATIO) & inside
+        highlights = specular(cv2.min(low, blue), inside) & inside
         measures = FrameMeasures(
             position=position,
             index=masked.index,

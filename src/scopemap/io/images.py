@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import Calibration, fitted
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import TruthQuality
@@ -184,8 +184,8 @@ class ImageFolder(SourceDefaults):
 
     def _set_camera(self, camera: CameraModel, source: str, name: str) -> None:
         """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
-        self.camera = fitted_to(camera, (self.width, self.height), name)
-        self.camera_source = source + rescaled_note(camera, self.camera)
+        calibration = fitted(Calibration(camera, None, source, file=name), (self.width, self.height), "scale")
+        self.camera, self.camera_source = calibration.camera, calibration.source
 
     def _check_numbers(self) -> None:
         """Raise `InputError` where frames had to be counted, as their names do not number them."""

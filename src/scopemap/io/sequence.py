@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier, SensorRectifier, working_camera
+from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth
 from scopemap.io.frame_choice import FrameChoice, SkippedFrame
@@ -63,7 +63,7 @@ class Sequence:
     def depth_rectifier(self) -> Rectifier:
         """From the depth files beside the frames to the working camera."""
         sensor = self.source.depth_sensor
-        return self.rectifier if sensor is None else SensorRectifier(self.rectifier, sensor)
+        return self.rectifier if sensor is None else Rectifier(self.rectifier.source, self.camera, sensor)
 
     @property
     def count(self) -> int | None:

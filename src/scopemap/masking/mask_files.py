@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from scopemap.cameras.rectification import Rectifier
 from scopemap.config import MaskSettings
 from scopemap.errors import InputError
 from scopemap.io.decoding import read_decoded
+from scopemap.masking.masker import disc
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
@@ -44,7 +46,6 @@ class MaskFiles:
     def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
         self._files, self._single = _numbered(self._folder)
-        self._covered_always: np.ndarray | None = None
         self._asked: set[int] = set()
 
     def covered(self, index: int) -> np.ndarray | None:
@@ -54,12 +55,14 @@ class MaskFiles:
         `CalibrationError` for one of another aspect than the images.
         """
         if self._single is not None:
-            if self._covered_always is None:
-                self._covered_always = self._read(self._single)
             return self._covered_always
         self._asked.add(index)
         file = self._files.get(index)
         return None if file is None else self._read(file)
+
+    @cached_property
+    def _covered_always(self) -> np.ndarray | None:
+        return None if self._single is None else self._read(self._single)
 
     def _read(self, file: Path) -> np.ndarray:
         image = read_decoded(file)
@@ -68,10 +71,7 @@ class MaskFiles:
         # The alpha channel is ignored.
         level = image if image.ndim == 2 else image[..., :3].max(-1)
         masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
-        if self._grow_px > 0:
-            side = 2 * self._grow_px + 1
-            masked = cv2.dilate(masked, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-        return masked > 0
+        return cv2.dilate(masked, disc(self._grow_px)) > 0
 
     def provenance(self) -> dict[str, str]:
         """Return the folder, how many masks it holds, and how many of the frames have one."""
@@ -98,17 +98,14 @@ def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:
     """Return the images by the number in their names, and the only image where that has none."""
     if not folder.is_dir():
         raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
-    images = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
-    images = [file for file in images if not file.name.startswith(".")]
+    files = (file for file in sorted(folder.iterdir()) if not file.name.startswith("."))
+    images = [file for file in files if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
     found: dict[int, Path] = {}
     for file in images:
-        numbers = re.findall(r"\d+", file.stem)
-        if not numbers:
-            continue
-        number = int(numbers[-1])
-        if number in found:
-            raise InputError(f"two masks for frame {number} in {folder}: {found[number].name} and {file.name}")
-        found[number] = file
+        for number in map(int, re.findall(r"\d+", file.stem)[-1:]):
+            if number in found:
+                raise InputError(f"two masks for frame {number} in {folder}: {found[number].name} and {file.name}")
+            found[number] = file
     if found:
         return found, None
     if len(images) == 1:

@@ -17,7 +17,7 @@ _NEIGHBOURHOOD_SHARE = 0.09
 _DARKEST_HIGHLIGHT = 70
 # Level at which the second-brightest channel is saturated, and how far a highlight's darkest channel stands out.
 BRIGHT_LEVEL = 240
-HIGHLIGHT_RATIO = 1.5
+_HIGHLIGHT_RATIO = 1.5
 # A highlight is widened, and the field of view shrunk, by so much: their rims are blurred.
 _HIGHLIGHT_GROW_PX = 2
 BORDER_PX = 3
@@ -29,12 +29,11 @@ _MIN_FIELD_SHARE = 0.05
 class FieldOfView:
     """The convex hull (circle, octagon and rectangle are convex) of the largest area that was lit in any frame so far.
 
-    Dark tissue in the lumen is thus not taken for the surround. border_px : by which the hull is shrunk, from pixels
-    that the rectification could not fill too, but not from the image's own edge.
+    Dark tissue in the lumen is thus not taken for the surround. The hull is shrunk by `BORDER_PX`, from pixels that the
+    rectification could not fill too, but not from the image's own edge.
     """
 
-    def __init__(self, border_px: int) -> None:
-        self._border_px = border_px
+    def __init__(self) -> None:
         self._lit: np.ndarray | None = None
         self._field: np.ndarray | None = None
 
@@ -51,9 +50,7 @@ class FieldOfView:
                 return self._field
             lit |= known
         self._lit = lit
-        side = 2 * self._border_px + 1
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-        self._field = cv2.erode((hull_of_largest(lit) & rectified).astype(np.uint8), disc).astype(bool)
+        self._field = cv2.erode((hull_of_largest(lit) & rectified).astype(np.uint8), disc(BORDER_PX)).astype(bool)
         return self._field
 
 
@@ -94,7 +91,7 @@ class Masker:
 
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
-        self._field = FieldOfView(BORDER_PX)
+        self._field = FieldOfView()
         self._overlays = OverlayFinder() if settings.overlays else None
 
     def __call__(self, frame: Frame) -> Frame:
@@ -110,8 +107,8 @@ class Masker:
         valid = frame.valid & lit & ~clipped if self.settings.advanced.exposure else frame.valid
         field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         if self.settings.highlights:
-            bright = clipped | specular(darkest, field, HIGHLIGHT_RATIO)
-            valid &= ~_grown(bright, _HIGHLIGHT_GROW_PX)
+            bright = clipped | specular(darkest, field)
+            valid &= cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) == 0
         overlays = None if self._overlays is None else self._overlays(frame.rgb, field)
         files = None if self._files is None else self._files.covered(frame.index)
         for covered in (overlays, files):
@@ -122,28 +119,24 @@ class Masker:
         return replace(frame, valid=valid & field)
 
 
-def specular(darkest: np.ndarray, field: np.ndarray, ratio: float) -> np.ndarray:
+def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:
     """Return specular highlights, (H, W) bool.
 
     Tissue is red, a mirror image of the lamp is white: the darkest channel, (H, W) uint8, stands out from its local
-    median, `ratio` times as bright. What is outside `field`, (H, W) bool, takes no part: it would make a highlight of
+    median, 1.5 times as bright. What is outside `field`, (H, W) bool, takes no part: it would make a highlight of
     the rim.
     """
     if not field.any():
         return np.zeros_like(field)
     surroundings = _local_median(np.where(field, darkest, np.median(darkest[field])).astype(np.uint8))
-    return (darkest > ratio * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
+    return (darkest > _HIGHLIGHT_RATIO * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
 
 
 def is_lit(rgb: np.ndarray, dark_level: int) -> np.ndarray:
     """Return which pixels of an image (H, W, 3) uint8 are brighter than `dark_level`, and the mean around them, too."""
     calm = cv2.blur(rgb, (_CALM_WIDTH_PX, _CALM_WIDTH_PX))
-    return cv2.min(_brightest(rgb), _brightest(calm)) > dark_level
-
-
-def _brightest(rgb: np.ndarray) -> np.ndarray:
-    r, g, b = cv2.split(rgb)
-    return cv2.max(cv2.max(r, g), b)
+    brightest = [cv2.max(cv2.max(r, g), b) for r, g, b in map(cv2.split, (rgb, calm))]
+    return cv2.min(*brightest) > dark_level
 
 
 def _darker_channels(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,6 +154,6 @@ def _local_median(level: np.ndarray) -> np.ndarray:
     return cv2.resize(cv2.medianBlur(small, side), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _grown(mask: np.ndarray, radius_px: int) -> np.ndarray:
-    side = 2 * radius_px + 1
-    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))).astype(bool)
+def disc(radius_px: int) -> np.ndarray:
+    """Return the structuring element of a disc, uint8."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))

@@ -42,12 +42,8 @@ class _Found:
         differs = np.abs(level.ravel()[self.edges] - self.level) > self.limit
         if not differs.any():
             return self.mask
-        edges = np.bincount(self.of)
-        gone = np.bincount(self.of, differs) > _GONE_SHARE * edges
-        if not gone.any():
-            return self.mask
-        gone[0] = True  # the background
-        return None if gone[edges > 0].all() else ~gone[self.labels]
+        shown = self.mask & (np.bincount(self.of, differs) <= _GONE_SHARE * np.bincount(self.of))[self.labels]
+        return shown if shown.any() else None
 
 
 class OverlayFinder:
@@ -105,7 +101,7 @@ class OverlayFinder:
             return None
         still &= _stands_alone(still, (self._calm_change >= _CHANGED) | (contrast <= _PLAIN))
         mask = _grown(still)
-        if mask is None:
+        if not mask.any():
             return None
         _, labels = cv2.connectedComponents(mask.astype(np.uint8))
         edges = np.flatnonzero(still & mask)
@@ -131,15 +127,14 @@ def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
 
 def _has_moved(before: np.ndarray, now: np.ndarray) -> bool:
     """Whether the texture of most parts has changed, by correlation, which is independent of illumination."""
-    textured = _in_parts(np.abs(now)) >= _TEXTURE
-    if np.count_nonzero(_in_parts(np.abs(before)) >= _TEXTURE) < _MIN_PARTS:
+    textured, textured_before = (_in_parts(np.abs(image)) >= _TEXTURE for image in (now, before))
+    if textured_before.sum() < _MIN_PARTS:
         # After a black picture the next textured one counts.
-        return bool(np.count_nonzero(textured) >= _MIN_PARTS)
-    textured &= _in_parts(np.abs(before)) >= _TEXTURE
-    parts = np.count_nonzero(textured)
+        return bool(textured.sum() >= _MIN_PARTS)
+    textured &= textured_before
     power = np.sqrt(_in_parts(before * before) * _in_parts(now * now))
-    moved = _in_parts(before * now) < _ALIKE * power
-    return bool(parts >= _MIN_PARTS and np.count_nonzero(moved & textured) >= _MOVED_SHARE * parts)
+    moved = textured & (_in_parts(before * now) < _ALIKE * power)
+    return bool(textured.sum() >= _MIN_PARTS and moved.sum() >= _MOVED_SHARE * textured.sum())
 
 
 def _in_parts(values: np.ndarray) -> np.ndarray:
@@ -148,8 +143,7 @@ def _in_parts(values: np.ndarray) -> np.ndarray:
 
 def _stands_alone(still: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the static edges, (H, W) bool, whose surroundings are nearly all `other` (moving or uniform), bool."""
-    closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
-    near = cv2.dilate(closed, _square(_NEAR_PX))
+    near = cv2.dilate(_closed(still), _square(_NEAR_PX))
     count, labels = cv2.connectedComponents(near)
     # The largest label within the radius: a pixel between two groups counts for one of them.
     around = cv2.dilate(labels.astype(np.float32), _square(_FAR_PX)).astype(np.int32)
@@ -163,9 +157,13 @@ def _square(radius_px: int) -> np.ndarray:
     return np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
 
 
-def _grown(still: np.ndarray) -> np.ndarray | None:
+def _closed(still: np.ndarray) -> np.ndarray:
+    return cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
+
+
+def _grown(still: np.ndarray) -> np.ndarray:
     """Return edges (H, W) bool with gaps closed, holes filled and a margin; specks are removed."""
-    closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8))
+    closed = _closed(still)
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     found = np.zeros_like(closed)
     for contour in contours:
@@ -176,5 +174,4 @@ def _grown(still: np.ndarray) -> np.ndarray | None:
         found[box] = np.maximum(found[box], closed[box])
         if cv2.contourArea(contour) <= _MAX_SHARE * still.size:
             cv2.drawContours(found, [contour], -1, 1, cv2.FILLED)
-    grown = cv2.dilate(found, _square(_GROW_PX)) > 0
-    return grown if grown.any() else None
+    return cv2.dilate(found, _square(_GROW_PX)) > 0

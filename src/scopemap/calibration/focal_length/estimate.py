@@ -3,25 +3,31 @@
 Windows differ by more than their standard deviations, so the variance between them is estimated, too (DerSimonian and
 Laird, "Meta-analysis in clinical trials", 1986). They also have a common error: a lamp that moves with the camera
 biases the flow, and the estimated rotation, by about 0.4 degrees. If the optical axis tilts by T degrees, the relative
-error of the focal length is 0.4 / T, for any number of windows.
+error of the focal length is 0.4 / T, for any number of windows. The assumed focal length of an unknown camera is kept
+unless the estimate contradicts it significantly.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
 from scopemap.calibration.focal_length.windows import MAX_FRAMES, windows_of
 from scopemap.config import Config
+from scopemap.errors import CalibrationError
 from scopemap.io.sequence import Sequence
 
 FOV_RANGE_DEG = (30.0, 150.0)
 """Horizontal fields of view that endoscopes have."""
 
+MAX_SHARE = 0.1
+"""Standard deviation over the focal length above which an estimate is no better than the assumption."""
+
+_MIN_DISTORTION = 0.05  # smaller estimates are noise
 _ROTATION_ERROR_DEG = 0.4
 _MIN_TILT_DEG = 0.05
 _MIN_SHARE = 0.01  # of any window's deviation
@@ -58,24 +64,55 @@ class FocalEstimate:
         return bool(abs(math.log(self.focal_px / focal_px)) >= _SIGNIFICANT * self.share)
 
 
+def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[str]]:
+    """Return a sequence of unknown camera with the focal length estimated from its motion, and notes on the estimate.
+
+    `input.focal` "flow" takes any estimate, "auto" one of small deviation that contradicts the assumed focal length.
+    Raises `CalibrationError` where there is no estimate for "flow".
+    """
+    estimate, assumed_px = focal_from_motion(sequence, config), sequence.camera.fx
+    wanted = config.input.focal == "flow"
+    if wanted and estimate.reason:
+        raise CalibrationError(
+            f"input.focal = flow: the motion in {sequence.path} does not determine the focal length, "
+            f"{estimate.reason}; give a calibration (--camera) or the field of view (--fov, with input.focal = assume)"
+        )
+    described = (
+        f"fx {estimate.focal_px:.0f} +- {max(estimate.sigma_px, 1):.0f} px, horizontal field of view "
+        f"{estimate.fov_deg:.0f} deg"
+    )
+    kept = ""
+    if estimate.reason:
+        kept = f"assumed, because the motion does not determine it: {estimate.reason}"
+    elif not wanted and estimate.share > MAX_SHARE:
+        kept = f"assumed, because the estimate is uncertain: {described}"
+    elif not wanted and not estimate.differs_from(assumed_px):
+        kept = f"assumed {assumed_px:.0f} px, consistent with the estimate: {described}"
+    if kept:
+        return sequence, [f"focal length: {kept}"]
+    distorted = (
+        f"focal length: the lens has radial distortion, about {abs(estimate.distortion):.0%} at half the image's width "
+        "from the centre; only a calibration corrects it (--camera)"
+    )
+    source = f"estimated: from the motion of {min(sequence.count or MAX_FRAMES, MAX_FRAMES)} frames, {described}"
+    notes = [distorted] * (abs(estimate.distortion) >= _MIN_DISTORTION)
+    return sequence.with_focal(estimate.focal_px, source, estimate.sigma_px), notes
+
+
 def focal_from_motion(sequence: Sequence, config: Config) -> FocalEstimate:
     """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior.
 
     The principal point is the camera's.
     """
-    camera = sequence.camera
-    fits = []
+    camera, fits, scale = sequence.camera, [], 1.0
     for window in windows_of(sequence, config):
-        fit = adjust_window(window, camera.fx * 2 * window.half_width_px / camera.width)
-        if fit is not None and fit.residual_px <= _MAX_RESIDUAL * 2 * window.half_width_px:
-            fits.append(_at_width(fit, camera.width / (2 * window.half_width_px)))
-    return combine(fits, camera.width)
-
-
-def _at_width(fit: WindowFit, scale: float) -> WindowFit:
-    return WindowFit(
-        fit.log_focal + math.log(scale), fit.deviation, fit.residual_px * scale, fit.tilt_deg, fit.distortion
-    )
+        # All windows have one size, which may be smaller than the sequence's.
+        scale = 2 * window.half_width_px / camera.width
+        fit = adjust_window(window, camera.fx * scale)
+        if fit is not None and fit.residual_px <= _MAX_RESIDUAL * scale * camera.width:
+            fits.append(fit)
+    estimate = combine(fits, scale * camera.width)
+    return replace(estimate, focal_px=estimate.focal_px / scale)
 
 
 def combine(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:

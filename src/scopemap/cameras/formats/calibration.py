@@ -27,7 +27,7 @@ class Calibration:
     """A camera and where it is from.
 
     depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it.
-    source : how the camera is known, one phrase. file : the file, None where there is none.
+    source : how the camera is known, one phrase. file : the file, or its name in errors; None where there is none.
     size_origin : where the size of `camera` is from. stated: the file. images: the file has none. relative: as images,
         and the file's numbers are shares of the size.
     """
@@ -36,7 +36,7 @@ class Calibration:
     depth_scale_mm: float | None
     source: str
     size_origin: SizeOrigin = "stated"
-    file: Path | None = None
+    file: Path | str | None = None
 
     @property
     def name(self) -> str:
@@ -81,39 +81,11 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
     camera = calibration.camera
     if (camera.width, camera.height) != image_size:
         raise CalibrationError(
-            f"{_sizes(camera, image_size, calibration.name)}; give --camera-fit scale if the images were resized from "
+            f"{_sizes(calibration, image_size)}; give --camera-fit scale if the images were resized from "
             "that size, --camera-fit crop:X,Y if they were cut out of it, else another calibration (--camera)"
         )
     check_plausible(camera, calibration.name)
     return calibration
-
-
-def fitted_to(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
-    """Return `camera` resized for images of `image_size` (width, height), px; `name` is the calibration's in errors.
-
-    Raises `CalibrationError` unless the aspects agree within 1 % and the camera is plausible.
-    """
-    scaled = _resized(camera, image_size, f"the calibration {name}")
-    check_plausible(scaled, f"the calibration {name}")
-    return scaled
-
-
-def _resized(camera: CameraModel, image_size: Size, name: str) -> CameraModel:
-    if (camera.width, camera.height) == image_size:
-        return camera
-    width, height = image_size
-    if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
-        raise CalibrationError(
-            f"{_sizes(camera, image_size, name)}: another aspect, perhaps cropped; give --camera-fit crop:X,Y if the "
-            "images were cut out of that size, else a calibration for these images (--camera)"
-        )
-    return camera.resized(*image_size)
-
-
-def rescaled_note(camera: CameraModel, scaled: CameraModel) -> str:
-    """Return what a `camera_source` adds where `scaled` is `camera` at another size, else ""."""
-    same = (camera.width, camera.height) == (scaled.width, scaled.height)
-    return "" if same else f", rescaled from {camera.width}x{camera.height} px"
 
 
 def check_plausible(camera: CameraModel, name: str) -> None:
@@ -122,13 +94,13 @@ def check_plausible(camera: CameraModel, name: str) -> None:
     least, most = (share * width for share in _FOCAL_PER_WIDTH)
     narrow, wide = _FOCAL_RATIO
     # Written so that NaN is refused, too.
-    fault = ""
     if not least < central.fx < most or not narrow < central.fy / central.fx < wide:
         fault = f"focal length {central.fx:g}, {central.fy:g} px (plausible: {least:g} to {most:g})"
     elif not (0 <= central.cx < width and 0 <= central.cy < height):
         fault = f"its principal point {central.cx:g}, {central.cy:g} is outside; it was made for a larger image"
-    if fault:
-        raise CalibrationError(f"{name} does not fit images of {width}x{height} px: {fault}")
+    else:
+        return
+    raise CalibrationError(f"{name} does not fit images of {width}x{height} px: {fault}")
 
 
 def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
@@ -138,8 +110,16 @@ def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
             f"{calibration.name} does not state its image size, so that it cannot be scaled (--camera-fit scale): add "
             "image_width and image_height"
         )
-    scaled = _resized(camera, image_size, calibration.name)
-    return replace(calibration, camera=scaled, source=calibration.source + rescaled_note(camera, scaled))
+    width, height = image_size
+    if (camera.width, camera.height) == image_size:
+        return calibration
+    if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
+        raise CalibrationError(
+            f"{_sizes(calibration, image_size)}: another aspect, perhaps cropped; give --camera-fit crop:X,Y if the "
+            "images were cut out of that size, else a calibration for these images (--camera)"
+        )
+    source = f"{calibration.source}, rescaled from {camera.width}x{camera.height} px"
+    return replace(calibration, camera=camera.resized(width, height), source=source)
 
 
 def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]) -> Calibration:
@@ -152,7 +132,7 @@ def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]
     is_stated = calibration.size_origin == "stated"
     if is_stated and (x + image_size[0] > camera.width or y + image_size[1] > camera.height):
         raise CalibrationError(
-            f"{_sizes(camera, image_size, calibration.name)}: too large to have been cut out of it at {x},{y} px "
+            f"{_sizes(calibration, image_size)}: too large to have been cut out of it at {x},{y} px "
             f"(--camera-fit crop:{x},{y})"
         )
     of_size = f" of {camera.width}x{camera.height} px" if is_stated else ""
@@ -160,6 +140,6 @@ def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]
     return replace(calibration, camera=camera.cropped(x, y, *image_size), source=source)
 
 
-def _sizes(camera: CameraModel, image_size: Size, name: str) -> str:
-    width, height = image_size
-    return f"{name} is for {camera.width}x{camera.height} px, but the images are {width}x{height} px"
+def _sizes(calibration: Calibration, image_size: Size) -> str:
+    camera, (width, height) = calibration.camera, image_size
+    return f"{calibration.name} is for {camera.width}x{camera.height} px, but the images are {width}x{height} px"

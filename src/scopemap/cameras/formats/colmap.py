@@ -20,7 +20,7 @@ from typing import IO
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, check_plausible
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OpenCvCamera
+from scopemap.cameras.formats.lens import with_lens
 from scopemap.errors import CalibrationError, InputError
 
 # How many parameters each model has; its place here is its number in binary files.
@@ -44,7 +44,7 @@ _COUNT = Struct("<Q")
 _CAMERA = Struct("<IiQQ")  # number, number of the model, width, height; then the parameters, double
 _IMAGE = Struct("<I7dI")  # number, qw qx qy qz tx ty tz, number of the camera; then name, 0, count of points, points
 _POINT_BYTES, _PIECE_BYTES = 24, 1 << 20
-_MOST_IMAGES, _LONGEST_NAME_BYTES = 1_000_000, 4096
+_LONGEST_NAME_BYTES = 4096
 _FIELDS_BEFORE_NAME = 9
 _MODEL_IN_ARCHIVE = re.compile(r"(?:.*/)?sparse/(\d{1,9})/images\.bin")
 _DAMAGED_ARCHIVE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError)
@@ -83,15 +83,6 @@ class ModelImage:
         return PurePosixPath(self.name.replace("\\", "/"))
 
 
-@dataclass(frozen=True)
-class SubModel:
-    """One of the models in an archive: the number of its folder, its images, and how many models there are."""
-
-    number: int
-    count: int
-    images: list[ModelImage]
-
-
 def model_files(folder: Path) -> tuple[Path, Path] | None:
     """Return the files (cameras, images) of the model in `folder`, binary before text as COLMAP does, or None."""
     pairs = ((folder / f"cameras{ending}", folder / f"images{ending}") for ending in (".bin", ".txt"))
@@ -123,27 +114,23 @@ def read_images(file: Path) -> list[ModelImage]:
         raise InputError(f"cannot read the images of a COLMAP model from {file}: {error}") from None
 
 
-def read_largest_model(archive: Path) -> SubModel:
-    """Return the model `sparse/<M>/images.bin` in a zip archive that has the most images, of equals the first.
+def read_largest_model(archive: Path) -> tuple[list[ModelImage], int, int]:
+    """Return the images of the largest model `sparse/<M>/images.bin` in a zip archive, M, and the number of models.
 
-    Raises `InputError` for an archive that is damaged or holds no model.
+    Of equals the first is taken. Raises `InputError` for an archive that is damaged or holds no model.
     """
     try:
         with zipfile.ZipFile(archive) as opened:
             numbers = {name: int(m[1]) for name in opened.namelist() if (m := _MODEL_IN_ARCHIVE.fullmatch(name))}
             if not numbers:
                 raise InputError(f"reading {archive}: it holds no COLMAP model (sparse/<number>/images.bin)")
-            largest = max(numbers, key=lambda name: (_image_count(opened, name), -numbers[name]))
+            counts = {name: _taken(opened.open(name), _COUNT)[0] for name in numbers}
+            largest = max(numbers, key=lambda name: (counts[name], -numbers[name]))
             with opened.open(largest) as stream:
                 images = _images_in(stream, f"{archive}, {largest}", binary=True)
     except _DAMAGED_ARCHIVE as error:
         raise InputError(f"reading {archive}: the archive is damaged or incomplete ({error})") from None
-    return SubModel(numbers[largest], len(numbers), images)
-
-
-def _image_count(archive: zipfile.ZipFile, name: str) -> int:
-    with archive.open(name) as stream:
-        return int(_taken(stream, _COUNT)[0])
+    return images, numbers[largest], len(numbers)
 
 
 def is_cameras_text(text: str) -> bool:
@@ -199,22 +186,15 @@ def camera_model(camera: ModelCamera, name: str) -> CameraModel:
     fx, fy, cx, cy, *lens = (*doubled, *camera.parameters)
     size = (camera.width, camera.height)
     central = PinholeCamera(fx, fy, cx - _CORNER_TO_CENTRE_PX, cy - _CORNER_TO_CENTRE_PX, *size)
+    words = "fisheye" if camera.model in _FISHEYES else "fov" if camera.model == "FOV" else "opencv"
+    if words != "fov":
+        lens += [0.0] * (4 - len(lens))
     try:
-        model = _with_lens(camera.model, central, lens)
+        model, _ = with_lens(central, words, lens)
     except ValueError as error:
         raise CalibrationError(f"{name}: {error}") from None
     check_plausible(model, name)
     return model
-
-
-def _with_lens(model: str, central: PinholeCamera, lens: list[float]) -> CameraModel:
-    if model in _FISHEYES:
-        return FisheyeCamera(central, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
-    if not any(lens):
-        return central
-    if model == "FOV":
-        return FovCamera(central, lens[0])
-    return OpenCvCamera(central, tuple(lens) if model == "FULL_OPENCV" else (*lens, 0.0, 0.0, 0.0)[:4])
 
 
 def _text_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
@@ -241,8 +221,7 @@ def _binary_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
             raise ValueError(f"camera {key} is of an unknown model, number {model}; {_ADVICE}")
         parameters = _taken(stream, Struct(f"<{_PARAMETERS[models[model]]}d"))
         yield key, ModelCamera(models[model], width, height, parameters)
-    if stream.read(1):
-        raise ValueError("bytes are left after the last entry; it is damaged")
+    _check_end(stream)
 
 
 def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
@@ -276,8 +255,6 @@ def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
 
 def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
     (count,) = _taken(stream, _COUNT)
-    if count > _MOST_IMAGES:
-        raise ValueError(f"it claims {count} images, expected {_MOST_IMAGES} at most")
     for position in range(count):
         _, *values, camera = _taken(stream, _IMAGE)
         name = b""
@@ -288,6 +265,10 @@ def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
         (points,) = _taken(stream, _COUNT)
         _skip(stream, _POINT_BYTES * points)
         yield ModelImage(name.decode(), camera, tuple(values), f"{where}, image {position + 1}")
+    _check_end(stream)
+
+
+def _check_end(stream: IO[bytes]) -> None:
     if stream.read(1):
         raise ValueError("bytes are left after the last entry; it is damaged")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats import colmap
+from scopemap.cameras.formats import colmap, text_formats
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, Calibration, Size, check_size, fitted, pinhole_of
 from scopemap.cameras.formats.lens import lens_of, model_in
 from scopemap.cameras.formats.parsing import (
@@ -22,7 +22,6 @@ from scopemap.cameras.formats.parsing import (
     number_rows,
     read_tree,
 )
-from scopemap.cameras.formats.text_formats import intrinsics_of, is_stereo_ini, of_calibu, of_numbers, of_stereo_ini
 from scopemap.cameras.lenses import OmnidirectionalCamera
 from scopemap.errors import CalibrationError
 
@@ -40,14 +39,14 @@ _MATRIX_NAMES = (
 _INNER = ("intrinsics", "projection_parameters", "camera_intrinsics", "intrinsic")
 _NERFSTUDIO = "fl_x"
 _INTRINSICS = {
-    "fx": ("fx", _NERFSTUDIO, "focal_x", "focal_length_x"),
-    "fy": ("fy", "fl_y", "focal_y", "focal_length_y"),
-    "cx": ("cx", "ppx"),
-    "cy": ("cy", "ppy"),
+    "fx": ("fx", _NERFSTUDIO, "focal_x", "focal_length_x", "fc_x"),
+    "fy": ("fy", "fl_y", "focal_y", "focal_length_y", "fc_y"),
+    "cx": ("cx", "ppx", "cc_x"),
+    "cy": ("cy", "ppy", "cc_y"),
 }
 _CORNER_TO_CENTRE_PX = 0.5
 _SIZES = ("image_size", "img_size", "im_size", "resolution", "image_resolution", "frame_size", "image_shape")
-_SIDES = tuple((f"{of}_width", f"{of}_height") for of in ("image", "img", "im", "frame"))
+_SIDES = (*((f"{of}_width", f"{of}_height") for of in ("image", "img", "im", "frame")), ("res_x", "res_y"))
 # Of the image, or of the calibration board, whose number of corners or squares has the same names.
 _UNSURE_SIDES = (("width", "height"), ("w", "h"), ("cols", "rows"))
 
@@ -70,7 +69,7 @@ def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
     typed, file = number_rows(str(camera)), Path(camera)
     if typed and len(typed[0]) > 1 and not os.path.isfile(file):
         try:
-            return replace(of_numbers(typed, image_size), source="camera of the numbers given (--camera)")
+            return replace(text_formats.of_numbers(typed, image_size), source="camera of the numbers given (--camera)")
         except ValueError as error:
             raise CalibrationError(f"cannot use the camera '{str(camera)[:200]}': {error}") from None
     try:
@@ -89,13 +88,13 @@ def _read(file: Path, image_size: Size) -> Calibration:
         raise ValueError("it is binary, not text")
     text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
     if (rows := number_rows(text)) is not None:
-        return of_numbers(rows, image_size)
+        return text_formats.of_numbers(rows, image_size)
     if colmap.is_cameras_text(text):
         return Calibration(colmap.only_camera(file), None, "")
-    if is_stereo_ini(text):
-        return Calibration(of_stereo_ini(text), None, "")
-    if "<camera_model" in text:
-        return Calibration(of_calibu(text), None, "")
+    if (
+        fields := text_formats.calibu_fields(text) if "<camera_model" in text else text_formats.stereo_ini_fields(text)
+    ) is not None:
+        return of_fields(fields, image_size)
     tree = (None if text.lstrip()[:1] in ("{", "[", "<") else named_values(text)) or read_tree(text)
     if not isinstance(tree, Fields):
         raise ValueError(f"it has none of the formats that are read: {_FORMATS}")
@@ -113,10 +112,9 @@ def of_fields(fields: Fields, image_size: Size) -> Calibration:
     intrinsics, note = _intrinsics(levels)
     size, size_note = _size_of(levels, intrinsics, image_size)
     pinhole, origin = pinhole_of(intrinsics, size, image_size)
-    model = model_in(levels)
+    model, lens_note = model_in(levels), ""
     if "omnidirectional" in model and any(fields.nodes(("polynomial",))):
         camera: CameraModel = _omnidirectional(fields, pinhole)
-        lens_note = ""
     else:
         camera, lens_note = lens_of(pinhole, levels, model)
     depth_scale_mm = next((s for level in levels if (s := level.number(("depth_scale",))) is not None), None)
@@ -131,7 +129,7 @@ def _intrinsics(levels: Sequence[Fields]) -> tuple[list[float], str]:
     """Return fx fy cx cy, and a note: of a matrix, else by name, else of Kalibr's list."""
     matrix = next((nine for level in levels if (nine := level.numbers(_MATRIX_NAMES, 9)) is not None), None)
     if matrix is not None:
-        return intrinsics_of(np.reshape(matrix, (3, 3)))
+        return text_formats.intrinsics_of(np.reshape(matrix, (3, 3)))
     for level in levels:
         found = {name: level.number(spellings) for name, spellings in _INTRINSICS.items()}
         intrinsics = [value for value in found.values() if value is not None]

@@ -7,11 +7,10 @@ import re
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import Calibration, Size, check_size, pinhole_of
 from scopemap.cameras.formats.lens import with_lens
-from scopemap.cameras.formats.parsing import MOST_TERMS, xml_root
-from scopemap.cameras.lenses import FisheyeCamera, OmnidirectionalCamera
+from scopemap.cameras.formats.parsing import MOST_TERMS, Fields, xml_root
+from scopemap.cameras.lenses import OmnidirectionalCamera
 
 _MATRIX_SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 _LINE_COUNTS = (4, 8, 9, 12)
@@ -101,8 +100,8 @@ def _of_ocamcalib(rows: list[list[float]]) -> OmnidirectionalCamera:
     return OmnidirectionalCamera(forward, column, row, *size, (1 / c, e / c, d / c))
 
 
-def of_calibu(text: str) -> CameraModel:
-    """Return the camera of Calibu's XML (EndoMapper): `rig` > `camera` > `camera_model type="calibu_..."`.
+def calibu_fields(text: str) -> Fields:
+    """Return the mapping of Calibu's XML (EndoMapper): `rig` > `camera` > `camera_model type="calibu_..."`.
 
     `calibu_fu_fv_u0_v0` is a pinhole, `..._k1_k2` has OpenCV's two radial terms, `..._kb4` is Kannala-Brandt's fisheye.
     Raises `ValueError` for anything else.
@@ -111,37 +110,28 @@ def of_calibu(text: str) -> CameraModel:
     kind = "" if model is None else model.get("type", "")
     if model is None or kind not in _CALIBU_PARAMETERS:
         raise ValueError(f"the type {kind[:40]!r} of its camera_model is not known ({', '.join(_CALIBU_PARAMETERS)})")
-    values = [float(value) for value in re.findall(r"[^\s\[\];,]+", model.findtext("params", ""))]
-    if len(values) != _CALIBU_PARAMETERS[kind] or not np.isfinite(values).all():
+    values = re.findall(r"[^\s\[\];,]+", model.findtext("params", ""))
+    if len(values) != _CALIBU_PARAMETERS[kind]:
         raise ValueError(f"it holds {len(values)} parameters, expected {_CALIBU_PARAMETERS[kind]} finite ones")
-    size = check_size(float(model.findtext("width", "")), float(model.findtext("height", "")))
-    fx, fy, cx, cy, *lens = values
-    pinhole = PinholeCamera(fx, fy, cx, cy, *size)
-    if any(lens) and len(lens) == 4:
-        return FisheyeCamera(pinhole, tuple(lens))
-    return with_lens(pinhole, "", [*lens, 0.0, 0.0] if lens else [])[0]
+    lens = [*values[4:], "0", "0"] if len(values) == 6 else values[4:]
+    size = [("image_width", model.findtext("width")), ("image_height", model.findtext("height"))]
+    name = "fisheye" if len(values) == 8 else "opencv"
+    return Fields([*size, ("intrinsics", values[:4]), ("distortion_coefficients", lens), ("model", name)])
 
 
-def is_stereo_ini(text: str) -> bool:
-    """Return whether a text is a da Vinci's `StereoCalibration.ini` (StereoMIS)."""
-    return any(line.strip() == f"[{_STEREO_LEFT}]" for line in text.splitlines())
+def stereo_ini_fields(text: str) -> Fields | None:
+    """Return the left camera of a da Vinci's `StereoCalibration.ini` (StereoMIS), None for any other text.
 
-
-def of_stereo_ini(text: str) -> CameraModel:
-    """Return the left camera of `StereoCalibration.ini`; `ValueError` where a number of it is missing or none.
-
-    `[StereoLeft]` holds res_x, res_y, fc_x, fc_y, cc_x, cc_y and the lens kc_0 ... in OpenCV's order.
+    `[StereoLeft]` holds res_x, res_y, fc_x, fc_y, cc_x, cc_y and the lens kc_0 ... in OpenCV's order. Raises
+    `ValueError` where the file is damaged.
     """
+    if not any(line.strip() == f"[{_STEREO_LEFT}]" for line in text.splitlines()):
+        return None
     parser = configparser.ConfigParser(interpolation=None)
     try:
         parser.read_string(text)
-        left = parser[_STEREO_LEFT]
-        width, height, fx, fy, cx, cy = (float(left[key]) for key in ["res_x", "res_y", "fc_x", "fc_y", "cc_x", "cc_y"])
-        lens = [float(left[key]) for i in range(8) if (key := f"kc_{i}") in left]
-    except KeyError as error:
-        raise ValueError(f"{error} is missing") from None
     except configparser.Error as error:
         raise ValueError(str(error).partition("\n")[0]) from None
-    if not np.isfinite([fx, fy, cx, cy, *lens]).all():
-        raise ValueError(f"[{_STEREO_LEFT}] holds NaN or infinity")
-    return with_lens(PinholeCamera(fx, fy, cx, cy, *check_size(width, height)), "", lens)[0]
+    left = parser[_STEREO_LEFT]
+    lens = [left[key] for i in range(8) if (key := f"kc_{i}") in left]
+    return Fields([*left.items(), ("distortion_coefficients", lens)])

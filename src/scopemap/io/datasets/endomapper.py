@@ -75,8 +75,8 @@ class EndoMapperSequence(PosedVideo):
         if not archive.is_file():
             self.notes.append("no pose is known: there is no COLMAP reconstruction of this procedure")
             return
-        model = read_largest_model(archive)
-        images = [image for image in model.images if image.is_posed]
+        images, chosen, count = read_largest_model(archive)
+        images = [image for image in images if image.is_posed]
         for image, pose in zip(images, camera_poses(images), strict=True):
             name = image.path.name
             match = _FRAME.fullmatch(name)
@@ -87,7 +87,7 @@ class EndoMapperSequence(PosedVideo):
                 )
             self.poses[number] = pose
         self.notes.append(
-            f"truth: COLMAP sub-model {model.number}, the largest of {model.count}: {len(self.poses)} frames; its "
+            f"truth: COLMAP sub-model {chosen}, the largest of {count}: {len(self.poses)} frames; its "
             "scale is arbitrary (its unit is taken as mm); image outN.png is taken as frame N - 1; no depth is known"
         )
         if self._beyond():

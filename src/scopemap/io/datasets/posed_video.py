@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.calibration import fitted_to, rescaled_note
+from scopemap.cameras.formats.calibration import Calibration, fitted
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
@@ -77,9 +77,9 @@ class PosedVideo(SourceDefaults):
 
     def _set_camera(self, camera: CameraModel, file: Path) -> None:
         """Take `camera`, read from `file`, brought to the size of the view."""
-        fitted = fitted_to(camera, (self.width, self.height), str(file))
-        self.camera = fitted
-        self.camera_source = f"calibration of the data set, {file.name}{rescaled_note(camera, fitted)}"
+        stated = Calibration(camera, None, f"calibration of the data set, {file.name}", file=file)
+        calibration = fitted(stated, (self.width, self.height), "scale")
+        self.camera, self.camera_source = calibration.camera, calibration.source
 
     def _beyond(self) -> int:
         return sum(self.count is not None and number >= self.count for number in self.poses)

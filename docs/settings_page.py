@@ -1,25 +1,19 @@
-"""The page of settings, docs/settings.md, generated from the settings' classes.
-
-`python -c "from scopemap.config.page import settings_page; print(settings_page(), end='')" > docs/settings.md`
-"""
+"""The page of settings, docs/settings.md, generated from the settings' classes: `python docs/settings_page.py`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from pydantic.fields import FieldInfo
-
-from scopemap.config.config import Config
-from scopemap.config.presets import PRESETS
-from scopemap.config.settings import Settings
+from scopemap.config import PRESETS, Config, Settings
 
 _HEAD = """# Settings
 
 Every setting can be set on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by
 a preset. The order is defaults < preset < file < command line. A result's `config.toml` holds all settings and is a
-valid file. A cell "presets" names what presets change;
-`paper-strict` changes what `paper` does, too. `scopemap.config.page` writes this page.
+valid file. A cell "presets" names what presets change; `paper-strict` changes what `paper` does, too. A meaning that
+begins with `name = value:` holds for that value only. `python docs/settings_page.py` writes this page.
 """
 _SECTIONS = (
     ("", "User settings", "What one may want to choose."),
@@ -37,17 +31,13 @@ def settings_page() -> str:
     parts = [_HEAD]
     for group, title, meaning in _SECTIONS:
         parts.append(f"\n## {title}\n\n{meaning}\n")
-        for stage, model in _stages():
+        for stage, model in _nested(Config).items():
             owner = model if not group else _nested(model).get(group)
             rows = [] if owner is None else list(_rows(owner, f"{stage}.{group}." if group else f"{stage}."))
             if rows:
                 parts.append(f"\n### {stage}\n\n{_summary(model)}\n\n" if not group else f"\n### {stage}\n\n")
                 parts.append("| setting | default | meaning | presets |\n|---|---|---|---|\n" + "".join(rows))
     return "".join(parts)
-
-
-def _stages() -> Iterator[tuple[str, type[Settings]]]:
-    yield from _nested(Config).items()
 
 
 def _nested(model: type[Settings]) -> dict[str, type[Settings]]:
@@ -60,20 +50,12 @@ def _rows(model: type[Settings], prefix: str) -> Iterator[str]:
     nested = _nested(model)
     for name, field in model.model_fields.items():
         if name not in nested:
-            changes = [f"{preset}: {_text(values[prefix + name])}" for preset, values in _changes(prefix + name)]
-            cells = (f"`{prefix}{name}`", _text(field.default), _meaning(field), "; ".join(changes))
+            changed = {preset: values[prefix + name] for preset, values in PRESETS.items() if prefix + name in values}
+            if "paper-strict" in changed and changed["paper-strict"] == changed.get("paper"):
+                del changed["paper-strict"]
+            changes = "; ".join(f"{preset}: {_text(value)}" for preset, value in changed.items())
+            cells = (f"`{prefix}{name}`", _text(field.default), field.description or "", changes)
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
-
-
-def _changes(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    for preset, values in PRESETS.items():
-        of_paper = preset == "paper-strict" and values.get(name) == PRESETS["paper"].get(name)
-        if name in values and not of_paper:
-            yield preset, values
-
-
-def _meaning(field: FieldInfo) -> str:
-    return " ".join((field.description or "").split())
 
 
 def _text(value: Any) -> str:
@@ -93,3 +75,7 @@ def _text(value: Any) -> str:
 
 def _summary(model: type[Settings]) -> str:
     return " ".join((model.__doc__ or "").split("\n\n")[0].split())
+
+
+if __name__ == "__main__":
+    Path(__file__).with_name("settings.md").write_text(settings_page(), encoding="utf-8")
