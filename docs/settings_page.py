@@ -12,8 +12,8 @@ _HEAD = """# Settings
 
 Every setting can be set on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by
 a preset. The order is defaults < preset < file < command line. A result's `config.toml` holds all settings and is a
-valid file. A cell "presets" names what presets change; `paper-strict` changes what `paper` does, too. A meaning that
-begins with `name = value:` holds for that value only. `python docs/settings_page.py` writes this page.
+valid file. A cell "presets" names what presets change; `paper-strict` changes what `paper` does, too.
+`python docs/settings_page.py` writes this page.
 """
 _SECTIONS = (
     ("", "User settings", "What one may want to choose."),
