@@ -44,7 +44,7 @@ _COUNT = Struct("<Q")
 _CAMERA = Struct("<IiQQ")  # number, number of the model, width, height; then the parameters, double
 _IMAGE = Struct("<I7dI")  # number, qw qx qy qz tx ty tz, number of the camera; then name, 0, count of points, points
 _POINT_BYTES, _PIECE_BYTES = 24, 1 << 20
-_LONGEST_NAME_BYTES = 4096
+_MOST_IMAGES, _LONGEST_NAME_BYTES = 1_000_000, 4096
 _FIELDS_BEFORE_NAME = 9
 _MODEL_IN_ARCHIVE = re.compile(r"(?:.*/)?sparse/(\d{1,9})/images\.bin")
 _DAMAGED_ARCHIVE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, ValueError)
@@ -255,6 +255,8 @@ def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
 
 def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
     (count,) = _taken(stream, _COUNT)
+    if count > _MOST_IMAGES:
+        raise ValueError(f"it claims {count} images, expected {_MOST_IMAGES} at most")
     for position in range(count):
         _, *values, camera = _taken(stream, _IMAGE)
         name = b""
