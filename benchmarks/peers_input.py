@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from scopemap import open_sequence, read_trajectory
-from scopemap.benchmark.methods.registry import BASELINES
+from scopemap.benchmark.methods.method import BASELINES
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.depth.files import depth_files

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from transformers import (
     DepthAnythingConfig,
@@ -14,6 +16,8 @@ from transformers import (
     DepthProImageProcessor,
     DPTImageProcessor,
 )
+
+from scopemap.io.checkpoints import REGISTRY
 
 _VIT = {
     "model_type": "dinov2",
@@ -77,3 +81,34 @@ def saved(pair: tuple[Any, Any], folder: Path) -> Path:
     for part in pair:
         part.save_pretrained(folder)
     return folder
+
+
+def write_weights(folder: Path) -> Path:
+    """Write weights for every network of the preset "paper"; `use_weights` lets them be found.
+
+    Disparity is 1 +- some tenths, metric depth some 25 mm: a scene of which something is known.
+    """
+    from torchvision.models import alexnet
+    from torchvision.models.optical_flow import raft_large
+
+    anything, pro = small_depth_anything(), small_depth_pro(inverse_depth=20.0)
+    with torch.no_grad():
+        anything[0].head.conv3.weight.mul_(1e7)
+        pro[0].head.layers[-2].weight.mul_(0.02)
+    saved(anything, folder / "depth-anything")
+    saved(pro, folder / "depth-pro")
+    torch.manual_seed(9)
+    torch.save(raft_large().state_dict(), folder / REGISTRY["raft-large"].place)
+    features = {name: tensor for name, tensor in alexnet().state_dict().items() if name.startswith("features.")}
+    torch.save(features, folder / REGISTRY["alexnet"].place)
+    return folder
+
+
+def use_weights(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make `folder` the folder of weights, of whatever hash."""
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(folder))
+    for name in ("depth-anything", "depth-pro", "raft-large", "alexnet"):
+        place = folder / REGISTRY[name].place
+        found = sorted(place.iterdir()) if place.is_dir() else [place]
+        files = {file.relative_to(folder).as_posix(): "" for file in found}
+        monkeypatch.setitem(REGISTRY, name, replace(REGISTRY[name], files=files))

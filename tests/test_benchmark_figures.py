@@ -97,13 +97,13 @@ def test_scatters_share_their_scale(tmp_path: Path) -> None:
 def test_matched_points_that_agree_hide_each_other(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(30, 50, (500, 3))
     for name, offset in (("same", 0.0), ("apart", 4.0)):
-        draw_matched_points({name: (points, points + offset)}, tmp_path / f"{name}.png")
+        draw_matched_points({name: (points, points + offset)}, tmp_path / f"{name}.png", where="world")
     blue = [is_colour(read(tmp_path / f"{name}.png"), BAR_COLOUR).sum() for name in ("same", "apart")]
     # The current points are drawn over the previous ones.
     assert blue[0] < 0.6 * blue[1]
-    draw_matched_points({"none": (np.empty((0, 3)), np.empty((0, 3)))}, tmp_path / "none.png")
+    draw_matched_points({"none": (np.empty((0, 3)), np.empty((0, 3)))}, tmp_path / "none.png", where="world")
     with pytest.raises(ValueError, match="current points of x"):
-        draw_matched_points({"x": (points, points[:3])}, tmp_path / "bad.png")
+        draw_matched_points({"x": (points, points[:3])}, tmp_path / "bad.png", where="world")
 
 
 def test_figures_leave_the_backend_alone(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from sample_trajectories import write_c3vd
 
 from scopemap.benchmark.entry import Entry, entries_of
-from scopemap.benchmark.methods.registry import create_method
+from scopemap.benchmark.methods.method import create_method
 from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
 from scopemap.benchmark.runner import run_plan
 from scopemap.config import Config

@@ -94,8 +94,8 @@ def figures(results: list[RunResult]) -> list[Any]:
 
 def test_every_method_is_a_row_and_one_that_dies_says_so(done: tuple[Benchmark, Path]) -> None:
     ours, still, imported = done[0].results
-    assert [row.status for row in (ours, still, imported)] == ["done", "done", "failed"]
-    assert "colon.txt" in imported.error
+    assert [row.status for row in (ours, still, imported)] == ["done", "done", "missing"]
+    assert imported.error == f"not supplied: {done[1] / 'colon.txt'}"
     assert ours.figures["poses"]["tracked"] == 6
     assert 0 < ours.figure("poses", "ate_rmse_mm") < still.figure("poses", "ate_rmse_mm")
     assert math.isnan(imported.figure("poses", "ate_rmse_mm"))
@@ -123,12 +123,13 @@ def test_what_is_done_is_not_done_again(
     monkeypatch.setattr(runner, "worker_command", lambda file: pytest.fail("a row was run again"))
     known: list[bool] = []
     again = run_plan(plan, done[1], data=done[1], listener=lambda entry, row, kept: known.append(kept))
-    assert known == [True, True, True]
+    assert known == [True, True, False], "what is missing is looked for again"
     assert figures(again.results) == figures(done[0].results)
 
 
 def test_failed_and_changed_rows_are_run_again(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = plan.model_copy(update={"method": plan.method[2:]})
+    (tmp_path / "colon.txt").write_text("")
 
     def run(code: str, changed: Plan = alone, **options: Any) -> RunResult:
         monkeypatch.setattr(runner, "worker_command", command(code))
@@ -158,6 +159,7 @@ def test_however_a_method_dies_the_others_go_on(
     code: str, error: str, plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "worker_command", command(code))
+    (tmp_path / "colon.txt").write_text("")
     rows = run_plan(plan, tmp_path, data=tmp_path, timeout_s=1 if "sleep" in code else None).results
     assert [(row.status, row.error) for row in rows] == [("failed", error)] * 3
 
@@ -168,6 +170,8 @@ def test_killed_half_way_it_continues_and_no_worker_stays(
 ) -> None:
     (tmp_path / "plan.toml").write_text(PLAN)
     work, out = FINISHES.replace("# the work", f"if method != 'ours': wait({str(tmp_path)!r})"), tmp_path / "out"
+    out.mkdir()
+    (out / "colon.txt").write_text("")
     start = (
         "import sys; from pathlib import Path; from scopemap.benchmark import runner, plan; "
         "command = lambda file, code: [sys.executable, '-c', code, str(file), runner.Entry.load(file).key]; "

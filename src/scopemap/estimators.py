@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.create import create_anchor, create_depth, files_folder
 from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.depth.files import FilesDepth
+from scopemap.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.depth.perceptual import create_perceptual
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+from scopemap.io import weights
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
@@ -38,6 +42,22 @@ def create_estimators(config: Config, sequence: Sequence) -> Estimators:
         create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks),
     )
+
+
+def missing_weights(config: Config) -> list[str]:
+    """Return the names of the weights that the settings need and this machine does not have; nothing is loaded."""
+    depth, networks = config.depth, config.networks
+    models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
+    if depth.anchor == "depth-pro":
+        models.setdefault("depth-pro", depth.anchor_model)
+    needed: list[tuple[str, ...]] = [
+        (model or name,) for name, model in models.items() if not (model and Path(model).is_dir())
+    ]
+    flows = {networks.flow, networks.keyframe_flow}
+    needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
+    if networks.perceptual == "lpips":
+        needed.append(PERCEPTUAL_CHECKPOINTS)
+    return [names[0] for names in needed if not weights.is_present(*names)]
 
 
 def largest_depth_mm(config: Config, estimators: Estimators) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +11,7 @@ from scopemap.benchmark.entry import FILE_NAME as ENTRY
 from scopemap.benchmark.entry import Entry
 from scopemap.benchmark.figures import FinishedRun
 from scopemap.benchmark.plan import ProtocolPlan
-from scopemap.benchmark.result import FILE_NAME, RunResult
+from scopemap.benchmark.result import FILE_NAME, RunResult, read_provenance
 from scopemap.benchmark.scoring import default_protocol, pose_groups, score
 from scopemap.benchmark.truth import open_truth
 from scopemap.errors import InputError
@@ -88,7 +87,7 @@ def _frames(path: Path, truth: Path) -> Frames | None:
 def _timing(path: Path) -> dict[str, float]:
     """Return the times of a run's provenance; {} where there are none."""
     try:
-        provenance = json.loads((path / "provenance.json").read_text(encoding="utf-8"))
-        return {f"seconds_{stage.replace(' ', '_')}": float(s) for stage, s in provenance["seconds"].items()}
-    except (OSError, ValueError, KeyError, TypeError):
+        seconds = read_provenance(path)["seconds"].items()
+        return {f"seconds_{stage.replace(' ', '_')}": float(s) for stage, s in seconds}
+    except (ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -1,8 +1,10 @@
 """Writes the tables and figures of finished runs, of a benchmark or of any folders, for `bench` and `compare`.
 
 OUT/results.md    OUT/tables/NAME.{md,csv,tex}
-OUT/figures/      ate.png, frames_until_loss.png, orb_bars.png; per sequence orb_pairs, orb_points, depth_change;
-per run its mesh with both camera paths
+OUT/figures/      ate.png, frames_until_loss.png, orb_bars.png; per sequence orb_pairs, orb_points, depth_change,
+clouds; per run its mesh with the camera paths
+
+Where a sequence has no true poses, points and meshes are drawn by the estimated ones, and the figures state so.
 """
 
 from __future__ import annotations
@@ -19,11 +21,13 @@ from scopemap.benchmark.result import RunResult
 from scopemap.benchmark.summary import joined, summarise
 from scopemap.benchmark.table import pd
 from scopemap.benchmark.tables import write_tables
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.correspondences import FrameMatcher, displacements
 from scopemap.evaluation.poses import match
 from scopemap.frame import Frame, Truth
+from scopemap.geometry.se3 import inverse, se3, transform
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.masking.masker import Masker
@@ -36,7 +40,7 @@ from scopemap.report.benchmark_figures import (
     draw_matched_points,
 )
 from scopemap.report.depth_figures import DepthScene, draw_depth_change
-from scopemap.report.mesh_figures import draw_reconstruction
+from scopemap.report.mesh_figures import draw_reconstruction, draw_registered_clouds
 from scopemap.trajectory.formats.opening import read_trajectory
 
 _MAX_DEPTHS = 6
@@ -138,34 +142,70 @@ def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
 
 
 def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
-    """Draw the depth of the two frames in the middle, and the 3D points of ORB's matches between them."""
+    """Draw two frames in the middle: their depth, their registered point clouds, and ORB's matches between them.
+
+    Clouds are registered by each method's own poses (experiment 1 of arXiv 2508.11282), matches by the true ones where
+    they are known.
+    """
     (previous, true_previous), (current, true_current) = _middle(frames)
-    depths = {}
+    depths, own_poses = {}, {}
     for run in runs[:_MAX_DEPTHS]:
-        reader = DepthReader(run.folder)
+        reader, scale = DepthReader(run.folder), run.result.figure("consistency", "scale")
         before, now = reader.read(previous.index), reader.read(current.index)
         if before is not None and now is not None and before.shape == now.shape == previous.valid.shape:
-            scale = run.result.figure("consistency", "scale")
             depths[run.result.method] = (scale * before, scale * now)
+            own_poses[run.result.method] = _poses_of(run, (previous.index, current.index), scale)
     if not depths:
         return
     name = folder_name(sequence)
-    scene = DepthScene(f"{sequence}, frames {previous.index}, {current.index}", (previous.rgb, current.rgb), depths)
+    images = (previous.rgb, current.rgb)
+    scene = DepthScene(f"{sequence}, frames {previous.index}, {current.index}", images, depths)
     draw_depth_change(scene, folder / f"depth_change_{name}.png")
     yield folder / f"depth_change_{name}.png"
+    posed = {method: poses for method, poses in own_poses.items() if poses is not None}
+    if posed:
+        clouds = {method: _clouds(images, depths[method], poses, frames.camera) for method, poses in posed.items()}
+        draw_registered_clouds(clouds, folder / f"clouds_{name}.png", where=_WORLD["estimated"])
+        yield folder / f"clouds_{name}.png"
     matcher = FrameMatcher(frames.camera)
     matcher.match(previous.rgb, previous.valid)
     correspondence = matcher.match(current.rgb, current.valid)
-    T_previous, T_current = (None if truth is None else truth.T_world_camera for truth in (true_previous, true_current))
-    if T_previous is None or T_current is None or correspondence is None:
+    if correspondence is None:
         return
-    poses = (T_previous, T_current)
-    found = {
-        method: displacements(correspondence.matches, *maps, frames.camera, poses) for method, maps in depths.items()
-    }
-    points = {method: (ends.previous_mm, ends.current_mm) for method, ends in found.items()}
-    draw_matched_points(points, folder / f"orb_points_{name}.png")
-    yield folder / f"orb_points_{name}.png"
+    T_previous, T_current = (None if truth is None else truth.T_world_camera for truth in (true_previous, true_current))
+    where = "estimated" if T_previous is None or T_current is None else "reference"
+    if T_previous is not None and T_current is not None:
+        posed = dict.fromkeys(depths, (T_previous, T_current))
+    if posed:
+        found = {
+            m: displacements(correspondence.matches, *depths[m], frames.camera, poses) for m, poses in posed.items()
+        }
+        points = {method: (ends.previous_mm, ends.current_mm) for method, ends in found.items()}
+        draw_matched_points(points, folder / f"orb_points_{name}.png", where=_WORLD[where])
+        yield folder / f"orb_points_{name}.png"
+
+
+def _poses_of(run: FinishedRun, indices: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return a run's poses (4, 4) of two frames, their translations scaled as its depth; None where one is lost."""
+    trajectory = read_trajectory(run.folder)
+    poses = [trajectory.T_world_camera[(trajectory.indices == index) & trajectory.tracked] for index in indices]
+    if not all(len(found) for found in poses):
+        return None
+    first, second = (se3(found[0, :3, :3], scale * found[0, :3, 3]) for found in poses)
+    return first, second
+
+
+def _clouds(
+    images: tuple[np.ndarray, np.ndarray],
+    depths_mm: tuple[np.ndarray, np.ndarray],
+    poses: tuple[np.ndarray, np.ndarray],
+    camera: PinholeCamera,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (N, 3) of both frames, mm, in the camera of the first, and their colours (N, 3) uint8."""
+    known = [np.isfinite(depth) for depth in depths_mm]
+    local = [(camera.rays * depth[..., None])[k] for depth, k in zip(depths_mm, known, strict=True)]
+    points = np.concatenate([local[0], transform(inverse(poses[0]) @ poses[1], local[1])])
+    return points, np.concatenate([image[k] for image, k in zip(images, known, strict=True)])
 
 
 def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
@@ -181,18 +221,22 @@ def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
 
 
 def _draw_mesh(run: FinishedRun, frames: Frames, file: Path) -> bool:
-    """Draw a run's mesh with both camera paths in the true world; False where there is no mesh or no truth."""
+    """Draw a run's mesh with its camera path, and the true one where it is known; False where there is no mesh."""
     mesh_file, reference = run.folder / "mesh.ply", reference_trajectory(frames)
-    if reference is None or not mesh_file.is_file():
-        return False
-    mesh = trimesh.load_mesh(mesh_file, process=False)
-    try:
-        matched = match(read_trajectory(run.folder), reference, run.result.figures["poses"].get("align", "sim3"))
-    except AlignmentError:
-        return False
+    mesh = trimesh.load_mesh(mesh_file, process=False) if mesh_file.is_file() else trimesh.Trimesh()
     if not len(mesh.faces):
         return False
-    mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
-    estimate_mm = np.where(matched.tracked[:, None], matched.aligned[:, :3, 3], np.nan)
-    draw_reconstruction(mesh, estimate_mm, matched.reference[:, :3, 3], file, matched.reference[0])
+    estimate = read_trajectory(run.folder)
+    if reference is None:
+        tracked, poses = estimate.tracked, estimate.T_world_camera
+        true_mm, T_view = None, poses[np.argmax(tracked)]
+    else:
+        try:
+            matched = match(estimate, reference, run.result.figures["poses"].get("align", "sim3"))
+        except AlignmentError:
+            return False
+        mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
+        tracked, poses = matched.tracked, matched.aligned
+        true_mm, T_view = matched.reference[:, :3, 3], matched.reference[0]
+    draw_reconstruction(mesh, np.where(tracked[:, None], poses[:, :3, 3], np.nan), true_mm, file, T_view)
     return True

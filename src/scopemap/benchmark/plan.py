@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import mimetypes
+import os
+import re
 import tomllib
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import resources
-from pathlib import Path
+from itertools import groupby
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -22,6 +26,7 @@ from scopemap.io.opening import DATASETS
 from scopemap.phantom.spec import PhantomSpec, parse_events
 
 _PLANS, _METHOD_SETS = "plans", "method_sets"
+_NESTING = 2  # folders around or within a sequence that the pattern does not name
 
 
 class _Part(BaseModel):
@@ -71,7 +76,8 @@ class SequencePlan(_Part):
     Attributes
     ----------
     name : for tables; before the path of each sequence that a pattern finds.
-    path : below the data folder. A pattern finds folders and videos, with `dataset` only those of its reader.
+    path : below the data folder. A pattern finds folders and videos, with `dataset` only those of its reader, in any
+        spelling of SCARED's folders and within folders of the same name.
     phantom : settings of a `PhantomSpec` instead of a path; its `path_file` is below the data folder, its `seed` is
         added to the benchmark's.
     dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].
@@ -111,7 +117,7 @@ class MethodPlan(_Part):
 
     Attributes
     ----------
-    name : for tables and folders. use : "scopemap", "import", or a baseline (`benchmark.methods.registry.BASELINES`).
+    name : for tables and folders. use : "scopemap", "import", or a baseline (`benchmark.methods.method.BASELINES`).
     preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
     files : of `use = "import"`: trajectory below the data folder; may hold {sequence} and {seed}.
     unit, kind : of these files.
@@ -189,33 +195,56 @@ def found_sequences(plan: Plan, data: Path | None) -> tuple[list[SequencePlan], 
             missing.append(f"{sequence.path}: needs --data, the folder that holds it")
         else:
             matches = _matches(sequence, data)
-            found += [_at(sequence, path, data) for path in matches]
+            found += [_at(sequence, name, path, data) for name, path in sorted(matches.items())]
             missing += [] if matches else [f"{sequence.path}: nothing like that in {data}"]
     if not found:
         raise InputError(f"no sequence of the plan '{plan.title}' is there: {missing[0]}")
     return found, missing
 
 
-def _at(sequence: SequencePlan, path: Path, data: Path) -> SequencePlan:
+def _at(sequence: SequencePlan, name: str, path: Path, data: Path) -> SequencePlan:
     below = path.relative_to(data).as_posix() if path.is_relative_to(data) else str(path)
-    named = sequence.name and below == sequence.path
-    name = sequence.name if named else " ".join(filter(None, (sequence.name, below)))
-    return sequence.model_copy(update={"path": below, "name": name})
+    full = sequence.name if sequence.name and name == sequence.path else " ".join(filter(None, (sequence.name, name)))
+    return sequence.model_copy(update={"path": below, "name": full})
 
 
-def _matches(sequence: SequencePlan, data: Path) -> list[Path]:
-    """Return the path itself if it exists, else the folders and videos that it finds as a pattern."""
-    if (data / sequence.path).exists():
-        return [data / sequence.path]
-    if Path(sequence.path).is_absolute():
-        return []
-    paths = [p for p in sorted(data.glob(sequence.path)) if p.is_dir() or _is_video(p)]
+def _matches(sequence: SequencePlan, data: Path) -> dict[str, Path]:
+    """Return the path itself if it exists, else the folders and videos that it finds as a pattern, by their names."""
+    if (data / sequence.path).exists() or Path(sequence.path).is_absolute():
+        return {sequence.path: data / sequence.path} if (data / sequence.path).exists() else {}
+    named = {path.relative_to(data).as_posix(): path for path in sorted(data.glob(sequence.path))}
     if sequence.dataset is None:
-        return paths
-    recognises = DATASETS[sequence.dataset].recognises
-    return [
-        p for p in paths if recognises(p) or (p.is_dir() and any(map(recognises, filter(Path.is_dir, p.iterdir()))))
-    ]
+        return {name: path for name, path in named.items() if path.is_dir() or _is_video(path)}
+    recognises, wanted = DATASETS[sequence.dataset].recognises, _usual_spelling(sequence.path)
+    found = {_usual_spelling(name): path for name, path in named.items() if recognises(path)}
+    levels = len(PurePosixPath(wanted).parts)
+    for path in _recognised(data, recognises, levels + _NESTING):
+        parts = PurePosixPath(_usual_spelling(path.relative_to(data).as_posix())).parts
+        # The frames may be in a folder within the one that the pattern names.
+        for name in ("/".join(parts[-levels:]), "/".join(parts[-levels - 1 : -1])):
+            if PurePosixPath(name).match(wanted):
+                found.setdefault(name, path)
+    return found
+
+
+def _usual_spelling(path: str) -> str:
+    """Return a path or pattern in SCARED's own spelling, without folders within their namesakes.
+
+    dataset1/keyframe1, dataset_1/dataset_1/keyframe_1 and dataset_1_keyframe_1 are dataset_1/keyframe_1.
+    """
+    spelled = re.sub(r"(?:test_)?(dataset|keyframe)_?(?=[\d\[])", r"\1_", path).replace("_keyframe_", "/keyframe_")
+    return "/".join(part for part, _ in groupby(spelled.split("/")))
+
+
+def _recognised(folder: Path, recognises: Callable[[Path], bool], depth: int) -> Iterator[Path]:
+    """Yield the folders of a data set's sequences, at most `depth` levels below a folder."""
+    if not (folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)):
+        return
+    for inner in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+        if recognises(inner):
+            yield inner
+        elif depth > 1:
+            yield from _recognised(inner, recognises, depth - 1)
 
 
 def _is_video(path: Path) -> bool:

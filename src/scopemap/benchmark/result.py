@@ -21,19 +21,20 @@ class RunResult:
     Attributes
     ----------
     sequence, method, seed : what was run; names as in the plan.
-    status : "failed" where the method died; `error` is the reason, in one line.
+    status : "failed" where the method died, "missing" where its weights or its trajectory are not on this machine;
+        `error` is the reason, in one line.
     figures : groups of figures by name: "poses" (the keys of `PoseReport`), "paper" (`PaperReport`), "depth",
         "consistency", "surface", and one group per named protocol. A group that could not be measured is absent, a
         figure that could not be measured is NaN (null in the file).
     timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; two runs of the same plan may
         differ here and nowhere else.
-    facts : machine, commit, versions, settings, alignment, quality of the truth.
+    facts : machine, commit, versions, settings, alignment, depth, quality of the truth.
     """
 
     sequence: str
     method: str
     seed: int = 0
-    status: Literal["done", "failed"] = "done"
+    status: Literal["done", "failed", "missing"] = "done"
     error: str = ""
     figures: Figures = field(default_factory=dict)
     timing: dict[str, float] = field(default_factory=dict)
@@ -60,6 +61,15 @@ class RunResult:
             return cls(**json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as error:
             raise InputError(f"cannot read the result of a benchmark run {path}: {error}") from None
+
+
+def read_provenance(run: Path) -> dict[str, Any]:
+    """Return the `provenance.json` of a run's folder; {} where there is none that can be read."""
+    try:
+        found = json.loads((run / "provenance.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def without_nan(tree: Any) -> Any:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from scopemap.benchmark.entry import Entry, entries_of
-from scopemap.benchmark.methods.registry import create_method
+from scopemap.benchmark.methods.method import Method, PipelineMethod, create_method
 from scopemap.benchmark.plan import Plan, found_sequences
 from scopemap.benchmark.result import FILE_NAME, RunResult
 from scopemap.benchmark.scoring import score
@@ -60,23 +60,44 @@ def run_plan(
     are kept, too, unless `retry`. `listener` is called with each row, and whether it was kept. A method that takes
     longer than `timeout_s` is ended and fails.
 
+    What a method needs and this machine does not have is a row of status "missing", looked for again by each call.
+
     Raises `InputError` where no sequence is found or `out` cannot be written.
     """
-    out, data = Path(out).resolve(), None if data is None else Path(data).resolve()
-    sequences, notes = found_sequences(plan, data)
+    out = Path(out).resolve()
+    entries, notes = planned(plan, out, data)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write a benchmark to {out}: {error.strerror or error}") from None
-    entries = list(entries_of(plan, sequences, data, out))
-    _check(plan, entries, data)
     results = []
     for entry in entries:
-        kept = _kept(entry, retry=retry)
-        results.append(kept or _run_in_process(entry, timeout_s))
+        kept = kept_result(entry, retry=retry)
+        results.append(kept or _missing(entry) or _run_in_process(entry, timeout_s))
         if listener:
             listener(entry, results[-1], kept is not None)
     return Benchmark(plan, entries, results, notes + _commits_note(results))
+
+
+def planned(plan: Plan, out: Path, data: Path | None = None) -> tuple[list[Entry], list[str]]:
+    """Return the entries of a plan, and a note for each sequence that is missing.
+
+    Raises `InputError` where no sequence is found, `SettingsError` for unknown methods and for two entries with one
+    folder.
+    """
+    data = None if data is None else Path(data).resolve()
+    sequences, notes = found_sequences(plan, data)
+    for method in plan.method:
+        create_method(method, data)
+    entries = list(entries_of(plan, sequences, data, out))
+    folders = Counter(entry.folder for entry in entries)
+    for entry in entries:
+        if folders[entry.folder] > 1:
+            raise SettingsError(
+                f"the plan '{plan.title}' has two sequences that are called '{entry.label}' (letters and digits "
+                "count): give them names"
+            )
+    return entries, notes
 
 
 def run_entry(entry: Entry) -> RunResult:
@@ -84,8 +105,7 @@ def run_entry(entry: Entry) -> RunResult:
     try:
         entry.render_phantom()
         sequence = entry.open()
-        method = create_method(entry.method, entry.data, entry.sequence.name, entry.seed)
-        timing = method.run(sequence, entry.shared_settings(), entry.run_folder)
+        timing = method_of(entry).run(sequence, entry.shared_settings(), entry.run_folder)
         memory_mb = _peak_memory_mb()
         figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
     except ScopemapError as error:
@@ -117,27 +137,33 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _check(plan: Plan, entries: list[Entry], data: Path | None) -> None:
-    """Raise `SettingsError` before anything runs for unknown methods and for two entries with one folder."""
-    for method in plan.method:
-        create_method(method, data)
-    folders = Counter(entry.folder for entry in entries)
-    for entry in entries:
-        if folders[entry.folder] > 1:
-            raise SettingsError(
-                f"the plan '{plan.title}' has two sequences that are called '{entry.label}' (letters and digits "
-                "count): give them names"
-            )
-
-
-def _kept(entry: Entry, *, retry: bool) -> RunResult | None:
-    """Return the row of an earlier call, if it belongs to this entry."""
+def kept_result(entry: Entry, *, retry: bool = False) -> RunResult | None:
+    """Return the row of an earlier call, if it belongs to this entry; None for a failed one with `retry`."""
     try:
         result = RunResult.load(entry.folder)
     except InputError:  # none, or a damaged one
         return None
     stale = result.facts.get("key") != entry.key or (retry and result.status == "failed")
     return None if stale else result
+
+
+def what_is_missing(entry: Entry) -> str:
+    """Return what an entry needs and this machine does not have, in one line; "" where it can run."""
+    try:
+        return method_of(entry).missing(entry.shared_settings())
+    except ScopemapError:  # the run reports it
+        return ""
+
+
+def _missing(entry: Entry) -> RunResult | None:
+    reason = what_is_missing(entry)
+    facts = _facts(entry)
+    return RunResult(entry.label, entry.method.name, entry.seed, "missing", reason, facts=facts) if reason else None
+
+
+def method_of(entry: Entry) -> Method:
+    """Return the method of an entry."""
+    return create_method(entry.method, entry.data, entry.sequence.name, entry.seed)
 
 
 def _run_in_process(entry: Entry, timeout_s: float | None) -> RunResult:
@@ -176,10 +202,23 @@ def _facts(entry: Entry) -> dict[str, Any]:
     return {
         "key": entry.key,
         "align": entry.sequence.align or entry.protocol.align,
+        "depth": _depth_of(entry),
         "versions": {name: version(name) for name in ("scopemap", "numpy", "torch", "numba")},
         "commit": source_commit(),
         "machine": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores",
     }
+
+
+def _depth_of(entry: Entry) -> str:
+    """Return the depth that an entry's settings name and its anchor; "" for an import."""
+    method = method_of(entry)
+    if not isinstance(method, PipelineMethod):
+        return ""
+    if entry.sequence.depth:
+        return entry.sequence.depth.partition(":")[0]
+    depth = method.config(entry.settings | entry.sequence.settings).depth
+    anchor = "" if depth.anchor in ("auto", depth.backend) else f", anchor {depth.anchor}"
+    return depth.backend.partition(":")[0] + anchor
 
 
 def _quality_of_truth(sequence: Sequence) -> str:

@@ -15,14 +15,14 @@ smaller errors."""
 
 _LONGEST_ERROR = 80
 # Columns of text, and where the runs keep their words: rows compete where the figures were measured alike.
-_WORDS = {"alignment": "poses.align", "flow": "consistency.flow", "scaling": "depth.scaling"}
+_WORDS = {"alignment": "poses.align", "flow": "consistency.flow", "scaling": "depth.scaling", "depth": "facts.depth"}
 
 
 def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
     """Return one row per sequence and method, both in the order in which they first appear.
 
     Figures are medians over the seeds, by "group.name" ("timing.ms_per_frame"), with half their range under the same
-    name and `SPREAD`. Columns of text are "sequence", "method", "runs", "frames tracked", "alignment", "flow",
+    name and `SPREAD`. Columns of text are "sequence", "method", "runs", "frames tracked", "alignment", "depth", "flow",
     "scaling", "failure"; others "done", "competes", "tracked", "frames". A sequence whose name ends with its seed
     ("colon, seed 1"), as a plan's entries are called, is that sequence.
     """
@@ -49,8 +49,7 @@ def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
     for name, column in _WORDS.items():
         words = runs.get(column, pd.Series("", index=runs.index))
         rows[name] = words.groupby(by, sort=False).agg(joined)
-    errors = runs["error"].groupby(by, sort=False).first()
-    rows["failure"] = ["" if done else _failure(error) for done, error in zip(rows["done"], errors, strict=True)]
+    rows["failure"] = runs["error"].groupby(by, sort=False).first().where(rows["done"] == 0, "")
     return rows.reset_index()
 
 
@@ -73,7 +72,8 @@ def _runs(results: Iterable[RunResult]) -> pd.DataFrame:
                 "sequence": result.sequence.removesuffix(f", seed {result.seed}"),
                 "method": result.method,
                 "done": result.status == "done",
-                "error": result.error,
+                "error": _reason(result),
+                "facts": {"depth": result.facts.get("depth", "")},
                 "poses": {"frames": math.nan, "tracked": math.nan},
                 **result.figures,
                 "timing": _with_stages(result),
@@ -98,7 +98,10 @@ def _columns_of(runs: pd.DataFrame, kind: Any) -> list[str]:
     return [name for name in runs if runs[name].map(lambda cell: isinstance(cell, kind)).any()]
 
 
-def _failure(error: str) -> str:
-    reason = " ".join(error.split())
+def _reason(result: RunResult) -> str:
+    """Return why a run has no figures, cut to the width of a cell."""
+    reason = " ".join(result.error.split())
     short = reason if len(reason) <= _LONGEST_ERROR else f"{reason[: _LONGEST_ERROR - 1]}…"
+    if result.status == "missing":
+        return short
     return f"failed: {short}" if short else "failed"

@@ -52,12 +52,13 @@ _PUBLISHED_COLUMNS = {
 def benchmark_tables(results: Iterable[RunResult], *, paper_units: bool = False) -> tuple[Table, ...]:
     """Return all tables that the results have figures for, the overview first and the times last.
 
-    Rows stand in the order in which sequences and methods first appear. A method that died is a row with "failed", in
-    the overview with the reason. `paper_units`: angles of tables 1 to 3 in radians instead of degrees.
+    Rows stand in the order in which sequences and methods first appear. A method without figures is a row with
+    "failed", "needs weights" or "not supplied", in the overview with the reason. `paper_units`: angles of tables 1 to 3
+    in radians instead of degrees.
     """
     results = tuple(results)
     rows = summarise(results)
-    short = rows.assign(failure=rows["failure"].where(rows["failure"] == "", "failed"))
+    short = rows.assign(failure=rows["failure"].str.partition(":")[0])
     groups = list(dict.fromkeys(group for result in results for group in result.figures))
     return (
         read_table("overview", rows),
@@ -103,7 +104,7 @@ def read_table(name: str, rows: pd.DataFrame, *, paper_units: bool = False) -> T
     tree = tomllib.loads(file.read_text(encoding="utf-8"))
     phrases = tree["phrases"] | {"angles": tree["phrases"]["radians" if paper_units else "degrees"]}
     table = tree[name]
-    kept = tuple(text for text in table["texts"] if name.startswith("table") or (rows[text] != "").any())
+    kept = tuple(text for text in table["texts"] if (rows[text] != "").any())
     figures = tuple(_figure(figure, paper_units) for figure in table["figures"])
     caption = table["caption"].format(**phrases)
     return Table(name, table["title"], caption, kept, figures, rows, tuple(table["compete_within"]))
@@ -134,7 +135,14 @@ def published_rows(table: PublishedTable) -> pd.DataFrame:
     """Return the rows of one of the paper's tables, in its order, with the columns of `summarise`: mm and rad."""
     with (resources.files("scopemap.benchmark") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
         rows = pd.read_csv(file).rename(columns=_PUBLISHED_COLUMNS)
-    texts = {"frames tracked": "", "sequences": "", "alignment": "not stated", "failure": "", "source": "published"}
+    texts = {
+        "depth": "",
+        "frames tracked": "",
+        "sequences": "",
+        "alignment": "not stated",
+        "failure": "",
+        "source": "published",
+    }
     return rows.assign(competes=False, **texts)
 
 
@@ -151,8 +159,8 @@ def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
         .assign(
             **{"frames tracked": of_frames(done[["tracked", "frames"]].sum().reindex(methods))},
             sequences=[f"{count} of {sequences}" for count in finished],
-            alignment=done["alignment"].agg(joined).reindex(methods, fill_value=""),
-            failure=["" if count else "failed" for count in finished],
+            **{name: rows.groupby("method")[name].agg(joined).reindex(methods) for name in ("alignment", "depth")},
+            failure=rows.groupby("method")["failure"].first().reindex(methods).where(finished == 0, ""),
             competes=whole & (scored == finished),
         )
         .reset_index()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+from scopemap.benchmark.result import read_provenance
 from scopemap.config import Config, InputSettings
 from scopemap.errors import CalibrationError, InputError, SettingsError
 from scopemap.io.opening import open_sequence, open_source
@@ -51,9 +51,9 @@ def is_camera_of(run: Path, sequence: Sequence) -> bool:
 def _camera_of(run: Path) -> dict[str, float] | None:
     """Return the working camera of a run, whose size its depth maps have; None where it is unknown."""
     try:
-        camera = json.loads((run / "provenance.json").read_text(encoding="utf-8"))["camera"]
+        camera = read_provenance(run)["camera"]
         return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 

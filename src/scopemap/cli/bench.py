@@ -27,6 +27,10 @@ def bench(
         Path | None, typer.Option(help="Folder for runs, tables and figures; continues an earlier call.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the plan's paths.")] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Only print sequences, rows, weights that are missing, and the hours expected."),
+    ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
     timeout_s: Annotated[
         float | None, typer.Option("--timeout", min=1, help="Seconds after which a run is ended.")
@@ -40,6 +44,12 @@ def bench(
 
     if plan is None:
         _list_plans()
+        return
+    if dry_run:
+        from scopemap.benchmark.preview import describe
+
+        for line in describe(read_plan(plan), out or Path("."), data):
+            typer.echo(line)
         return
     if out is None:
         raise typer.BadParameter("needed with a plan: the folder for runs, tables and figures", param_hint="--out")
@@ -76,8 +86,8 @@ def _list_plans() -> None:
 def _line(result: RunResult, known: bool) -> str:
     start = f"{result.sequence}: {result.method}: "
     again = " (kept)" if known else ""
-    if result.status == "failed":
-        return f"{start}failed, {result.error}{again}"
+    if result.status != "done":
+        return f"{start}{'failed, ' if result.status == 'failed' else ''}{result.error}{again}"
     poses, timing = result.figures.get("poses", {}), result.timing
     scored = f"ATE {poses['ate_rmse_mm']:.3f} mm, " if poses.get("ate_rmse_mm") is not None else ""
     pace = timing.get("ms_per_frame")

@@ -101,11 +101,11 @@ def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Pa
     figure.savefig(file)
 
 
-def draw_matched_points(points_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path) -> None:
+def draw_matched_points(points_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
     """Draw matched points of two consecutive frames in space, mm, one panel per method: the closer, the better.
 
-    Each method gives the ends in the previous and in the current frame, (N, 3) each, in one world; of more than 400
-    matches every k-th is drawn.
+    Each method gives the ends in the previous and in the current frame, (N, 3) each, in one world, which `where` names;
+    of more than 400 matches every k-th is drawn.
     """
     across, down = _grid_size(len(points_mm))
     figure = new_figure(4.2 * across, 4.2 * down)
@@ -120,6 +120,7 @@ def draw_matched_points(points_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], 
         mean = f"mean {distances.mean():.2f} mm" if len(distances) else "no match"
         axes.set_title(f"{_short(name)}\n{len(distances)} matches, {mean}", fontsize=10)
     figure.axes[0].legend(loc="upper left", fontsize=8)
+    figure.suptitle(where, fontsize=10, y=0.995)
     figure.savefig(file)
 
 

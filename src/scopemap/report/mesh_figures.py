@@ -107,8 +107,25 @@ def draw_reconstruction(
     figure = _picture_grid([{title: _cropped(picture) for title, picture in pictures.items()}], 4.6, 5.2)
     for name, (colour, _) in reversed(paths.items()):
         figure.axes[0].plot([], [], color=colour, linewidth=widths_px[name], label=name)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title="dot: start")
+    title = "dot: start" if reference_positions_mm is not None else "dot: start; no true poses are known"
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title=title)
     figure.savefig(file)
+
+
+def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
+    """Draw the point clouds of two frames on each other as a PNG, one panel per method, from in front and aside.
+
+    Each method gives points (N, 3), mm, in a camera of the clouds, and their colours (N, 3) uint8; `where` names the
+    poses that registered them.
+    """
+    rows: list[dict[str, np.ndarray]] = [{}, {}]
+    for method, (points, colours) in clouds.items():
+        centre = np.median(points, axis=0)
+        radius = float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
+        for row, yaw_rad in zip(rows, (0.0, 0.8), strict=True):
+            view = _view_of(np.eye(3), centre, radius, yaw_rad, 0.0)
+            row[f"{method}\n{where}"] = _cropped(render_points(points, colours, view))
+    _picture_grid(rows, 3.6, 4.0).savefig(file)
 
 
 def _picture_grid(rows: Sequence[Mapping[str, np.ndarray]], width_in: float, height_in: float) -> Figure:
@@ -164,13 +181,28 @@ def outside_views(
     shown = np.concatenate(points)
     low, high = (shown.min(axis=0), shown.max(axis=0)) if len(shown) else (np.zeros(3), np.ones(3))
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    # From 4 radii away the sphere around the mesh fills a field of view of 2 asin(1/4).
-    angle_rad = 2.1 * float(np.arcsin(0.25))
-    views = {}
-    for name, yaw_rad in (("from outside", -1.0), ("from the other side", 2.1)):
-        R_view = R @ so3_exp(np.array([0.0, yaw_rad, 0.0])) @ so3_exp(np.array([-0.45, 0.0, 0.0]))
-        views[name] = inside_view(se3(R_view, centre - 4.0 * radius * R_view[:, 2]), angle_rad)
-    return views
+    sides = {"from outside": -1.0, "from the other side": 2.1}
+    return {name: _view_of(R, centre, radius, yaw_rad, -0.45) for name, yaw_rad in sides.items()}
+
+
+def _view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: float, pitch_rad: float) -> MeshView:
+    """Return a view of a whole ball, turned from the orientation R (3, 3)."""
+    R_view = R @ so3_exp(np.array([0.0, yaw_rad, 0.0])) @ so3_exp(np.array([pitch_rad, 0.0, 0.0]))
+    # From 4 radii away the ball fills a field of view of 2 asin(1/4).
+    return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
+
+
+def render_points(points_mm: np.ndarray, colours: np.ndarray, view: MeshView) -> np.ndarray:
+    """Return the (H, W, 3) uint8 picture of points (N, 3), world mm, in their colours (N, 3), 2 px wide, on white."""
+    camera = view.camera
+    picture = np.full((camera.height, camera.width, 3), 255, np.uint8)
+    points, pixels = view.project(points_mm)
+    order = np.argsort(-points[:, 2], kind="stable")
+    # From far to near: of the points in a pixel the last one stays.
+    u, v = (np.rint(pixels[order])[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(-1, 2).astype(int).T
+    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & np.repeat(points[order, 2] > 0, 4)
+    picture[v[shown], u[shown]] = np.repeat(colours[order], 4, axis=0)[shown]
+    return picture
 
 
 def render_mesh(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scopemap.benchmark.plan import MethodPlan
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError
 from scopemap.evaluation.poses import associate
 from scopemap.io.sequence import Sequence
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -25,9 +25,11 @@ class ImportedTrajectory:
     """
 
     def __init__(self, plan: MethodPlan, data: Path | None, name: str, seed: int) -> None:
-        if data is None:
-            raise SettingsError(f"method '{plan.name}': give --data, the folder of the imported trajectories")
-        self._plan, self._file = plan, data / plan.files.format(sequence=name, seed=seed)
+        self._plan, self._file = plan, (data or Path("DATA")) / plan.files.format(sequence=name, seed=seed)
+
+    def missing(self, settings: Mapping[str, Any]) -> str:
+        """Return the file that is not there."""
+        return "" if self._file.exists() else f"not supplied: {self._file}"
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Write the trajectory as a run's folder; its time is unknown."""

@@ -1,22 +1,51 @@
-"""What every method of a benchmark has in common, and the methods that are a run of our pipeline."""
+"""The methods of a benchmark by the name that a plan's `use` gives, and those that are a run of our pipeline."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from scopemap.config import Config, Preset
+from scopemap.benchmark.methods.endo_depth_and_motion import create_endo_depth_and_motion
+from scopemap.benchmark.methods.imported import ImportedTrajectory
+from scopemap.benchmark.methods.open3d_odometry import Open3dTracker
+from scopemap.benchmark.methods.standing_still import StandingStill
+from scopemap.benchmark.plan import MethodPlan
+from scopemap.config import Config
+from scopemap.errors import SettingsError
+from scopemap.estimators import missing_weights
 from scopemap.io.sequence import Sequence
 from scopemap.pipeline import Step
 from scopemap.runner import reconstruct
 from scopemap.tracking.track import FrameTracker
 
+# Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
+PLAIN = {
+    "mapis.advanced.frame_scale": "none",
+    "mapis.paper.blend": "none",
+    "smoothing.method": "none",
+    "mapping.method": "none",
+}
+
+BASELINES: dict[str, Callable[[], FrameTracker]] = {
+    "endo-depth-and-motion": create_endo_depth_and_motion,
+    "steinbruecker": partial(Open3dTracker, "steinbruecker"),
+    "park": partial(Open3dTracker, "park"),
+    "point-to-point": partial(Open3dTracker, "point-to-point"),
+    "point-to-plane": partial(Open3dTracker, "point-to-plane"),
+    "standing-still": StandingStill,
+}
+"""Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
+
 
 class Method(Protocol):
     """Turns a sequence into a run's folder, which the same code then scores for all methods."""
+
+    def missing(self, settings: Mapping[str, Any]) -> str:
+        """Return what the method needs and this machine does not have, in one line; "" where it can run."""
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Write at least trajectory.tum, frames.csv and provenance.json to `out` and return the times.
@@ -30,31 +59,32 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class PipelineMethod:
-    """A run of the pipeline. A baseline replaces the tracker; frames, masks and raw depth are the same for all.
+    """A run of the pipeline as `scopemap run` does it; a baseline replaces the tracker and gets plain depth."""
 
-    Attributes
-    ----------
-    preset, settings : what the method changes of the defaults. The shared settings stand between the two, so that a
-        preset cannot replace the depth that all methods share.
-    create_tracker : makes the tracker of a baseline; None: the program's own, exactly as `scopemap run` runs it.
-    """
+    plan: MethodPlan
 
-    preset: Preset | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    create_tracker: Callable[[], FrameTracker] | None = None
+    def config(self, settings: Mapping[str, Any]) -> Config:
+        """Return the preset, then the shared `settings` (it cannot replace a depth that they name), then its own."""
+        plain = {} if self.plan.use == "scopemap" else PLAIN
+        return Config.load(self.plan.preset, settings={**settings, **plain, **self.plan.settings})
+
+    def missing(self, settings: Mapping[str, Any]) -> str:
+        """Return the weights that are not on this machine."""
+        names = missing_weights(self.config(settings))
+        return f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Reconstruct into `out`; raises what the pipeline raises.
 
         Times are those of the run's own clock: "tracking" is tracking, depth refinement and the choice of keyframes.
         """
-        config = Config.load(self.preset, settings=dict(settings) | dict(self.settings))
-        tracker = self.create_tracker() if self.create_tracker is not None else None
+        tracker = None if self.plan.use == "scopemap" else BASELINES[self.plan.use]()
         finished: list[float] = []
 
         def note(step: Step) -> None:
             finished.append(time.perf_counter())
 
+        config = self.config(settings)
         result = reconstruct(sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
         frames, seconds = len(result.records), result.provenance["seconds"]
         # Work after the last frame counts for all frames.
@@ -64,3 +94,15 @@ class PipelineMethod:
             "track_ms_per_frame": 1e3 * seconds["track and fuse"] / frames,
             **{f"seconds_{stage.replace(' ', '_')}": value for stage, value in seconds.items()},
         }
+
+
+def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed: int = 0) -> Method:
+    """Return the method of a plan; raises `SettingsError` for an unknown one.
+
+    data : folder of imported trajectories. sequence, seed : which of them, by the name of the sequence.
+    """
+    if plan.use == "import":
+        return ImportedTrajectory(plan, data, sequence, seed)
+    if plan.use != "scopemap" and plan.use not in BASELINES:
+        raise SettingsError(f"unknown method '{plan.use}': choose one of scopemap, import, {', '.join(BASELINES)}")
+    return PipelineMethod(plan)

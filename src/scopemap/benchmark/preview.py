@@ -1,0 +1,86 @@
+"""Describes a plan before it is run: its sequences and rows, what is missing, and the hours that the rest takes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+from scopemap.benchmark.entry import Entry
+from scopemap.benchmark.methods.method import PipelineMethod
+from scopemap.benchmark.plan import Plan, spec_of
+from scopemap.benchmark.runner import kept_result, method_of, planned, what_is_missing
+from scopemap.config import Config
+from scopemap.errors import ScopemapError
+from scopemap.estimators import missing_weights
+from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+from scopemap.io import weights
+
+# Seconds per frame at 400x320 px on two CPU cores, measured with networks of full size; start-up is a run's.
+_FLOW_S = {"dis": 0.03, "raft-small": 1.0, "raft-large": 12.0}
+_DEPTH_S = {"scopenet": 0.1, "depth-anything": 1.0, "depth-pro": 60.0}
+_PERCEPTUAL_S = {"lpips": 0.15, "auto": 0.15, "structure": 0.02}
+_TRACKING_S = 0.35
+_SCORING_S = 0.1
+_START_S = 20.0
+
+
+def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
+    """Yield the lines that `scopemap bench PLAN --dry-run` prints; raises as `run_plan`, but writes nothing."""
+    entries, notes = planned(plan, out, data)
+    lengths = {entry.label: _frames(entry) for entry in entries}
+    rows: defaultdict[str, list[str]] = defaultdict(list)
+    hours: defaultdict[str, float] = defaultdict(float)
+    lacking: set[str] = set()
+    done = 0
+    for entry in entries:
+        if kept_result(entry) is not None:
+            done += 1
+        elif reason := what_is_missing(entry):
+            rows[entry.method.name].append(reason)
+            lacking |= set(missing_weights(config)) if (config := _config(entry)) else set()
+        else:
+            hours[entry.method.name] += _seconds(entry, lengths[entry.label]) / 3600
+    yield f"{plan.title}: {len(lengths)} sequences, {sum(lengths.values())} frames, {len(plan.method)} methods"
+    yield from (f"  {label}: {count} frames" for label, count in lengths.items())
+    yield from (f"note: {note}" for note in notes)
+    for method in dict.fromkeys(entry.method.name for entry in entries):
+        reasons = dict.fromkeys(rows[method])
+        expected = [f"{hours[method]:.1f} h"] if method in hours else []
+        yield f"  {method}: {'; '.join([*expected, *reasons]) or 'done'}"
+    yield f"weights that are missing: {', '.join(sorted(lacking)) or 'none'}"
+    waiting = sum(map(len, rows.values()))
+    yield (
+        f"{len(entries)} runs: {done} done, {waiting} missing, {len(entries) - done - waiting} to run in about "
+        f"{sum(hours.values()):.1f} h on two CPU cores; networks take less on a GPU"
+    )
+
+
+def _frames(entry: Entry) -> int:
+    """Return the number of frames of an entry's sequence; 0 where its file does not state it."""
+    if entry.sequence.phantom is not None:
+        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0
+    try:
+        return entry.open().count or 0
+    except ScopemapError:  # the run reports it
+        return 0
+
+
+def _config(entry: Entry) -> Config | None:
+    """Return the settings of an entry's run; None for an imported trajectory."""
+    method = method_of(entry)
+    return method.config(entry.shared_settings()) if isinstance(method, PipelineMethod) else None
+
+
+def _seconds(entry: Entry, frames: int) -> float:
+    """Return the time that an entry takes, from its networks."""
+    config = _config(entry)
+    if config is None:
+        return 0.0
+    needed = {config.networks.flow, config.networks.keyframe_flow}
+    if "auto" in needed:
+        needed.add("raft-small" if weights.is_present(*RAFT_CHECKPOINTS["small"]) else "dis")
+    per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
+    per_frame += sum(_FLOW_S.get(name, 0.0) for name in needed) + _PERCEPTUAL_S[config.networks.perceptual]
+    once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
+    return once + frames * per_frame

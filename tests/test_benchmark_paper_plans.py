@@ -1,0 +1,163 @@
+"""The plans of the paper's data sets on drawn copies, from the first row to the last figure, with small networks."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drawn_benchmarks import as_hamlyn, as_scared, as_scared_c, seen
+from front_door import call
+from small_networks import use_weights, write_weights
+from tiny_phantom import write_tiny
+
+from scopemap.benchmark import runner
+from scopemap.benchmark.entry import Entry
+from scopemap.benchmark.figures import FinishedRun, write_results
+from scopemap.benchmark.plan import Plan, found_sequences, read_plan
+from scopemap.benchmark.result import RunResult
+from scopemap.benchmark.runner import run_entry, run_plan
+from scopemap.benchmark.tables import published_rows
+
+OURS = ("scopemap", "scopemap, paper's depth", "paper's preset", "MDE (per-frame Depth Pro)")
+BASELINES = ("EDAM", "Park", "SB", "Po2Pl", "Po2Po")
+IMPORTED = ("Endo-2DTAM", "OneSLAM", "BodySLAM")
+PAPERS_DEPTH = "depth-anything, anchor depth-pro"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """SCARED, SCARED-C and Hamlyn in the spellings in use, a clip of C3VD, OneSLAM's poses of one keyframe, weights."""
+    root = tmp_path_factory.mktemp("data")
+    frames = seen(write_tiny(root / "c3vd" / "cecum_t1_a_under_review", frames=4))
+    as_scared(frames, root / "scared" / "dataset_1" / "keyframe_1")
+    as_scared(frames, root / "scared" / "dataset_2" / "dataset_2" / "keyframe_3")
+    as_scared(frames, root / "train" / "dataset3" / "keyframe4")
+    as_scared_c(frames, root / "scared-c" / "dataset1" / "keyframe2")
+    as_hamlyn(frames, root / "hamlyn", "rectified01", "calibration/rectified01")
+    as_hamlyn(frames, root / "hamlyn", "rectified14/rectified14", "calibration/rectified14")
+    supplied = root / "scared" / "trajectories" / "oneslam" / "dataset_1" / "keyframe_1" / "poses_pred.txt"
+    supplied.parent.mkdir(parents=True)
+    lines = [f"{n} {' '.join(map(str, truth.T_world_camera[:3, 3]))} 0 0 0 1" for n, (_, truth) in enumerate(frames)]
+    supplied.write_text("\n".join(lines))
+    write_weights(root / "weights")
+    return root
+
+
+def in_this_process(entry: Entry, timeout_s: float | None) -> RunResult:
+    """What a worker does: saves one import of the networks per row."""
+    entry.save()
+    return run_entry(entry)
+
+
+def run(plan: Plan, data: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[RunResult], set[str]]:
+    """Run a plan as `scopemap bench` does and return its rows and the names of its figures."""
+    monkeypatch.setattr(runner, "_run_in_process", in_this_process)
+    benchmark = run_plan(plan, out, data=data)
+    pairs = zip(benchmark.entries, benchmark.results, strict=True)
+    runs = [FinishedRun(result, entry.run_folder, entry.open) for entry, result in pairs]
+    files = write_results(runs, out, title=plan.title, notes=benchmark.notes)
+    return benchmark.results, {file.name for file in files if file.suffix == ".png"}
+
+
+@pytest.mark.parametrize(
+    ("plan", "folder", "sequences"),
+    [
+        ("scared", "scared", ["dataset_1/keyframe_1", "dataset_2/keyframe_3"]),
+        ("scared", ".", ["dataset_1/keyframe_1", "dataset_2/keyframe_3", "dataset_3/keyframe_4"]),
+        ("scared-c", "scared-c", ["dataset_1/keyframe_2"]),
+        ("hamlyn", "hamlyn", ["rectified01", "rectified14"]),
+        ("c3vd-mono", "c3vd", ["cecum_t1_a_under_review"]),
+    ],
+)
+def test_every_spelling_is_found(plan: str, folder: str, sequences: list[str], data: Path) -> None:
+    found, _ = found_sequences(read_plan(plan), data / folder)
+    assert [sequence.name for sequence in found] == sequences
+    assert all((data / folder / sequence.path).is_dir() for sequence in found)
+
+
+def test_scared_runs_to_the_last_row_and_figure(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_weights(data / "weights", monkeypatch)
+    rows, figures = run(read_plan("scared"), data / "scared", tmp_path, monkeypatch)
+    first = {row.method: row for row in rows if row.sequence == "dataset_1/keyframe_1"}
+    assert set(first) == {*OURS, *BASELINES, *(f"{name}, paper's depth" for name in BASELINES), *IMPORTED} | {
+        "standing still"
+    }
+    assert {name for name, row in first.items() if row.status != "done"} == {"Endo-2DTAM", "BodySLAM"}
+    assert first["BodySLAM"].error.startswith("not supplied: ")
+    assert {row.method for row in rows if row.status == "missing"} == set(IMPORTED)
+    depths = {name: row.facts["depth"] for name, row in first.items() if row.status == "done"}
+    expected = dict.fromkeys(depths, "scopenet") | {"MDE (per-frame Depth Pro)": "depth-pro", "OneSLAM": ""}
+    expected |= {name: PAPERS_DEPTH for name in depths if name.startswith("paper's") or name.endswith("paper's depth")}
+    assert depths == expected
+    names = {"orb_pairs", "orb_points", "depth_change", "clouds", "mesh"}
+    drawn = {name.partition("_dataset")[0] for name in figures}
+    assert drawn == {"ate.png", "frames_until_loss.png", "orb_bars.png"} | names
+    table = list(csv.DictReader((tmp_path / "tables" / "table2.csv").open()))
+    assert [row["framework"] for row in table if row["source"] == "measured"] == list(first)
+    assert {row["depth"] for row in table if row["framework"] == "paper's preset"} == {PAPERS_DEPTH}
+
+
+def test_ablations_and_scared_c_run_to_the_last_row(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_weights(data / "weights", monkeypatch)
+    ablations = read_plan("scared-ablations")
+    faster = ablations.model_copy(update={"settings": ablations.settings | {"networks.flow": "dis"}})
+    rows, _ = run(faster, data / "train", tmp_path / "ablations", monkeypatch)
+    assert {(row.status, row.error) for row in rows} == {("done", "")}
+    assert len(list(csv.DictReader((tmp_path / "ablations" / "tables" / "table3.csv").open()))) == len(rows) + len(
+        published_rows("table3_ablation_scared")
+    )
+    plan = read_plan("scared-c")
+    few = plan.model_copy(update={"method": tuple(m for m in plan.method if m.name in OURS[:2])})
+    rows, _ = run(few, data / "scared-c", tmp_path / "c", monkeypatch)
+    assert [row.status for row in rows] == ["done", "done"]
+
+
+def test_hamlyn_is_drawn_by_the_estimated_poses(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_weights(data / "weights", monkeypatch)
+    rows, figures = run(read_plan("hamlyn"), data / "hamlyn", tmp_path, monkeypatch)
+    assert {row.method for row in rows if row.status != "done"} == set(IMPORTED)
+    assert all(row.figure("poses", "frames_until_loss") > 0 for row in rows if row.status == "done")
+    for sequence in ("rectified01", "rectified14"):
+        shown = {name.removesuffix(".png").partition(f"_{sequence}")[0] for name in figures if sequence in name}
+        assert shown == {"orb_pairs", "orb_points", "depth_change", "clouds", "mesh"}
+    assert {"frames_until_loss.png", "orb_bars.png"} <= figures
+    assert "ate.png" not in figures
+
+
+def test_a_dry_run_lists_rows_missing_weights_and_hours(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[:3] == [
+        "SCARED: 2 sequences, 8 frames, 18 methods",
+        "  dataset_1/keyframe_1: 4 frames",
+        "  dataset_2/keyframe_3: 4 frames",
+    ]
+    rows = dict(line.strip().split(": ", 1) for line in lines[3:] if line.startswith("  "))
+    assert set(rows) == {method.name for method in read_plan("scared").method}
+    assert rows["scopemap"].endswith(" h")
+    assert rows["MDE (per-frame Depth Pro)"] == "needs weights: depth-pro (scopemap models pull NAME)"
+    assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large, alexnet (")
+    assert rows["OneSLAM"].count(" h; not supplied: ") == 1
+    assert "weights that are missing: alexnet, depth-anything, depth-pro, raft-large" in lines
+    assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about 0.")
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_weights_a_row_names_them_and_the_plan_goes_on(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path / "none"))
+    plan = read_plan("scared")
+    few = plan.model_copy(update={"method": tuple(m for m in plan.method if m.name in (*OURS, "standing still"))})
+    rows, _ = run(few, data / "scared", tmp_path, monkeypatch)
+    status: dict[str, Any] = {row.method: row.status for row in rows}
+    assert status == dict.fromkeys(OURS, "missing") | {"scopemap": "done", "standing still": "done"}
+    text = (tmp_path / "tables" / "overview.csv").read_text()
+    assert "needs weights: depth-pro" in text
