@@ -41,21 +41,17 @@ class ImportedTrajectory:
         if not any(submap.tracked.any() for submap in submaps):
             raise InputError(f"{file}: none of its {len(read)} poses belongs to a frame of {sequence.path}")
         for number, submap in enumerate(submaps):
-            _write(out / f"maps/{number}" if number else out, submap, [f[2] for f in frames])
+            folder = out / f"maps/{number}" if number else out
+            folder.mkdir(parents=True, exist_ok=True)
+            write_tum(folder / "trajectory.tum", submap)
+            with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as table:
+                writer = csv.writer(table)
+                writer.writerow(["index", "time_s", "name", "status"])
+                for (index, time_s, name), status in zip(frames, submap.status.tolist(), strict=True):
+                    writer.writerow([index, f"{time_s:.6f}", name, status])
         facts = {"input": str(sequence.path), "imported": str(file), "convention": read.source}
         (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         return {}
-
-
-def _write(folder: Path, poses: Trajectory, names: list[str]) -> None:
-    """Write the files of a run's folder that hold its poses."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tum(folder / "trajectory.tum", poses)
-    with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as table:
-        writer = csv.writer(table)
-        writer.writerow(["index", "time_s", "name", "status"])
-        for index, time_s, name, status in zip(poses.indices, poses.times_s, names, poses.status, strict=True):
-            writer.writerow([index, f"{time_s:.6f}", name, status])
 
 
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:
