@@ -187,13 +187,15 @@ def row(run: Run, out: Path | None) -> str:
 
         moved = result.mesh.copy()
         moved.vertices = matched.similarity.transform_points(moved.vertices)
-        surface = f"{compare_surfaces(moved, trimesh.load_mesh(mesh_file)).accuracy.mean_mm:.2f}"
-    rotation = f"{report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f}"
-    ten = "" if report.rpe_10_mm != report.rpe_10_mm else f"{report.rpe_10_mm:.3f} / {report.rpe_10_deg:.3f}"
-    tracked = f"{report.tracked} of {report.frames}"
+        surface = f"{compare_surfaces(moved, trimesh.load_mesh(mesh_file))['accuracy_mean_mm']:.2f}"
+    rotation = f"{report['rotation_unaligned_mean_deg']:.2f} / {report['rotation_unaligned_max_deg']:.2f}"
+    ten = ""
+    if report["rpe_10_mm"] == report["rpe_10_mm"]:
+        ten = f"{report['rpe_10_mm']:.3f} / {report['rpe_10_deg']:.3f}"
+    tracked = f"{report['tracked']} of {report['frames']}"
     return (
-        f"| {run.name} | {tracked} | {run.align} | {report.ate_rmse_mm:.3f} | {rotation} | {ten} "
-        f"| {report.tlr:.3f} | {surface} | {ms:.0f} |"
+        f"| {run.name} | {tracked} | {run.align} | {report['ate_rmse_mm']:.3f} | {rotation} | {ten} "
+        f"| {report['tlr']:.3f} | {surface} | {ms:.0f} |"
     )
 
 

@@ -157,7 +157,7 @@ def score_sequence(
     jitter = scale_jitter(np.array([score.scale for score in scores]))
     one, both, medians = _fits(frames, truths_mm, made)
     sparse, oracle = (tuple(map(float, row)) for row in mean)
-    return SequenceScore(mean_score(scores), tuple(scores), jitter.log_std, one, both, medians, sparse, oracle)
+    return SequenceScore(mean_score(scores), tuple(scores), jitter["log_std"], one, both, medians, sparse, oracle)
 
 
 def score_frame(rgb: np.ndarray, truth_mm: np.ndarray, prediction: Prediction) -> tuple[FrameScore, np.ndarray]:
@@ -165,7 +165,7 @@ def score_frame(rgb: np.ndarray, truth_mm: np.ndarray, prediction: Prediction) -
     scaled = evaluate_depth(prediction.depth_mm, truth_mm, scaling="median")
     metric = evaluate_depth(prediction.depth_mm, truth_mm)
     known = np.isfinite(truth_mm) & (prediction.depth_mm > 0)
-    ratio = scaled.scale * prediction.depth_mm[known].astype(np.float64) / truth_mm[known]
+    ratio = scaled["scale"] * prediction.depth_mm[known].astype(np.float64) / truth_mm[known]
     error = np.abs(ratio - 1)
     bright = rgb[known].max(-1) >= _SATURATED_LEVEL
     edge = beside_steps(truth_mm)[known]
@@ -174,7 +174,7 @@ def score_frame(rgb: np.ndarray, truth_mm: np.ndarray, prediction: Prediction) -
     if prediction.sigma_mm is not None:
         relative = (prediction.sigma_mm / prediction.depth_mm)[known].astype(np.float64)
         unsure, curves = _uncertainty(ratio, relative)
-    return FrameScore(scaled.abs_rel, scaled.delta_1, metric.abs_rel, scaled.scale, *where, *unsure), curves
+    return FrameScore(scaled["abs_rel"], scaled["delta_1"], metric["abs_rel"], scaled["scale"], *where, *unsure), curves
 
 
 def _uncertainty(ratio: np.ndarray, relative_sigma: np.ndarray) -> tuple[tuple[float, ...], np.ndarray]:
@@ -258,8 +258,8 @@ def _fits(frames: Sequence[Frame], truths_mm: Sequence[np.ndarray], made: Sequen
             evaluate_depth(scale * d**exponent / n, g, scaling="median" if medians else "none")
             for d, g, n in zip(distances, truths_mm, along, strict=True)
         ]
-        kept = [report for report in reports if report.pixels]
-        return Fit(scale, exponent, _mean([r.abs_rel for r in kept]), _mean([r.delta_1 for r in kept]))
+        kept = [report for report in reports if report["pixels"]]
+        return Fit(scale, exponent, _mean([r["abs_rel"] for r in kept]), _mean([r["delta_1"] for r in kept]))
 
     predicted, true = np.exp(np.concatenate(x)), np.exp(np.concatenate(y))
     # A scale that differs from frame to frame must not be taken for an exponent: each frame about its own median.
@@ -299,7 +299,7 @@ def steadiness(
             scales.append(depth_scale(before_mm, current_mm))
         previous_mm = current_mm
     report = meter.report()
-    log_std = scale_jitter(np.array(scales)).log_std
+    log_std = scale_jitter(np.array(scales))["log_std"]
     flow = report["along_flow"]
     return Steadiness(report["pairs"], log_std, flow["relative"], flow["rtc"], report["opw"]["relative"])
 

@@ -49,7 +49,7 @@ def without(trajectory: Trajectory, frames: list[int]) -> Trajectory:
 
 def ate_mm(result: Reconstruction, source: Path) -> float:
     """Error of the frames that are clear in both runs, aligned by a similarity."""
-    return pose_report(match(without(result.trajectory, BAD), read_trajectory(source), "sim3")).ate_rmse_mm
+    return pose_report(match(without(result.trajectory, BAD), read_trajectory(source), "sim3"))["ate_rmse_mm"]
 
 
 def veiled(folder: Path) -> list[str]:
@@ -91,8 +91,8 @@ def loop(folder: Path) -> list[str]:
             closed = told.split(" loops closed")[0].split()[-1]
             rows.append(
                 f"| {scene}, {name} | {closed} | {np.linalg.norm(off[:3, 3]):.2f} / "
-                f"{np.degrees(rotation_angle_rad(off[:3, :3])):.2f} | {report.ate_rmse_mm:.3f} "
-                f"| {report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f} |"
+                f"{np.degrees(rotation_angle_rad(off[:3, :3])):.2f} | {report['ate_rmse_mm']:.3f} "
+                f"| {report['rotation_unaligned_mean_deg']:.2f} / {report['rotation_unaligned_max_deg']:.2f} |"
             )
     return rows
 
@@ -116,8 +116,8 @@ def cut(folder: Path) -> list[str]:
             scales = [match(part, truth, "sim3").similarity.scale if part.tracked.any() else np.nan for part in parts]
             rows.append(
                 f"| {scene}, {name} | {len(set(tracked))} | {len(tracked)} of {len(result.records)} "
-                f"| {report.ate_rmse_mm:.3f} "
-                f"| {report.rotation_unaligned_mean_deg:.2f} / {report.rotation_unaligned_max_deg:.2f} "
+                f"| {report['ate_rmse_mm']:.3f} "
+                f"| {report['rotation_unaligned_mean_deg']:.2f} / {report['rotation_unaligned_max_deg']:.2f} "
                 f"| {scales[0] / scales[1]:.2f} |".replace("nan", "")
             )
     return rows

@@ -68,8 +68,8 @@ def main() -> None:
     for name in sorted(set(BASELINES) - {"standing-still"}):
         trajectory, ms = tracked(clip, options.frames, BASELINES[name]())
         report = pose_report(match(trajectory, read_trajectory(clip), "sim3"))
-        rotation = f"{report.rotation_unaligned_mean_deg:.1f} / {report.rotation_unaligned_max_deg:.1f}"
-        print(f"| {name} | {report.ate_rmse_mm:.2f} | {report.tlr:.2f} | {rotation} | {ms:.0f} |", flush=True)
+        rotation = f"{report['rotation_unaligned_mean_deg']:.1f} / {report['rotation_unaligned_max_deg']:.1f}"
+        print(f"| {name} | {report['ate_rmse_mm']:.2f} | {report['tlr']:.2f} | {rotation} | {ms:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ def aligned(result: Reconstruction, source: Path) -> tuple[float, trimesh.Trimes
     matched = match(result.trajectory, read_reference(source), "sim3")
     mesh = result.mesh.copy()
     mesh.vertices = matched.similarity.transform_points(mesh.vertices)
-    return pose_report(matched).ate_rmse_mm, mesh
+    return pose_report(matched)["ate_rmse_mm"], mesh
 
 
 def phantom_rows(folder: Path, data: Path, settings: dict[str, Any]) -> Iterator[str]:

@@ -23,8 +23,8 @@ def main(run: Path, truth: Path) -> None:
     for align in ("origin", "se3", "sim3"):
         report = evaluate_poses(estimate, reference, align)
         print(
-            f"{align:6}: ATE {report.ate_rmse_mm:.3f} mm, rotation {report.rotation_mean_deg:.2f} deg, "
-            f"scale {report.scale:.3f}, {report.tracked} of {report.frames} frames tracked"
+            f"{align:6}: ATE {report['ate_rmse_mm']:.3f} mm, rotation {report['rotation_mean_deg']:.2f} deg, "
+            f"scale {report['scale']:.3f}, {report['tracked']} of {report['frames']} frames tracked"
         )
 
 

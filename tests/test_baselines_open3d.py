@@ -215,6 +215,6 @@ def test_first_real_frames(real_data: Path, method: str, ate_mm: float, tlr: tup
     sequence = open_sequence(clip, frames=slice(0, 30))
     result = reconstruct(sequence, Config.load(settings=settings | depth), tracker=Open3dTracker(method))
     report = evaluate_poses(result.trajectory, read_trajectory(clip), "sim3")
-    assert report.tracked == 30
-    assert report.ate_rmse_mm < ate_mm
-    assert tlr[0] < report.tlr < tlr[1]
+    assert report["tracked"] == 30
+    assert report["ate_rmse_mm"] < ate_mm
+    assert tlr[0] < report["tlr"] < tlr[1]

@@ -7,7 +7,7 @@ import math
 import re
 import subprocess
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,14 @@ from scopemap.benchmark.tables import PublishedTable, benchmark_tables, publishe
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
 from scopemap.evaluation.consistency import ConsistencyMeter
-from scopemap.evaluation.depth import DepthReport, scale_jitter
+from scopemap.evaluation.depth import mean_depth_report, scale_jitter
 from scopemap.evaluation.paper import paper_figures
-from scopemap.evaluation.poses import PoseReport, match
+from scopemap.evaluation.poses import match, pose_report
 from scopemap.evaluation.surface import compare_surfaces, distance_figures
 
 NAN = float("nan")
-PAPER_FIGURES = paper_figures(match(*(as_trajectory(poses) for poses in vector_a()), "sim3"))
+MATCHED = match(*(as_trajectory(poses) for poses in vector_a()), "sim3")
+PAPER_FIGURES = paper_figures(MATCHED)
 FACTS = {"machine": "Linux x86_64, 2 cores", "commit": "abc1234", "versions": {"scopemap": "0.1.0", "numpy": "2.0"}}
 PUBLISHED: tuple[PublishedTable, ...] = ("table1_pose_scared", "table2_methods_scared", "table3_ablation_scared")
 
@@ -232,9 +233,9 @@ def test_every_column_names_a_figure_that_is_measured() -> None:
     surface = compare_surfaces(plane, plane) | {"normal_consistency": 1.0}
     surface |= distance_figures("accuracy_icp", np.ones(3))
     measured: dict[str, Any] = {
-        "poses": {field.name: 0 for field in fields(PoseReport)},
+        "poses": pose_report(MATCHED),
         "paper": PAPER_FIGURES,
-        "depth": {field.name: 0 for field in fields(DepthReport)} | {"jitter": asdict(scale_jitter(np.ones(3)))},
+        "depth": mean_depth_report([]) | {"jitter": scale_jitter(np.ones(3))},
         "consistency": ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report() | {"flow": "dis"},
         "surface": surface,
     }

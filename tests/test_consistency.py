@@ -296,12 +296,12 @@ def test_a_link_counts_neither_masked_features_nor_distrusted_flow() -> None:
 
 def test_change_of_two_maps_computed_by_hand() -> None:
     change = depth_change(np.array([[11.0, 20.1, np.nan]]), np.array([[10.0, 20.0, 5.0]]))
-    assert (change.mean_mm, change.relative, change.rtc) == pytest.approx((0.55, (0.1 + 0.005) / 2, 0.5))
+    assert (change["mean_mm"], change["relative"], change["rtc"]) == pytest.approx((0.55, (0.1 + 0.005) / 2, 0.5))
     other = depth_change(np.array([[12.0]]), np.array([[10.0]]))
     nothing = depth_change(np.array([[np.nan]]), np.array([[10.0]]))
     mean = mean_change([change, nothing, other])
-    assert (mean.pairs, mean.mean_mm, mean.rtc) == (2, pytest.approx((0.55 + 2) / 2), 0.25)
-    assert depth_change(np.array([[1.01]]), np.array([[1.0]])).rtc == 0
+    assert (mean["pairs"], mean["mean_mm"], mean["rtc"]) == (2, pytest.approx((0.55 + 2) / 2), 0.25)
+    assert depth_change(np.array([[1.01]]), np.array([[1.0]]))["rtc"] == 0
 
 
 @settings(max_examples=20, deadline=None)

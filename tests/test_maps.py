@@ -285,7 +285,7 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     assert not [text for text in result.provenance["warnings"] if "submaps" in text]
     np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
     report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
-    assert report.ate_rmse_mm < 0.4
+    assert report["ate_rmse_mm"] < 0.4
     assert set(fused) == {record.index for record in result.records} - {record.index for record in result.lost}
     # Depth is in the same millimetres before the break and after it.
     truth, depth = C3vdFolder(cut), DepthReader(tmp_path / "out")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import ndimage
 
 from scopemap.geometry.se3 import inverse, transform
@@ -12,7 +13,7 @@ from scopemap.phantom.march import march
 from scopemap.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.volume import Volume
-from scopemap.phantom.writer import SeenVoxels
+from scopemap.phantom.writer import seen_surface
 from scopemap.trajectory.formats.text import read_poses
 
 SMALL = {"width": 96, "height": 80, "frames": 12}
@@ -132,11 +133,15 @@ def test_frames_agree_with_each_other(phantom: Phantom) -> None:
     assert np.percentile(error, 95) < 0.2
 
 
+def seen_mesh(phantom: Phantom, *indices: int) -> trimesh.Trimesh:
+    seen = np.zeros(phantom.volume.coefficients.shape, bool)
+    for index in indices:
+        seen[phantom.volume.cells_of(render_frame(phantom, index)[1].rest_mm)] = True
+    return seen_surface(phantom.volume, seen)
+
+
 def test_mesh_lies_on_the_surface_and_faces_the_camera(phantom: Phantom) -> None:
-    seen = SeenVoxels(phantom.volume)
-    for index in (0, 5, 11):
-        seen.add(render_frame(phantom, index)[1].rest_mm)
-    mesh = seen.mesh()
+    mesh = seen_mesh(phantom, 0, 5, 11)
     corners = mesh.vertices[mesh.faces]
     middle = np.abs(distances_at(phantom.volume, corners.mean(1)))
     assert np.abs(distances_at(phantom.volume, mesh.vertices)).max() < 1e-3
@@ -149,9 +154,7 @@ def test_mesh_lies_on_the_surface_and_faces_the_camera(phantom: Phantom) -> None
 def test_mesh_covers_what_the_cameras_see(phantom: Phantom) -> None:
     from scipy.spatial import cKDTree
 
-    seen = SeenVoxels(phantom.volume)
-    seen.add(render_frame(phantom, 5)[1].rest_mm)
-    distance, _ = cKDTree(seen.mesh().vertices).query(world_points(phantom, 5))
+    distance, _ = cKDTree(seen_mesh(phantom, 5).vertices).query(world_points(phantom, 5))
     # The open tube ends at the rim of the volume, where the mesh stops a voxel or two before the last ray.
     assert np.percentile(distance, 99.9) < 1.2 * phantom.volume.voxel_mm
     assert distance.max() < 2.5 * phantom.volume.voxel_mm
@@ -169,9 +172,7 @@ def test_depth_of_moving_tissue_lies_on_moving_tissue(breathing_colon: Phantom) 
 def test_moving_mesh_agrees_with_moving_depth(breathing_colon: Phantom) -> None:
     from scipy.spatial import cKDTree
 
-    seen = SeenVoxels(breathing_colon.volume)
-    seen.add(render_frame(breathing_colon, 5)[1].rest_mm)
-    mesh = seen.mesh()
+    mesh = seen_mesh(breathing_colon, 5)
     points = world_points(breathing_colon, 5)
 
     def to_plane(vertices: np.ndarray) -> np.ndarray:

@@ -123,14 +123,14 @@ def measure(demo: Demonstration) -> dict[str, float]:
         mesh = {"mesh_accuracy_mm": surface["accuracy_mean_mm"], "mesh_median_mm": surface["accuracy_median_mm"]}
         mesh |= {"mesh_completeness_mm": surface["completeness_mean_mm"]}
     return {
-        "frames": sim3.frames,
-        "tracked": sim3.tracked,
+        "frames": sim3["frames"],
+        "tracked": sim3["tracked"],
         "path_mm": truth.path_length_mm,
-        "ate_sim3_mm": sim3.ate_rmse_mm,
-        "ate_origin_mm": pose_report(match(demo.result.trajectory, truth, "origin")).ate_rmse_mm,
-        "scale": sim3.scale,
-        "rotation_mean_deg": sim3.rotation_unaligned_mean_deg,
-        "rotation_max_deg": sim3.rotation_unaligned_max_deg,
+        "ate_sim3_mm": sim3["ate_rmse_mm"],
+        "ate_origin_mm": pose_report(match(demo.result.trajectory, truth, "origin"))["ate_rmse_mm"],
+        "scale": sim3["scale"],
+        "rotation_mean_deg": sim3["rotation_unaligned_mean_deg"],
+        "rotation_max_deg": sim3["rotation_unaligned_max_deg"],
         **mesh,
         "depth_abs_rel": _abs_rel(demo.sequence, demo.refined_mm),
         "raw_depth_abs_rel": _abs_rel(demo.sequence, demo.raw_mm),
@@ -159,4 +159,4 @@ def draw(demo: Demonstration, folder: Path) -> list[Path]:
 def _abs_rel(sequence: Sequence, depth_mm: dict[int, np.ndarray]) -> float:
     pairs = [(depth_mm[frame.index], truth.depth_mm) for frame, truth in sequence if truth is not None]
     reports = [evaluate_depth(found, true, scaling="median") for found, true in pairs if true is not None]
-    return mean_depth_report(reports).abs_rel
+    return float(mean_depth_report(reports)["abs_rel"])

@@ -23,7 +23,7 @@ class RunResult:
     sequence, method, seed : what was run; names as in the plan.
     status : "failed" where the method died, "missing" where its weights or its trajectory are not on this machine;
         `error` is the reason, in one line.
-    figures : groups of figures by name: "poses" (the keys of `PoseReport`), "paper" (`PaperReport`), "depth",
+    figures : groups of figures by name: "poses" (`pose_report`), "paper" (`paper_figures`), "depth",
         "consistency", "surface", and one group per named protocol. A group that could not be measured is absent, a
         figure that could not be measured is NaN (null in the file).
     timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; two runs of the same plan may

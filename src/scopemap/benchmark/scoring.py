@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +67,7 @@ def pose_groups(
 ) -> tuple[Figures, MatchedTrajectories | None]:
     """Return "poses", "paper" and the named protocols' groups, and the alignment.
 
-    Without an alignment, "poses" holds the figures that need no truth, by the names of `PoseReport`.
+    Without an alignment, "poses" holds the figures that need no truth, by the names of `pose_report`.
     """
     matched = None
     if reference is not None:
@@ -79,7 +78,7 @@ def pose_groups(
         own = {"frames": len(tracked), "tracked": int(np.count_nonzero(tracked))}
         own |= {"longest_tracked": longest_run(tracked), "frames_until_loss": frames_until_loss(tracked)}
         return {"poses": own}, None
-    figures: Figures = {"poses": asdict(pose_report(matched)), "paper": paper_figures(matched)}
+    figures: Figures = {"poses": pose_report(matched), "paper": paper_figures(matched)}
     for name in protocol.protocols:
         # A protocol's own fit may fail where ours does not: then it has no figures.
         with suppress(AlignmentError):
@@ -188,7 +187,7 @@ def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Fi
     )
     if not report.frames:
         return {}
-    return {"depth": {"scaling": report.scaling, **asdict(report.mean), "jitter": asdict(report.jitter)}}
+    return {"depth": report.mean | {"jitter": report.jitter}}
 
 
 def _consistency(

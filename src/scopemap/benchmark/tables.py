@@ -28,7 +28,7 @@ _SECTIONS = {"tracking": "poses", "consistency": "consistency", "depth": "depth"
 _OWN_GROUPS = {"paper", *_SECTIONS.values()}
 _FACTS = ("machine", "device", "commit", "versions", "truth")
 _UNITS = {"_mm": "mm", "_deg": "deg", "_rad": "rad", "_percent": "%", "_px": "px", "_s": "s"}
-# The paper's columns and the figures of `PaperReport`. The interval of its RPE is not stated: it is none of ours.
+# The paper's columns and the figures of `paper_figures`. The interval of its RPE is not stated: it is none of ours.
 _PUBLISHED_COLUMNS = {
     "framework": "method",
     "variant": "method",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -96,7 +95,7 @@ def evaluate(
         show(depth_groups(trajectory, truth, depth, consistency=consistency), form)
         return
     matched = match(estimate, reference, align, first=align_first)
-    figures: dict[str, Any] = asdict(pose_report(matched)) | _surface(trajectory, truth, matched, icp=icp)
+    figures: dict[str, Any] = pose_report(matched) | _surface(trajectory, truth, matched, icp=icp)
     if paper_units:
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])

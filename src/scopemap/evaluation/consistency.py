@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,45 +31,38 @@ from scopemap.geometry.warp import moved_depth, pull
 
 _POSES = ("reference", "estimated")
 _CHANGES = ("same_pixel", "along_flow", "opw", "opw_reference", "opw_estimated")
+_CHANGE = ("mean_mm", "relative", "rtc")
 _RTC_RATIO = 1.01
 
 
-@dataclass(frozen=True)
-class DepthChange:
-    """Difference of consecutive depths: the mean over pairs of each pair's mean over pixels; NaN where there are none.
+def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarray | None = None) -> dict[str, float]:
+    """Compare two depth maps (H, W), mm, NaN = unknown, where both are positive and `counted` (H, W) bool is True.
 
-    Attributes
-    ----------
-    pairs : pairs of frames with a pixel that counts.
+    pairs : 1, or 0 where no pixel counts; then all else is NaN.
     mean_mm : mean |a - b|; relative : mean |a - b| / b, b of the current frame.
     rtc : share of pixels, 0..1, with max(a/b, b/a) strictly below 1.01; higher is better.
     """
-
-    pairs: int
-    mean_mm: float
-    relative: float
-    rtc: float
-
-
-def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarray | None = None) -> DepthChange:
-    """Compare two depth maps (H, W), mm, NaN = unknown, where both are positive and `counted` (H, W) bool is True."""
     both = (other_mm > 0) & (current_mm > 0)
     if counted is not None:
         both &= counted
     if not both.any():
-        return DepthChange(0, *[float("nan")] * 3)
+        return {"pairs": 0, **dict.fromkeys(_CHANGE, float("nan"))}
     a, b = other_mm[both].astype(np.float64), current_mm[both].astype(np.float64)
     apart = np.abs(a - b)
     near = np.maximum(a, b) < _RTC_RATIO * np.minimum(a, b)
-    return DepthChange(1, float(np.mean(apart)), float(np.mean(apart / b)), float(np.mean(near)))
+    return {
+        "pairs": 1,
+        "mean_mm": float(np.mean(apart)),
+        "relative": float(np.mean(apart / b)),
+        "rtc": float(np.mean(near)),
+    }
 
 
-def mean_change(changes: Sequence[DepthChange]) -> DepthChange:
-    """Return the mean over pairs of frames; pairs without a pixel are left out."""
-    kept = np.array([astuple(change) for change in changes if change.pairs > 0])
-    if not len(kept):
-        return DepthChange(0, *[float("nan")] * 3)
-    return DepthChange(int(kept[:, 0].sum()), *map(float, kept[:, 1:].mean(axis=0)))
+def mean_change(changes: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each figure of `depth_change` over the pairs of frames with a pixel, and their number."""
+    kept = np.array([[change[name] for name in _CHANGE] for change in changes if change["pairs"]])
+    means = kept.mean(axis=0).tolist() if len(kept) else [float("nan")] * len(_CHANGE)
+    return {"pairs": len(kept), **dict(zip(_CHANGE, means, strict=True))}
 
 
 def projected_depth(depth_mm: np.ndarray, camera: PinholeCamera, T_other_camera: np.ndarray) -> np.ndarray:
@@ -100,7 +93,7 @@ def alignment_errors(
     """
     forth = depth_change(projected_depth(depth_previous_mm, camera, T_current_previous), depth_current_mm)
     back = depth_change(projected_depth(depth_current_mm, camera, inverse(T_current_previous)), depth_previous_mm)
-    return forth.relative, back.relative
+    return forth["relative"], back["relative"]
 
 
 @dataclass(frozen=True)
@@ -135,7 +128,7 @@ class ConsistencyMeter:
         self._camera, self._scale = camera, scale
         self._previous: tuple[np.ndarray, dict[str, np.ndarray]] | None = None
         self._scales: list[float] = []
-        self._changes: defaultdict[str, list[DepthChange]] = defaultdict(list)
+        self._changes: defaultdict[str, list[dict[str, float]]] = defaultdict(list)
         self._alignments: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self._displacements: defaultdict[str, list[np.ndarray]] = defaultdict(list)
 
@@ -181,8 +174,8 @@ class ConsistencyMeter:
         orb_camera, orb_reference, orb_estimated : displacement of points in their own cameras, and in the world.
         """
         figures: dict[str, Any] = {"frames": len(self._scales), "pairs": max(len(self._scales) - 1, 0)}
-        figures |= {"scale": self._scale, "jitter": asdict(scale_jitter(np.array(self._scales)))}
-        figures |= {name: asdict(mean_change(self._changes[name])) for name in _CHANGES}
+        figures |= {"scale": self._scale, "jitter": scale_jitter(np.array(self._scales))}
+        figures |= {name: mean_change(self._changes[name]) for name in _CHANGES}
         for name in _POSES:
             table = np.array(self._alignments[name], dtype=np.float64).reshape(-1, 2)
             known = np.isfinite(table)

@@ -8,8 +8,8 @@ sequence may have one factor, or one scale and shift in disparity (Video-Depth-A
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -35,6 +35,10 @@ _LEAST_VARIATION = 1e-12
 DepthPairs = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
 """Gives the frames, in order, anew at every call: (predicted, true), (H, W) each, mm, NaN = unknown."""
 
+_FIGURES = (
+    *("pixels", "coverage", "scale", "shift_per_mm", "abs_rel", "sq_rel_mm", "rmse_mm", "rmse_log", "mae_mm"),
+    *("delta_1", "delta_2", "delta_3"),
+)
 # Bins of the logarithm of depth: medians read from them are exact to 1e-5 of their value, in bounded memory.
 _LOG_LOW, _LOG_HIGH, _LOG_STEP = float(np.log(1e-4)), float(np.log(1e6)), 2e-5
 
@@ -63,34 +67,6 @@ class DepthFit:
         return 1 / np.maximum(disparity, _LEAST_DISPARITY_PER_MM)
 
 
-@dataclass(frozen=True)
-class DepthReport:
-    """Errors of one depth map, or their mean over several; NaN where no pixel could be compared.
-
-    Attributes
-    ----------
-    pixels, coverage : compared pixels, and their share of the pixels with true depth, 0..1.
-    scaling, scale, shift_per_mm : what was applied to the prediction, as in `DepthFit`.
-    abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g; mae_mm : mean |d - g|.
-    rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
-    delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
-    """
-
-    scaling: DepthScaling
-    pixels: float
-    coverage: float
-    scale: float
-    shift_per_mm: float
-    abs_rel: float
-    sq_rel_mm: float
-    rmse_mm: float
-    rmse_log: float
-    mae_mm: float
-    delta_1: float
-    delta_2: float
-    delta_3: float
-
-
 def evaluate_depth(
     predicted_mm: np.ndarray,
     truth_mm: np.ndarray,
@@ -98,8 +74,14 @@ def evaluate_depth(
     scaling: ImageScaling | DepthFit = "none",
     truth_range_mm: tuple[float, float] = (1e-3, float("inf")),
     clip_prediction: bool = False,
-) -> DepthReport:
+) -> dict[str, Any]:
     """Return the errors of a predicted depth map (H, W) against the true one (H, W), both mm, NaN = unknown.
+
+    pixels, coverage : compared pixels, and their share of the pixels with true depth, 0..1. The others are NaN without.
+    scaling, scale, shift_per_mm : what was applied to the prediction, as in `DepthFit`.
+    abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g; mae_mm : mean |d - g|.
+    rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
+    delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
 
     Parameters
     ----------
@@ -110,10 +92,10 @@ def evaluate_depth(
         Video-Depth-Anything do. Without it the far pixels of a shifted prediction dominate the mean.
     """
     d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
-    coverage = len(d) / max(known, 1)
     fit = scaling if isinstance(scaling, DepthFit) else _fit(d, g, scaling)
-    if len(d) == 0:
-        return DepthReport(fit.scaling, 0, coverage, *[float("nan")] * 10)
+    counted, coverage = len(d), len(d) / max(known, 1)
+    if counted == 0:
+        return _report(fit.scaling, [0, coverage, *[float("nan")] * 10])
     d = fit.apply(d)
     if clip_prediction:
         d = np.clip(d, *truth_range_mm)
@@ -126,7 +108,11 @@ def evaluate_depth(
         np.mean(np.abs(difference)),
         *(np.mean(ratio < 1.25**k) for k in (1, 2, 3)),
     ]
-    return DepthReport(fit.scaling, len(d), coverage, fit.scale, fit.shift_per_mm, *map(float, errors))
+    return _report(fit.scaling, [counted, coverage, fit.scale, fit.shift_per_mm, *errors])
+
+
+def _report(scaling: DepthScaling, figures: Iterable[float]) -> dict[str, Any]:
+    return {"scaling": scaling} | dict(zip(_FIGURES, map(float, figures), strict=True))
 
 
 def compared_depths(
@@ -171,36 +157,20 @@ def disparity_fit(sums: np.ndarray, scaling: DepthScaling) -> DepthFit:
     return DepthFit(scaling, float(1 / slope) if slope != 0 else float("inf"), float(mean_y - slope * mean_x))
 
 
-def mean_depth_report(reports: Sequence[DepthReport]) -> DepthReport:
-    """Return the mean over images; those without a comparable pixel count in `pixels` and `coverage` only.
+def mean_depth_report(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the mean of `evaluate_depth` over images; those without a comparable pixel have `pixels` and `coverage`.
 
     Raises `SettingsError` where the images were scaled in different ways.
     """
     if not reports:
-        return DepthReport("none", 0, *[float("nan")] * 11)
-    scalings = sorted({report.scaling for report in reports})
+        return _report("none", [0, *[float("nan")] * 11])
+    scalings = sorted({report["scaling"] for report in reports})
     if len(scalings) > 1:
         raise SettingsError(f"mean of depth errors: the images were scaled by {', '.join(scalings)}; use one of them")
-    table = np.array([astuple(report)[1:] for report in reports], dtype=np.float64)
-    compared = table[:, 0] > 0
-    errors = table[compared, 2:].mean(axis=0) if compared.any() else np.full(table.shape[1] - 2, np.nan)
-    return DepthReport(scalings[0], *(float(value) for value in (*table[:, :2].mean(axis=0), *errors)))
-
-
-@dataclass(frozen=True)
-class ScaleJitter:
-    """Variation over the frames of the factor s_t = median(g / d) from prediction to truth; a global scale cancels.
-
-    Attributes
-    ----------
-    frames : frames with a factor.
-    log_std : standard deviation (by N) of ln s_t. NaN below two frames.
-    log_step : mean |ln s_{t+1} - ln s_t| over consecutive frames that both have one; NaN where there are none.
-    """
-
-    frames: int
-    log_std: float
-    log_step: float
+    table = np.array([[report[name] for name in _FIGURES] for report in reports])
+    compared = table[table[:, 0] > 0, 2:]
+    errors = compared.mean(axis=0) if len(compared) else np.full(compared.shape[1], np.nan)
+    return _report(scalings[0], [*table[:, :2].mean(axis=0), *errors])
 
 
 @dataclass(frozen=True)
@@ -209,9 +179,9 @@ class DepthSequenceReport:
 
     scaling: DepthScaling
     fit: DepthFit
-    mean: DepthReport
-    frames: tuple[DepthReport, ...]
-    jitter: ScaleJitter
+    mean: dict[str, Any]
+    frames: tuple[dict[str, Any], ...]
+    jitter: dict[str, float]
 
 
 def evaluate_depth_sequence(
@@ -232,11 +202,9 @@ def evaluate_depth_sequence(
     fit = fit_sequence(pairs, scaling, truth_range_mm) if of_sequence else DepthFit(scaling)
     each: ImageScaling | DepthFit = fit if of_sequence else scaling  # type: ignore[assignment]
     frames, scales = [], []
+    options: dict[str, Any] = {"truth_range_mm": truth_range_mm, "clip_prediction": clip_prediction}
     for predicted_mm, truth_mm in pairs():
-        report = evaluate_depth(
-            predicted_mm, truth_mm, scaling=each, truth_range_mm=truth_range_mm, clip_prediction=clip_prediction
-        )
-        frames.append(report)
+        frames.append(evaluate_depth(predicted_mm, truth_mm, scaling=each, **options))
         scales.append(depth_scale(predicted_mm, truth_mm, truth_range_mm))
     return DepthSequenceReport(scaling, fit, mean_depth_report(frames), tuple(frames), scale_jitter(np.array(scales)))
 
@@ -249,13 +217,20 @@ def depth_scale(
     return float(np.median(g / d)) if len(d) else float("nan")
 
 
-def scale_jitter(scales: np.ndarray) -> ScaleJitter:
-    """Return the jitter of one factor per frame (N,), in order, NaN where a frame has none."""
+def scale_jitter(scales: np.ndarray) -> dict[str, float]:
+    """Return the variation of one factor s_t per frame (N,), in order, NaN where a frame has none.
+
+    A global scale cancels.
+
+    frames : frames with a factor. log_std : standard deviation (by N) of ln s_t; NaN below two frames.
+    log_step : mean |ln s_{t+1} - ln s_t| over consecutive frames that both have one; NaN where there are none.
+    """
     logs = np.log(np.asarray(scales, dtype=np.float64))
     known, steps = logs[np.isfinite(logs)], np.abs(np.diff(logs))
     steps = steps[np.isfinite(steps)]
     log_std = float(np.std(known)) if len(known) > 1 else float("nan")
-    return ScaleJitter(len(known), log_std, float(np.mean(steps)) if len(steps) else float("nan"))
+    log_step = float(np.mean(steps)) if len(steps) else float("nan")
+    return {"frames": len(known), "log_std": log_std, "log_step": log_step}
 
 
 def fit_sequence(pairs: DepthPairs, scaling: DepthScaling, truth_range_mm: tuple[float, float]) -> DepthFit:
@@ -271,7 +246,7 @@ def fit_sequence(pairs: DepthPairs, scaling: DepthScaling, truth_range_mm: tuple
         else:
             for histogram, depths_mm in zip(counts, (d, g), strict=True):
                 bins = ((np.log(depths_mm) - _LOG_LOW) / _LOG_STEP).astype(np.int64)
-                np.add.at(histogram, np.clip(bins, 0, len(histogram) - 1), 1)
+                histogram += np.bincount(bins.clip(0, len(histogram) - 1), minlength=len(histogram))
     if scaling == "sequence-scale-and-shift":
         return disparity_fit(sums, scaling)
     if not counts.any():

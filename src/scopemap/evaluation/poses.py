@@ -7,6 +7,7 @@ Poses are camera to world, (N, 4, 4) float64, mm, matched row by row. Definition
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -137,57 +138,6 @@ class MatchedTrajectories:
         return float(np.count_nonzero(self.tracked) / self.reference_in_span)
 
 
-@dataclass(frozen=True)
-class PoseReport:
-    """Pose errors of one trajectory over the tracked frames. NaN where too few frames give a figure.
-
-    Attributes
-    ----------
-    frames, tracked : matched frames, and those of them that are not lost.
-    align, scale : mode of the alignment, and the scale that it found.
-    ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
-    rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
-    rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
-    rpe_1_mm, rpe_1_deg, rpe_10_mm, rpe_10_deg : relative error over 1 and 10 frames, all pairs, RMSE, after scaling.
-    rpe_10mm_path_mm, rpe_10mm_path_deg : relative error over 10 mm (within 10 %) of reference path, all pairs, RMSE.
-    tlr : estimated over reference path length, before the alignment.
-    ..._below_..._percent : share of frames with an absolute error strictly below the limit.
-    coverage : tracked frames over the reference poses within the estimate's span, 0..1; reference_frames : in all.
-    longest_tracked, frames_until_loss : matched frames in the longest run without loss, and before the first loss.
-    """
-
-    frames: int
-    tracked: int
-    align: AlignMode
-    scale: float
-    ate_rmse_mm: float
-    ate_hold_rmse_mm: float
-    ate_mean_mm: float
-    rotation_mean_deg: float
-    rotation_max_deg: float
-    rotation_unaligned_mean_deg: float
-    rotation_unaligned_max_deg: float
-    rpe_1_mm: float
-    rpe_1_deg: float
-    rpe_10_mm: float
-    rpe_10_deg: float
-    tlr: float
-    ate_median_mm: float
-    ate_max_mm: float
-    rpe_10mm_path_mm: float
-    rpe_10mm_path_deg: float
-    ate_below_1_mm_percent: float
-    ate_below_2_mm_percent: float
-    ate_below_5_mm_percent: float
-    rotation_below_1_deg_percent: float
-    rotation_below_2_deg_percent: float
-    rotation_below_5_deg_percent: float
-    coverage: float
-    reference_frames: int
-    longest_tracked: int
-    frames_until_loss: int
-
-
 def associate(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return matching rows of the estimate and of the reference, both (N,) int64, in time order.
 
@@ -245,26 +195,38 @@ def _with_last_pose(trajectory: Trajectory) -> np.ndarray:
 
 
 def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
+    numbered = estimate.has_indices and reference.has_indices
+    stamps = [known.indices if numbered else known.times_s for known in (estimate, reference)]
+    spans = [f"{values[0]:.10g}..{values[-1]:.10g}" if len(values) else "none" for values in stamps]
     start = f"cannot compare the trajectories: {found} tracked frames match, at least {MIN_MATCHED} are needed; "
-    if estimate.has_indices and reference.has_indices:
-        return f"{start}frame numbers are {_span(estimate.indices)} and {_span(reference.indices)}"
-    spans = f"{_span(estimate.times_s)} s and {_span(reference.times_s)} s"
-    return f"{start}time stamps are {spans} (30 frames per s where a file has none); frame numbers as stamps match too"
-
-
-def _span(values: np.ndarray) -> str:
-    return f"{values[0]:.10g}..{values[-1]:.10g}" if len(values) else "none"
+    if numbered:
+        return f"{start}frame numbers are {spans[0]} and {spans[1]}"
+    times = f"time stamps are {spans[0]} s and {spans[1]} s (30 frames per s where a file has none)"
+    return f"{start}{times}; frame numbers as stamps match too"
 
 
 def evaluate_poses(
     estimate: Trajectory, reference: Trajectory, align: AlignMode, *, first: int | None = None
-) -> PoseReport:
-    """Return the pose errors of `estimate` against `reference`; raises as `match`."""
+) -> dict[str, Any]:
+    """Return the `pose_report` of `estimate` against `reference`; raises as `match`."""
     return pose_report(match(estimate, reference, align, first=first))
 
 
-def pose_report(matched: MatchedTrajectories) -> PoseReport:
-    """Return the figures that `scopemap evaluate` prints."""
+def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
+    """Return the pose errors over the tracked frames that `scopemap evaluate` prints; NaN where frames are too few.
+
+    frames, tracked : matched frames, and those of them that are not lost.
+    align, scale : mode of the alignment, and the scale that it found.
+    ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
+    rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
+    rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
+    rpe_1_mm, rpe_1_deg, rpe_10_mm, rpe_10_deg : relative error over 1 and 10 frames, all pairs, RMSE, after scaling.
+    tlr : estimated over reference path length, before the alignment.
+    rpe_10mm_path_mm, rpe_10mm_path_deg : relative error over 10 mm (within 10 %) of reference path, all pairs, RMSE.
+    ..._below_..._percent : share of frames with an absolute error strictly below 1, 2 and 5 mm or deg.
+    coverage : tracked frames over the reference poses within the estimate's span, 0..1; reference_frames : in all.
+    longest_tracked, frames_until_loss : matched frames in the longest run without loss, and before the first loss.
+    """
     ok = matched.tracked
     held_mm = translation_errors_mm(matched.aligned, matched.reference)
     error_mm, error_deg = held_mm[ok], np.degrees(rotation_errors_rad(matched.aligned[ok], matched.reference[ok]))
@@ -274,36 +236,34 @@ def pose_report(matched: MatchedTrajectories) -> PoseReport:
     unaligned_rad = ErrorSummary.of(relative_errors(matched.estimated, matched.reference, since_first)[1])
     (rpe_1_mm, rpe_1_rad), (rpe_10_mm, rpe_10_rad) = rpe_over_frames(matched, 1), rpe_over_frames(matched, 10)
     rpe_path_mm, rpe_path_rad = rpe_over_path(matched, 10.0)
-    below_mm = {f"ate_below_{limit}_mm_percent": below_percent(error_mm, limit) for limit in (1, 2, 5)}
-    below_deg = {f"rotation_below_{limit}_deg_percent": below_percent(error_deg, limit) for limit in (1, 2, 5)}
-    return PoseReport(
-        frames=len(ok),
-        tracked=int(np.count_nonzero(ok)),
-        align=matched.align,
-        scale=matched.similarity.scale,
-        ate_rmse_mm=ate.rmse,
-        ate_hold_rmse_mm=ErrorSummary.of(held_mm).rmse,
-        ate_mean_mm=ate.mean,
-        rotation_mean_deg=rotation.mean,
-        rotation_max_deg=rotation.max,
-        rotation_unaligned_mean_deg=float(np.degrees(unaligned_rad.mean)),
-        rotation_unaligned_max_deg=float(np.degrees(unaligned_rad.max)),
-        rpe_1_mm=rpe_1_mm.rmse,
-        rpe_1_deg=float(np.degrees(rpe_1_rad.rmse)),
-        rpe_10_mm=rpe_10_mm.rmse,
-        rpe_10_deg=float(np.degrees(rpe_10_rad.rmse)),
-        tlr=length_ratio(matched),
-        ate_median_mm=ate.median,
-        ate_max_mm=ate.max,
-        rpe_10mm_path_mm=rpe_path_mm.rmse,
-        rpe_10mm_path_deg=float(np.degrees(rpe_path_rad.rmse)),
-        coverage=matched.coverage,
-        reference_frames=matched.reference_frames,
-        longest_tracked=longest_run(ok),
-        frames_until_loss=frames_until_loss(ok),
-        **below_mm,
-        **below_deg,
-    )
+    return {
+        "frames": len(ok),
+        "tracked": int(np.count_nonzero(ok)),
+        "align": matched.align,
+        "scale": matched.similarity.scale,
+        "ate_rmse_mm": ate.rmse,
+        "ate_hold_rmse_mm": ErrorSummary.of(held_mm).rmse,
+        "ate_mean_mm": ate.mean,
+        "rotation_mean_deg": rotation.mean,
+        "rotation_max_deg": rotation.max,
+        "rotation_unaligned_mean_deg": float(np.degrees(unaligned_rad.mean)),
+        "rotation_unaligned_max_deg": float(np.degrees(unaligned_rad.max)),
+        "rpe_1_mm": rpe_1_mm.rmse,
+        "rpe_1_deg": float(np.degrees(rpe_1_rad.rmse)),
+        "rpe_10_mm": rpe_10_mm.rmse,
+        "rpe_10_deg": float(np.degrees(rpe_10_rad.rmse)),
+        "tlr": length_ratio(matched),
+        "ate_median_mm": ate.median,
+        "ate_max_mm": ate.max,
+        "rpe_10mm_path_mm": rpe_path_mm.rmse,
+        "rpe_10mm_path_deg": float(np.degrees(rpe_path_rad.rmse)),
+        **{f"ate_below_{limit}_mm_percent": below_percent(error_mm, limit) for limit in (1, 2, 5)},
+        **{f"rotation_below_{limit}_deg_percent": below_percent(error_deg, limit) for limit in (1, 2, 5)},
+        "coverage": matched.coverage,
+        "reference_frames": matched.reference_frames,
+        "longest_tracked": longest_run(ok),
+        "frames_until_loss": frames_until_loss(ok),
+    }
 
 
 def rpe_over_frames(matched: MatchedTrajectories, step: int) -> tuple[ErrorSummary, ErrorSummary]:

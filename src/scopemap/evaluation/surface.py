@@ -50,23 +50,19 @@ def distance_to_mesh(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
     triangles = small_triangles(mesh)
     centroids = triangles.mean(axis=1)
     radii = np.linalg.norm(triangles - centroids[:, None], axis=2).max(axis=1)
-    normals = trimesh.util.unitize(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
     tree = cKDTree(centroids)
     distances, unsettled = np.full(len(points), np.inf), np.arange(len(points))
     for candidates in _CANDIDATES:
         count = min(candidates, len(triangles))
-        settled = np.zeros(len(points), dtype=bool)
+        farthest = np.full(len(points), np.inf)
         for start in range(0, len(unsettled), _CHUNK):
             rows = unsettled[start : start + _CHUNK]
             to_centroid, nearest = tree.query(points[rows], k=list(range(1, count + 1)))
-            # No triangle is nearer than the disc about it in its plane; without area its normal is 0, the disc a ball.
-            offsets = points[rows, None] - centroids[nearest]
-            height = np.einsum("nki,nki->nk", offsets, normals[nearest])
-            beside = np.sqrt(np.maximum(np.einsum("nki,nki->nk", offsets, offsets) - height**2, 0.0))
-            at_least = np.hypot(height, np.maximum(beside - radii[nearest], 0.0))
-            distances[rows] = _nearest_mm(points[rows], triangles, nearest, at_least)
-            settled[rows] = (distances[rows] <= to_centroid[:, -1] - radii.max()) | (count == len(triangles))
-        unsettled = unsettled[~settled[unsettled]]
+            distances[rows] = _nearest_mm(points[rows], triangles, nearest, to_centroid - radii[nearest])
+            farthest[rows] = to_centroid[:, -1]
+        if count == len(triangles):
+            break
+        unsettled = unsettled[distances[unsettled] > farthest[unsettled] - radii.max()]
     return distances
 
 
@@ -164,16 +160,22 @@ def surface_points(surface: Surface) -> np.ndarray:
     return np.asarray(surface, dtype=np.float64)
 
 
-def oriented_samples(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (N, 3) float64, mm, spread evenly over a mesh and the unit normals (N, 3) of their triangles.
+def oriented_samples(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) float64, mm, of a surface and unit normals (N, 3).
 
-    By a fixed seed. Raises `ValueError` for a mesh without area.
+    A mesh gives points spread evenly, by a fixed seed, with the normals of their triangles; bare points get theirs from
+    their 10 nearest neighbours. Raises `ValueError` for a mesh without area, and for no points.
     """
-    if len(mesh.faces) == 0 or mesh.area == 0:
+    if not isinstance(surface, trimesh.Trimesh):
+        points = surface_points(surface)
+        neighbours = points[cKDTree(points).query(points, k=range(1, min(_NEIGHBOURS, len(points)) + 1))[1]]
+        spread = neighbours - neighbours.mean(axis=1, keepdims=True)
+        return points, np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
+    if len(surface.faces) == 0 or surface.area == 0:
         raise ValueError("surface: the mesh has no area")
-    count = int(np.clip(np.ceil(_SAMPLES_PER_MM2 * mesh.area), *_SAMPLES))
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    return np.asarray(points), np.asarray(mesh.face_normals)[faces]
+    count = int(np.clip(np.ceil(_SAMPLES_PER_MM2 * surface.area), *_SAMPLES))
+    points, faces = trimesh.sample.sample_surface(surface, count, seed=0)
+    return np.asarray(points), np.asarray(surface.face_normals)[faces]
 
 
 def distances_mm(points: np.ndarray, surface: Surface) -> np.ndarray:
@@ -197,7 +199,7 @@ def refine(predicted: Surface, truth: Surface) -> tuple[Similarity, float, float
     """
     points = surface_points(predicted)
     points = points[np.random.default_rng(0).permutation(len(points))[:_MOVED_POINTS]]
-    targets, normals = _oriented(truth)
+    targets, normals = oriented_samples(truth)
     if min(len(points), len(targets)) < _FEWEST_POINTS:
         raise AlignmentError(
             f"cannot fit one surface to the other: {len(points)} and {len(targets)} points, at least {_FEWEST_POINTS} "
@@ -233,16 +235,6 @@ def _step(points: np.ndarray, onto: np.ndarray, normals: np.ndarray) -> Similari
     unknowns = axes[:, held] @ ((axes[:, held].T @ (jacobian.T @ gaps)) / values[held])
     R = so3_exp(unknowns[:3] / radius)
     return Similarity(1.0, R, centre + unknowns[3:6] - R @ centre)
-
-
-def _oriented(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and unit normals (N, 3) of a surface; those of bare points from their 10 nearest neighbours."""
-    if isinstance(surface, trimesh.Trimesh):
-        return oriented_samples(surface)
-    points = surface_points(surface)
-    neighbours = points[cKDTree(points).query(points, k=range(1, min(_NEIGHBOURS, len(points)) + 1))[1]]
-    spread = neighbours - neighbours.mean(axis=1, keepdims=True)
-    return points, np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
 
 
 def _rms_mm(points: np.ndarray, truth: Surface, kept: int) -> float:

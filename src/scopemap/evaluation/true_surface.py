@@ -31,12 +31,8 @@ from scopemap.evaluation.surface import (
     surface_points,
 )
 from scopemap.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
-from scopemap.io.decoding import read_decoded
+from scopemap.io.decoding import read_decoded, reporting
 
-_PHANTOM, _PHANTOM_FRAMES = "mesh_truth.ply", "mesh_truth"
-# The second is the name on the data set's page.
-_C3VD = ("coverage_mesh.obj", "outputMesh.obj")
-_SCARED_DEPTH, _SCARED_CLOUD = "left_depth_map.tiff", "point_cloud.obj"
 _OBSERVED, _MISSED = 1, 2
 
 
@@ -102,22 +98,11 @@ def read_true_surface(folder: Path) -> TrueSurface | None:
 
     SCARED's points are in the left camera at the keyframe, the world of its poses. `InputError` for an unreadable file.
     """
-    folder = Path(folder)
-    if (folder / _PHANTOM).is_file():
-        return TrueSurface(
-            _read_mesh(folder / _PHANTOM), frames=tuple(sorted((folder / _PHANTOM_FRAMES).glob("*.ply")))
-        )
-    for name in _C3VD:
-        if (folder / name).is_file():
-            return _read_coverage(folder / name)
-    for name, read in ((_SCARED_DEPTH, _read_depth_points), (_SCARED_CLOUD, _read_cloud)):
-        if (folder / name).is_file():
-            points_mm = read(folder / name)
-            with np.errstate(invalid="ignore"):
-                known = np.isfinite(points_mm).all(axis=1) & (points_mm[:, 2] > 0)
-            if not known.any():
-                raise InputError(f"the true points of the keyframe in {folder} are all missing")
-            return TrueSurface(points_mm[known].astype(np.float64), T_view=np.eye(4))
+    for name, read in _READERS.items():
+        file = Path(folder) / name
+        if file.is_file():
+            with reporting(f"cannot read the true surface {file}"):
+                return read(file)
     return None
 
 
@@ -150,11 +135,13 @@ def _icp_figures(predicted: Surface, truth: Surface) -> dict[str, float]:
     return distance_figures("accuracy_icp", distances) | rms
 
 
+def _read_phantom(path: Path) -> TrueSurface:
+    return TrueSurface(_read_mesh(path), frames=tuple(sorted((path.parent / path.stem).glob("*.ply"))))
+
+
 def _read_mesh(path: Path) -> trimesh.Trimesh:
-    try:
+    with reporting(f"cannot read the true surface {path}"):
         mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # the readers of mesh files raise whatever their parsers raise
-        raise InputError(f"cannot read the true surface {path}: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"the true surface {path} holds no triangles")
     return mesh
@@ -165,50 +152,54 @@ def _read_coverage(path: Path) -> TrueSurface:
 
     Source: `RenderingModule.cpp`, `writeOBJ` (github.com/DurrLab/C3VD). Readers of OBJ give no indices of `vt`.
     """
-    lines = _read_lines(path)
-    vertices = _numbers(path, [line[2:] for line in lines if line.startswith("v ")])
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    vertices = _vertices(lines)
     faces = [line.split()[1:] for line in lines if line.startswith("f ")]
     try:
         corners, marks = np.array([[c.split("/")[:2] for c in face] for face in faces], np.int64).transpose(2, 0, 1)
-        if corners.shape[1] != 3:
-            raise ValueError
     except ValueError:
-        raise InputError(
-            f"cannot read the coverage in {path}: expected triangles `f v/vt v/vt v/vt`, as C3VD writes"
-        ) from None
+        corners = np.empty((0, 0))
+    if corners.shape[1] != 3:
+        raise ValueError("expected triangles `f v/vt v/vt v/vt`, as C3VD writes")
     if corners.min() < 1 or corners.max() > len(vertices):
-        raise InputError(f"cannot read the true surface {path}: a face names none of the {len(vertices)} vertices")
+        raise ValueError(f"a face names none of the {len(vertices)} vertices")
     if not np.isin(marks, (_OBSERVED, _MISSED)).all() or (marks != marks[:, :1]).any():
-        raise InputError(f"cannot read the coverage in {path}: expected vt 1 (observed) or 2 (missed) on every face")
+        raise ValueError("expected vt 1 (observed) or 2 (missed) on every face")
     return TrueSurface(trimesh.Trimesh(vertices, corners - 1, process=False), marks[:, 0] == _OBSERVED)
 
 
-def _read_depth_points(path: Path) -> np.ndarray:
-    """Return SCARED's points (N, 3), mm, one per pixel, NaN where there is none; OpenCV reverses x, y, z."""
+def _read_depth_points(path: Path) -> TrueSurface:
+    """Read SCARED's points, mm, one per pixel; OpenCV reverses x, y, z."""
     points = read_decoded(path)
     if points is None or points.ndim != 3 or points.shape[2] != 3:
-        raise InputError(f"cannot read the true surface {path}: expected an image of three channels, x, y and z")
-    return points[..., ::-1].reshape(-1, 3)
+        raise ValueError("expected an image of three channels, x, y and z")
+    return _of_one_view(points[..., ::-1].reshape(-1, 3))
 
 
-def _read_cloud(path: Path) -> np.ndarray:
-    """Return SCARED's points (N, 3), mm, one line each, `nan` where there is none."""
-    return _numbers(path, [line[2:] for line in _read_lines(path) if line.startswith("v ")])
+def _read_cloud(path: Path) -> TrueSurface:
+    return _of_one_view(_vertices(path.read_text(encoding="utf-8", errors="replace").splitlines()))
 
 
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot read the true surface {path}: {error.strerror or error}") from None
+def _of_one_view(points_mm: np.ndarray) -> TrueSurface:
+    """Return the truth of SCARED's points (N, 3), NaN or z = 0 where there is none."""
+    known = np.isfinite(points_mm).all(axis=1) & (points_mm[:, 2] > 0)
+    if not known.any():
+        raise ValueError("the points are all missing")
+    return TrueSurface(points_mm[known].astype(np.float64), T_view=np.eye(4))
 
 
-def _numbers(path: Path, rows: list[str]) -> np.ndarray:
-    """Return the first three numbers of each row, (N, 3) float64; `nan` is a number."""
-    try:
-        table = np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, 0))
-    except ValueError as error:
-        raise InputError(f"cannot read the true surface {path}: {error}") from None
+def _vertices(lines: list[str]) -> np.ndarray:
+    """Return x, y, z of the lines `v x y z`, (N, 3) float64; `nan` is a number."""
+    table = np.loadtxt([line[2:] for line in lines if line.startswith("v ")], ndmin=2)
     if table.shape[1] < 3:
-        raise InputError(f"cannot read the true surface {path}: expected lines `v x y z`")
+        raise ValueError("expected lines `v x y z`")
     return table[:, :3]
+
+
+_READERS = {
+    "mesh_truth.ply": _read_phantom,
+    "coverage_mesh.obj": _read_coverage,
+    "outputMesh.obj": _read_coverage,  # its name on the data set's page
+    "left_depth_map.tiff": _read_depth_points,
+    "point_cloud.obj": _read_cloud,
+}

@@ -1,9 +1,11 @@
 """Findings about a video's frames: time stamps, repeated, blank, blurred, badly exposed frames and odd colours.
 
-Each check takes a `Clip` and returns findings, with the option that answers each as its advice.
+Each check takes a `Clip` and yields findings, with the option that answers each as its advice.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -28,76 +30,70 @@ _EXPOSURES = (
 )
 
 
-def check_frames(clip: Clip) -> list[VideoFinding]:
-    """Return the findings of all checks of single frames."""
-    checks = (_blank, _blurred, _colour, _exposure)
-    return [finding for check in checks for finding in check(clip)]
+def check_frames(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield the findings of all checks of single frames."""
+    for check in (_blank, _blurred, _colour, _exposure):
+        yield from check(clip)
 
 
-def check_timing(clip: Clip, claimed_s: float | None) -> list[VideoFinding]:
-    """Return what is wrong with the time stamps; `claimed_s` is the length in the file's header, s, or None."""
+def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
+    """Yield what is wrong with the time stamps; `claimed_s` is the length in the file's header, s, or None."""
     steps_s = clip.steps_s
     if steps_s.size < 2:
-        return []
+        return
     back = clip.positions(tuple((int(i) + 1, int(i) + 1) for i in np.flatnonzero(steps_s <= 0)))
     if back:
         message = f"{len(back)} time stamps are not later than the one before (frames {worded(back)})"
         advice = "poses keep their order; take no speeds from the time stamps"
-        return [VideoFinding("warning", "time-order", message, advice, back)]
+        yield VideoFinding("warning", "time-order", message, advice, back)
+        return
     usual_s = float(np.median(steps_s))
-    found = [*_dropped(clip, steps_s, usual_s), *_length(clip, claimed_s)]
+    yield from _dropped(clip, steps_s, usual_s)
+    if claimed_s is not None and clip.is_whole and clip.stamped:
+        times_s = clip["time_s"]
+        read_s = float(times_s[-1] - times_s[0]) + usual_s
+        if abs(read_s - claimed_s) > max(_LENGTH_S, _LENGTH_SHARE * claimed_s):
+            message = f"the file's header claims {claimed_s:.1f} s, its pictures last {read_s:.1f} s"
+            advice = "what can be read is used; copy the file anew if it is cut off"
+            yield VideoFinding("warning", "length-claimed", message, advice)
     # A hole is no variable rate.
     rest = np.abs(steps_s[steps_s < _HOLE * usual_s] / usual_s - 1)
     if clip.stamped and (rest > _UNEVEN).mean() > _UNEVEN_SHARE:
         low, high = 1 / np.percentile(steps_s, [95, 5])
         message = f"variable rate: {low:.3g} to {high:.3g} pictures per second, usually {1 / usual_s:.3g}"
         advice = "runs use the time stamps; --fps thins out by them, too"
-        found.append(VideoFinding("info", "rate-variable", message, advice))
+        yield VideoFinding("info", "rate-variable", message, advice)
     if clip.stamped and clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
         message = f"{clip.rate_hz:.3g} pictures per second, between which hardly anything moves"
-        found.append(VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work"))
-    return found
+        yield VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work")
 
 
-def _dropped(clip: Clip, steps_s: np.ndarray, usual_s: float) -> list[VideoFinding]:
+def _dropped(clip: Clip, steps_s: np.ndarray, usual_s: float) -> Iterator[VideoFinding]:
     before = np.flatnonzero(steps_s > _HOLE * usual_s)
-    if not before.size or before.size > _UNEVEN_SHARE * len(clip):
-        return []
-    lost = int(np.round((steps_s[before] / usual_s - 1) * np.diff(clip["position"])[before]).sum())
-    places = clip.positions(tuple((int(i), int(i) + 1) for i in before))
-    what = "time stamps leave" if clip.stamped else "numbers in the names leave"
-    message = f"{what} {before.size} hole(s), about {lost} picture(s) were dropped (between frames {worded(places)})"
-    return [VideoFinding("warning", "frames-dropped", message, "", places)]
+    if before.size and before.size <= _UNEVEN_SHARE * len(clip):
+        lost = int(np.round((steps_s[before] / usual_s - 1) * np.diff(clip["position"])[before]).sum())
+        places = clip.positions(tuple((int(i), int(i) + 1) for i in before))
+        what = "time stamps leave" if clip.stamped else "numbers in the names leave"
+        message = (
+            f"{what} {before.size} hole(s), about {lost} picture(s) were dropped (between frames {worded(places)})"
+        )
+        yield VideoFinding("warning", "frames-dropped", message, "", places)
 
 
-def _length(clip: Clip, claimed_s: float | None) -> list[VideoFinding]:
-    if claimed_s is None or not clip.is_whole or not clip.stamped or not clip.rate_hz:
-        return []
-    times_s = clip["time_s"]
-    read_s = float(times_s[-1] - times_s[0]) + 1 / clip.rate_hz
-    if abs(read_s - claimed_s) <= max(_LENGTH_S, _LENGTH_SHARE * claimed_s):
-        return []
-    message = f"the file's header claims {claimed_s:.1f} s, its pictures last {read_s:.1f} s"
-    advice = "what can be read is used; copy the file anew if it is cut off"
-    return [VideoFinding("warning", "length-claimed", message, advice)]
-
-
-def check_packing(packed: Packing | None, pictures: list[np.ndarray]) -> list[VideoFinding]:
-    """Return whether a picture holds two views (stereo), or two fields of different times (interlaced).
+def check_packing(packed: Packing | None, pictures: list[np.ndarray]) -> Iterator[VideoFinding]:
+    """Yield whether a picture holds two views (stereo), or two fields of different times (interlaced).
 
     `pictures` are some of the video, (H, W, 3) uint8; interlacing shows only where something moves.
     """
-    found = []
     if packed is not None:
         where = "beside" if packed.layout == "left-right" else "above"
         squeezed = ", each squeezed to half its size" if packed.squeezed else ""
         correlation = f"(correlation {packed.correlation:.2f})"
         message = f"two views {where} each other{squeezed} {correlation}; the rest is about the first"
-        found.append(VideoFinding("warning", "stereo", message, f"--stereo {packed.layout}"))
+        yield VideoFinding("warning", "stereo", message, f"--stereo {packed.layout}")
     if pictures and is_interlaced(pictures):
         message = "interlaced: odd and even rows show two moments, edges of what moves look like combs"
-        found.append(VideoFinding("warning", "interlaced", message, "--deinterlace"))
-    return found
+        yield VideoFinding("warning", "interlaced", message, "--deinterlace")
 
 
 def repeated(clip: Clip) -> np.ndarray:
@@ -105,20 +101,18 @@ def repeated(clip: Clip) -> np.ndarray:
     return (clip["change"] < LEAST_DIFFERENCE) & ~clip["blank"]
 
 
-def check_repeats(clip: Clip) -> list[VideoFinding]:
-    """Return duplicates, as conversions between rates make them, and frozen stretches."""
+def check_repeats(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield duplicates, as conversions between rates make them, and frozen stretches."""
     flags = repeated(clip)
     frozen = clip.stretches(flags, seconds=0.3, least=4)
     single = stretches_of(flags & ~covered(frozen, len(clip)))
     advice = "runs leave them out (--set input.skip_duplicates=false keeps them)"
-    found = []
     if frozen:
         message = f"the picture is frozen for {clip.counted(frozen)}"
-        found.append(VideoFinding("warning", "frozen", message, advice, clip.positions(frozen)))
+        yield VideoFinding("warning", "frozen", message, advice, clip.positions(frozen))
     if single:
         message = f"the same picture as before: {clip.counted(single)}{_rhythm(single) if clip.step == 1 else ''}"
-        found.append(VideoFinding("info", "duplicates", message, advice, clip.positions(single)))
-    return found
+        yield VideoFinding("info", "duplicates", message, advice, clip.positions(single))
 
 
 def _rhythm(single: tuple[Stretch, ...]) -> str:
@@ -129,36 +123,33 @@ def _rhythm(single: tuple[Stretch, ...]) -> str:
     return f", about every {np.median(steps):.0f}th: the video was converted to a higher rate"
 
 
-def _blank(clip: Clip) -> list[VideoFinding]:
+def _blank(clip: Clip) -> Iterator[VideoFinding]:
     blank, black = clip["blank"], clip["brightness"] <= _BLACK_LEVEL
-    found = []
     for flags, code, words in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
         stretches = stretches_of(flags)
         if stretches:
             message = f"{words}: {clip.counted(stretches)}"
-            found.append(VideoFinding("warning", code, message, clip.selecting(stretches), clip.positions(stretches)))
-    return found
+            yield VideoFinding("warning", code, message, clip.selecting(stretches), clip.positions(stretches))
 
 
-def _blurred(clip: Clip) -> list[VideoFinding]:
+def _blurred(clip: Clip) -> Iterator[VideoFinding]:
     shown, detail = ~clip["blank"], clip["detail"]
     usual = np.median(detail[shown]) if shown.any() else 0.0
     stretches = clip.stretches(shown & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2)
-    if not stretches:
-        return []
-    share = np.median(detail[covered(stretches, len(clip))]) / usual
-    message = (
-        f"blurred, or without texture: {clip.counted(stretches)} show {share:.0%} of the usual detail (a smear on "
-        "the lens, defocus, or tissue very near)"
-    )
-    return [VideoFinding("warning", "blurred", message, clip.selecting(stretches), clip.positions(stretches))]
+    if stretches:
+        share = np.median(detail[covered(stretches, len(clip))]) / usual
+        message = (
+            f"blurred, or without texture: {clip.counted(stretches)} show {share:.0%} of the usual detail (a smear on "
+            "the lens, defocus, or tissue very near)"
+        )
+        yield VideoFinding("warning", "blurred", message, clip.selecting(stretches), clip.positions(stretches))
 
 
-def _colour(clip: Clip) -> list[VideoFinding]:
+def _colour(clip: Clip) -> Iterator[VideoFinding]:
     flags = (clip["redness"] < _LEAST_REDNESS) & ~clip["blank"]
     stretches = clip.stretches(flags, seconds=0.3, least=4, gap=3)
     if not stretches:
-        return []
+        return
     advice = "look at them; narrow-band light is fine to run on"
     if np.mean(flags) > _MOSTLY:
         message = "hardly any picture has the colour of tissue in white light: is it narrow-band light, or no tissue?"
@@ -166,18 +157,17 @@ def _colour(clip: Clip) -> list[VideoFinding]:
         frames = clip.counted(stretches)
         message = f"not the colour of tissue in white light (outside the patient, or narrow-band light): {frames}"
         advice += f", else {clip.selecting(stretches)}" if clip.selecting(stretches) else ""
-    return [VideoFinding("warning", "not-tissue", message, advice, clip.positions(stretches))]
+    yield VideoFinding("warning", "not-tissue", message, advice, clip.positions(stretches))
 
 
-def _exposure(clip: Clip) -> list[VideoFinding]:
-    found, shown = [], ~clip["blank"]
+def _exposure(clip: Clip) -> Iterator[VideoFinding]:
+    shown = ~clip["blank"]
     for name, most, words in _EXPOSURES:
         stretches = clip.stretches(shown & (clip[name] > most), seconds=0.15, least=3, gap=2)
         if stretches:
             worst, frames = float(np.max(clip[name][shown])), clip.counted(stretches)
             message = f"more than {most:.0%} of the field is {words} in {frames}, {worst:.0%} at worst"
-            found.append(VideoFinding("info", name, message, "", clip.positions(stretches)))
-    return found
+            yield VideoFinding("info", name, message, "", clip.positions(stretches))
 
 
 def exposure_figures(clip: Clip) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import av
@@ -47,18 +48,16 @@ def read_container(media: str) -> dict[str, Any] | None:
         return None
 
 
-def check_container(facts: dict[str, Any]) -> list[VideoFinding]:
-    """Return what in the header is unusual."""
-    found = []
+def check_container(facts: dict[str, Any]) -> Iterator[VideoFinding]:
+    """Yield what in the header is unusual."""
     if abs(facts["pixel_aspect"] - 1) > 1e-3:
         message = f"pixels are {facts['pixel_aspect']:.4g} times as wide as high; runs reckon with it"
-        found.append(VideoFinding("info", "pixel-aspect", message))
+        yield VideoFinding("info", "pixel-aspect", message)
     if facts["bits"] > 8:
-        found.append(VideoFinding("info", "bit-depth", f"{facts['bits']} bits per channel; runs work on 8"))
+        yield VideoFinding("info", "bit-depth", f"{facts['bits']} bits per channel; runs work on 8")
     if facts["rotation_deg"]:
         message = f"players turn the picture by {facts['rotation_deg']} deg"
-        found.append(VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see"))
+        yield VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see")
     if facts["interlaced"]:
         message = "the header says that the pictures are interlaced"
-        found.append(VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too"))
-    return found
+        yield VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,27 +55,22 @@ class FieldWatcher:
     """Finds the field from all frames, and its motion from the fields of 25 frames each."""
 
     def __init__(self) -> None:
-        self._times = self._window = np.zeros((0, 0), np.int32)
-        self._count = self._in_window = 0
+        # Grow to (h, w) with the first frame; all frames of a video have one size.
+        self._times = self._window = np.zeros((1, 1), np.int32)
+        self._count = 0
         self._latest: np.ndarray | None = None
-        self._sides: list[Box] = []
+        self._boxes: list[Box] = []
 
     def add(self, item: InspectedFrame) -> None:
         """Add the next frame; blank ones do not count."""
         if item.measures.blank:
             return
         lit = cv2.morphologyEx(item.lit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-        if self._times.shape != lit.shape:
-            self._times, self._window = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
-            self._count = self._in_window = 0
-        self._times += lit
-        self._window += lit
-        self._count, self._in_window = self._count + 1, self._in_window + 1
-        if self._in_window == _WINDOW:
-            self._latest = hull_of_largest(self._window > _LIT_SHARE * self._in_window)
-            left, top, right, bottom = _box(self._latest)
-            self._sides.append((left, right, top, bottom))
-            self._window, self._in_window = np.zeros_like(self._window), 0
+        self._times, self._window, self._count = self._times + lit, self._window + lit, self._count + 1
+        if self._count % _WINDOW == 0:
+            self._latest = hull_of_largest(self._window > _LIT_SHARE * _WINDOW)
+            self._boxes.append(_box(self._latest))
+            self._window = np.zeros_like(self._window)
 
     def field(self) -> Field:
         """Return the field of the frames so far; the whole picture where all were blank."""
@@ -94,31 +90,34 @@ class FieldWatcher:
 
     def _moved(self) -> float:
         """Return by how much opposite sides moved alike, between any two windows; a dark rim moves one of them only."""
-        step = len(self._sides) // _MOST_WINDOWS + 1
-        sides = np.array(self._sides[::step]).reshape(-1, 2, 2)
-        apart = sides[:, None] - sides[None]
-        alike = np.where(np.sign(apart[..., 0]) == np.sign(apart[..., 1]), np.abs(apart).min(-1), 0.0)
-        return float(alike.max()) if alike.size else 0.0
+        step = len(self._boxes) // _MOST_WINDOWS + 1
+        sides = np.array(self._boxes[::step]).reshape(-1, 2, 2)
+        first, second = (sides[:, None] - sides[None]).transpose(2, 0, 1, 3)
+        alike = np.where(np.sign(first) == np.sign(second), np.minimum(np.abs(first), np.abs(second)), 0.0)
+        return float(alike.max(initial=0.0))
 
-    def findings(self) -> list[VideoFinding]:
-        """Return shape and motion of a field that does not fill the picture."""
+    def findings(self) -> Iterator[VideoFinding]:
+        """Yield shape and motion of a field that does not fill the picture."""
         field = self.field()
         if field.shape == "full":
-            return []
+            return
         left, top, right, bottom = field.box
         margins = f"left {left:.1%}, right {1 - right:.1%}, top {top:.1%}, bottom {1 - bottom:.1%}"
         words = _WORDS.get(field.shape, f"a rectangle inside black borders ({margins})")
         message = f"the field of view is {words}, {field.share:.0%} of the picture; runs leave the rest out"
-        found = [VideoFinding("info", f"field-{field.shape.replace(' ', '-')}", message)]
+        yield VideoFinding("info", f"field-{field.shape.replace(' ', '-')}", message)
         if field.moved > _MOVED:
             message = (
                 f"the field of view moves in the picture, by {field.moved:.1%} of its size; runs take all that was "
                 "ever lit for it, less what is black in a frame"
             )
-            advice = "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
-            severity, advice = ("warning", advice) if field.moved > _FAR else ("info", "")
-            found.append(VideoFinding(severity, "field-moves", message, advice))  # type: ignore[arg-type]
-        return found
+            if field.moved <= _FAR:
+                yield VideoFinding("info", "field-moves", message)
+            else:
+                advice = (
+                    "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
+                )
+                yield VideoFinding("warning", "field-moves", message, advice)
 
 
 def _box(mask: np.ndarray) -> Box:

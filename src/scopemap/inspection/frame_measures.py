@@ -112,13 +112,12 @@ class FrameInspector:
         return InspectedFrame(rgb, small, lit, field, masked, measures)
 
     def _change(self, rgb: np.ndarray, small: np.ndarray) -> float:
-        if self._kept is None or self._kept[0].shape != rgb.shape:
-            self._kept = rgb, small
-            return np.inf
-        # Means of pixels differ less than the pixels do: only where they agree, all pixels are compared.
-        change = mean_difference(small, self._kept[1])
-        if change < LEAST_DIFFERENCE:
-            change = mean_difference(rgb, self._kept[0])
+        change = np.inf
+        if self._kept is not None:
+            # Means of pixels differ less than the pixels do: only where they agree, all pixels are compared.
+            change = mean_difference(small, self._kept[1])
+            if change < LEAST_DIFFERENCE:
+                change = mean_difference(rgb, self._kept[0])
         if change >= LEAST_DIFFERENCE:
             self._kept = rgb, small
         return change
@@ -126,7 +125,7 @@ class FrameInspector:
     def _motion(self, small: np.ndarray) -> float:
         grey = cv2.cvtColor(smaller(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
         before, self._before = self._before, grey
-        if before is None or before.shape != grey.shape:
+        if before is None:
             return 0.0
         flow = self._flow.calc(before, grey, np.zeros((*grey.shape, 2), np.float32))
         return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1]

@@ -26,7 +26,7 @@ from scopemap.inspection.clip import Clip, VideoFinding
 from scopemap.inspection.container import check_container, read_container
 from scopemap.inspection.field import Field, FieldWatcher
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
-from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher
+from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher, ShareBox
 from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import UNKNOWN_MAKE
@@ -60,7 +60,7 @@ class Inspection:
     packed: Packing | None
     field: Field
     overlays: tuple[Overlay, ...]
-    insets: tuple[tuple[float, float, float, float], ...]
+    insets: tuple[ShareBox, ...]
     findings: tuple[VideoFinding, ...]
     samples: tuple[InspectedFrame, ...]
 
@@ -68,16 +68,17 @@ class Inspection:
     def facts(self) -> dict[str, Any]:
         """What the video is, and the usual shares of its pictures; what is not known is left out."""
         times_s = self.clip["time_s"]
-        facts = dict(self.container or {})
-        facts |= {"width": self.size[0], "height": self.size[1], "pictures": len(self.clip)}
-        facts |= {"span_s": float(times_s[-1] - times_s[0]), "usual_rate_hz": self.clip.rate_hz}
-        facts |= {
+        facts = (self.container or {}) | {
+            "width": self.size[0],
+            "height": self.size[1],
+            "pictures": len(self.clip),
+            "span_s": float(times_s[-1] - times_s[0]),
+            "usual_rate_hz": self.clip.rate_hz,
             "repeated": int(repeated(self.clip).sum()),
             "field": self.field.shape,
             "field_share": self.field.share,
         }
-        facts |= exposure_figures(self.clip)
-        return {name: value for name, value in facts.items() if value is not None}
+        return {name: value for name, value in (facts | exposure_figures(self.clip)).items() if value is not None}
 
     @property
     def report(self) -> dict[str, Any]:
@@ -112,7 +113,7 @@ def inspect(
     sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
     media = sequence.source.media()
     container = None if media is None else read_container(media)
-    field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled(_KEPT)
+    field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled()
     measures, stopped = [], ""
     try:
         for item in _inspected(sequence):
@@ -137,7 +138,6 @@ def inspect(
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
         *check_frames(clip),
     ]
-    height, width = sampled.kept[0].small.shape[:2]
     return Inspection(
         path=sequence.path,
         size=(sequence.source.width, sequence.source.height),
@@ -146,7 +146,7 @@ def inspect(
         packed=packed,
         field=field.field(),
         overlays=tuple(overlays.overlays()),
-        insets=tuple((a / width, b / height, c / width, d / height) for a, b, c, d in insets.boxes()),
+        insets=tuple(insets.boxes()),
         findings=tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.severity))),
         samples=tuple(sampled.kept),
     )
@@ -182,23 +182,21 @@ def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
 
 def _of_source(warnings: list[str]) -> list[VideoFinding]:
     """Return a finding for each of the reader's warnings, those after the third counted."""
-    found = [VideoFinding("warning", "source", warning) for warning in warnings[:_NAMED]]
-    if len(warnings) > _NAMED:
-        found.append(VideoFinding("warning", "source", f"and {len(warnings) - _NAMED} more warnings of the reader"))
-    return found
+    more = len(warnings) - _NAMED
+    messages = warnings[:_NAMED] + ([f"and {more} more warnings of the reader"] if more > 0 else [])
+    return [VideoFinding("warning", "source", message) for message in messages]
 
 
 class _Sampled:
     """Keeps a few frames of a video of unknown length, evenly spread."""
 
-    def __init__(self, most: int) -> None:
-        self._most, self._step, self._seen = most, 1, 0
+    def __init__(self) -> None:
+        self._step, self._seen = 1, 0
         self.kept: list[InspectedFrame] = []
 
     def add(self, item: InspectedFrame) -> None:
-        if self._seen % self._step == 0 and len(self.kept) == self._most:
-            self.kept = self.kept[::2]
-            self._step *= 2
         if self._seen % self._step == 0:
             self.kept.append(item)
+        if len(self.kept) > _KEPT:
+            self.kept, self._step = self.kept[::2], 2 * self._step
         self._seen += 1

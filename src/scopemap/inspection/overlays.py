@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
 import cv2
 import numpy as np
 
-from scopemap.inspection.clip import VideoFinding
+from scopemap.inspection.clip import VideoFinding, stretches_of
 from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.masker import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
@@ -18,6 +19,7 @@ _JOIN_SHARE = 0.02
 _LEAST_TIMES, _LEAST_TIMES_SHARE = 12, 0.05
 _LEAST_BOX_PX = 3
 Box = tuple[int, int, int, int]
+ShareBox = tuple[float, float, float, float]
 
 # A static edge is this much stronger, on average, than the image beside it.
 _RIDGE, _RIDGE_LEVELS, _BESIDE_PX = 1.6, 4.0, 9
@@ -30,7 +32,7 @@ _MOVED_PX = 0.004
 class Overlay:
     """One overlay: left, top, right, bottom as shares of width and height; whether it is in the field of view."""
 
-    box: tuple[float, float, float, float]
+    box: ShareBox
     in_field: bool
 
 
@@ -39,7 +41,8 @@ class OverlayWatcher:
 
     def __init__(self) -> None:
         self._finder = OverlayFinder()
-        self._times = np.zeros((0, 0), np.int32)
+        # Grows to (h, w) with the first frame; all frames of a video have one size.
+        self._times = np.zeros((1, 1), np.int32)
         self._looked = 0
         self._field = np.zeros((0, 0), bool)
 
@@ -48,17 +51,11 @@ class OverlayWatcher:
         # A field that moves has its rim inside of all that was ever lit.
         rim = _rim(item.field) | _rim(hull_of_largest(item.lit)) | (_beside_black(item.lit) & item.field)
         found = self._finder(item.small, item.field, ~rim & ~item.field)
-        if self._times.shape != rim.shape:
-            self._times, self._looked = np.zeros(rim.shape, np.int32), 0
-        self._field = item.field
-        self._looked += 1
-        if found is not None:
-            self._times += found & ~rim
+        self._times = self._times + (np.zeros_like(rim) if found is None else found & ~rim)
+        self._field, self._looked = item.field, self._looked + 1
 
     def overlays(self) -> list[Overlay]:
         """Return the overlays that were there for at least 12 frames and 5 % of them."""
-        if not self._times.size:
-            return []
         height, width = self._times.shape
         there = (self._times >= max(_LEAST_TIMES, _LEAST_TIMES_SHARE * self._looked)).astype(np.uint8)
         # Letters of a word, and words of a line, belong together.
@@ -72,21 +69,20 @@ class OverlayWatcher:
                 found.append(Overlay(box, bool(self._field[labels == label].mean() > 0.5)))
         return sorted(found, key=lambda one: one.box)
 
-    def findings(self) -> list[VideoFinding]:
-        """Return the overlays in and beside the field of view, and the warning about patients' names."""
-        overlays, found = self.overlays(), []
+    def findings(self) -> Iterator[VideoFinding]:
+        """Yield the overlays in and beside the field of view, and the warning about patients' names."""
+        overlays = self.overlays()
         inside, outside = ([one for one in overlays if one.in_field is where] for where in (True, False))
         if inside:
             message = f"{len(inside)} overlay(s) in the field of view (text, logos): {_places(inside)}"
             advice = "runs leave them out; where they miss some, give masks: --set mask.files=FOLDER"
-            found.append(VideoFinding("warning", "overlay", message, advice))
+            yield VideoFinding("warning", "overlay", message, advice)
         if outside:
             message = f"{len(outside)} overlay(s) beside the field of view (text, logos): {_places(outside)}"
-            found.append(VideoFinding("info", "overlay-outside", message))
+            yield VideoFinding("info", "overlay-outside", message)
         if overlays:
             message = "burned-in text may name a patient: look before you pass the video or pictures of it on"
-            found.append(VideoFinding("info", "overlay-privacy", message))
-        return found
+            yield VideoFinding("info", "overlay-privacy", message)
 
 
 def _rim(field: np.ndarray) -> np.ndarray:
@@ -116,50 +112,44 @@ class InsetWatcher:
     def __init__(self) -> None:
         self._count = 0
         self._last: np.ndarray | None = None
-        self._across = self._down = self._change = np.zeros((0, 0), np.float32)
+        self._across = self._down = self._change = np.zeros((1, 1), np.float32)
         self._field: np.ndarray = np.zeros((0, 0), bool)
 
     def add(self, item: InspectedFrame) -> None:
         """Add the next frame."""
         grey = cv2.cvtColor(item.small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-        if self._last is None or self._last.shape != grey.shape:
-            self._count, self._last = 0, grey
-            self._across, self._down, self._change = (np.zeros_like(grey) for _ in range(3))
+        if self._last is None:
+            self._last = grey
         if item.measures.blank or item.measures.motion < _MOVED_PX:
             return
         self._count += 1
-        self._across[:, 1:] += np.abs(np.diff(grey, axis=1))
-        self._down[1:] += np.abs(np.diff(grey, axis=0))
-        self._change += cv2.absdiff(grey, self._last)
+        self._across = self._across + np.abs(np.diff(grey, axis=1, prepend=grey[:, :1]))
+        self._down = self._down + np.abs(np.diff(grey, axis=0, prepend=grey[:1]))
+        self._change = self._change + cv2.absdiff(grey, self._last)
         self._last, self._field = grey, item.field
 
-    def boxes(self) -> list[Box]:
-        """Return the insets: left, top, right, bottom in px of the small pictures, right and bottom excluded."""
+    def boxes(self) -> list[ShareBox]:
+        """Return the insets: left, top, right, bottom as shares of width and height."""
         if self._count < _LEAST_PICTURES:
             return []
         height, width = self._across.shape
         upright = _lines(self._across / self._count, round(_LEAST_SIDE * height))
         level = _lines((self._down / self._count).T, round(_LEAST_SIDE * width)).T
-        columns, rows = _strongest(upright.sum(0)), _strongest(level.sum(1))
-        across, down = (
-            list(combinations(sorted({0, *sides, end}), 2)) for sides, end in ((columns, width), (rows, height))
-        )
+        columns, rows = {0, width, *_strongest(upright.sum(0))}, {0, height, *_strongest(level.sum(1))}
+        across, down = list(combinations(sorted(columns), 2)), list(combinations(sorted(rows), 2))
         boxes = [(left, top, right, bottom) for left, right in across for top, bottom in down]
-        return _largest_first([box for box in boxes if self._is_inset(box, upright, level)])
+        kept = _largest_first([box for box in boxes if self._is_inset(box, upright, level)])
+        return [(a / width, b / height, c / width, d / height) for a, b, c, d in kept]
 
-    def findings(self) -> list[VideoFinding]:
-        """Return a finding where there is an inset."""
-        boxes = self.boxes()
-        if not boxes:
-            return []
-        height, width = self._across.shape
-        places = ", ".join(
-            f"{x0 / width:.0%}-{x1 / width:.0%} of the width, {y0 / height:.0%}-{y1 / height:.0%} of the height"
-            for x0, y0, x1, y1 in boxes
-        )
-        message = f"picture in picture: {places} shows something else"
-        advice = "leave it out: --masks FOLDER of this command writes a mask, --set mask.files=FOLDER of a run reads it"
-        return [VideoFinding("warning", "inset", message, advice)]
+    def findings(self) -> Iterator[VideoFinding]:
+        """Yield a finding where there is an inset."""
+        places = [f"{a:.0%}-{c:.0%} of the width, {b:.0%}-{d:.0%} of the height" for a, b, c, d in self.boxes()]
+        if places:
+            message = f"picture in picture: {', '.join(places)} shows something else"
+            advice = (
+                "leave it out: --masks FOLDER of this command writes a mask, --set mask.files=FOLDER of a run reads it"
+            )
+            yield VideoFinding("warning", "inset", message, advice)
 
     def _is_inset(self, box: Box, upright: np.ndarray, level: np.ndarray) -> bool:
         left, top, right, bottom = box
@@ -189,9 +179,8 @@ def _lines(strength: np.ndarray, least_px: int) -> np.ndarray:
 
 def _strongest(lengths: np.ndarray) -> list[int]:
     """Return the middles of the longest groups of lines."""
-    groups = np.split(np.flatnonzero(lengths), np.flatnonzero(np.diff(np.flatnonzero(lengths)) > 1) + 1)
-    found = sorted(((int(lengths[g].max()), int(np.round(g.mean()))) for g in groups if g.size), reverse=True)
-    return [middle for _, middle in found[:_MOST_LINES]]
+    groups = [(int(lengths[a : b + 1].max()), round((a + b) / 2)) for a, b in stretches_of(lengths > 0)]
+    return [middle for _, middle in sorted(groups, reverse=True)[:_MOST_LINES]]
 
 
 def _largest_first(boxes: list[Box]) -> list[Box]:

@@ -45,8 +45,8 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     """
     views = _chosen(inspection.samples)
     bands = [(f.code, f.stretches) for f in inspection.findings if f.stretches and f.code in _BANDS]
-    aspects = [_height_share(views[0].rgb), _height_share(views[0].frame.rgb)]
-    rows_in = [_WIDTH_IN / _SHOWN * min(aspect, 1.6) + 0.25 for aspect in aspects]
+    shapes = (views[0].rgb.shape, views[0].frame.rgb.shape)
+    rows_in = [_WIDTH_IN / _SHOWN * min(height / width, 1.6) + 0.25 for height, width, _ in shapes]
     heights = [*rows_in, *[_LINE_IN] * len(_LINES), *([_BANDS_IN * len(bands) + 0.4] if bands else [])]
     figure = new_figure(_WIDTH_IN, sum(heights) + 0.6)
     grid = figure.add_gridspec(len(heights), _SHOWN, height_ratios=heights)
@@ -69,9 +69,8 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
         axes = figure.add_subplot(grid[len(heights) - 1, :], sharex=first)
         _draw_bands(axes, bands)
         _finish(axes, inspection, views)
-    figure.axes[-1].set_xlabel(
-        "frame, counted from 0" + (" (orange dots: repeated)" if repeated(inspection.clip).any() else "")
-    )
+    dots = " (orange dots: repeated)" if repeated(inspection.clip).any() else ""
+    figure.axes[-1].set_xlabel(f"frame, counted from 0{dots}")
     headline(figure, _title(inspection))
     figure.savefig(file)
 
@@ -99,10 +98,6 @@ def _chosen(samples: tuple[InspectedFrame, ...]) -> list[InspectedFrame]:
     shown = [view for view in samples if not view.measures.blank] or list(samples)
     places = np.unique(np.linspace(0, len(shown) - 1, _SHOWN).round().astype(int))
     return [shown[place] for place in places]
-
-
-def _height_share(rgb: np.ndarray) -> float:
-    return float(rgb.shape[0] / rgb.shape[1])
 
 
 def _draw_found(axes: Axes, view: InspectedFrame, inspection: Inspection) -> None:

@@ -13,9 +13,8 @@ _SWAY_FRAMES = (90.0, 170.0)
 def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
     """Return a hand-like path along a winding or straight tube, (frames, 4, 4): forward, or forward and back."""
     rng = np.random.default_rng((seed, 1))
-    phase = _phase(frames, loop)
     length = _SPEED_MM * max(frames - 1, 1) * (0.5 if loop else 1.0)
-    progress = 0.5 * (1 - np.cos(phase)) if loop else np.linspace(0, 1, frames)
+    progress = 0.5 * (1 - np.cos(_phase(frames))) if loop else np.linspace(0, 1, frames)
     stations = np.linspace(0, length, max(int(length * 2), 2))
     yaw, pitch = (np.radians(0 if straight else 28) * _wander(stations, rng, (120.0, 220.0)) for _ in range(2))
     heading = np.stack([np.sin(yaw), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], -1)
@@ -39,9 +38,9 @@ def sweep_path(frames: int, loop: bool, seed: int) -> np.ndarray:
     return _poses(positions, look + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
 
 
-def _phase(frames: int, loop: bool) -> np.ndarray:
-    """Angle 0 to 2 pi over a loop, whose last frame is its first; else the share of the path, 0 to 1."""
-    return np.linspace(0, 2 * np.pi if loop else 1.0, frames)
+def _phase(frames: int) -> np.ndarray:
+    """Angle 0 to 2 pi over a loop, whose last frame is its first."""
+    return np.linspace(0, 2 * np.pi, frames)
 
 
 def _wander(x: np.ndarray, rng: np.random.Generator, periods: tuple[float, float]) -> np.ndarray:
@@ -65,7 +64,7 @@ def _sway(
             amplitude *= min(1.0, frames / frames_per_cycle[0])
             turns = np.maximum(np.round(frames / rng.uniform(*frames_per_cycle, 3) * [1.0, 1.6, 2.6]), 1)
             phase = rng.uniform(0, 2 * np.pi, 3)
-            wave = np.sin(_phase(frames, loop)[:, None] * turns + phase) @ [0.55, 0.3, 0.15]
+            wave = np.sin(_phase(frames)[:, None] * turns + phase) @ [0.55, 0.3, 0.15]
             columns.append(amplitude * (wave - wave[0]))
         else:
             columns.append(amplitude * _wander(np.arange(frames), rng, frames_per_cycle))

@@ -55,9 +55,7 @@ class Breathing:
     def at(self, index: int) -> Displacement:
         """Return the displacement of frame `index`."""
         strength = 0.5 - 0.5 * np.cos(2 * np.pi * index / self.period_frames)
-        waves = self.waves.copy()
-        waves[:, 3:6] *= strength
-        return Displacement(waves if strength > 0 else REST.waves)
+        return Displacement(self.waves * [1, 1, 1, strength, strength, strength, 1])
 
 
 def breathing(amplitude_mm: float, period_frames: float, seed: int) -> Breathing:

@@ -109,6 +109,12 @@ class Volume:
             squared += ndimage.maximum_filter(slope, size=6, origin=-1, mode="nearest") ** 2
         return np.sqrt(squared)
 
+    def cells_of(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the cells, three index arrays (N,), of points (..., 3); NaN points are left out."""
+        points = points_mm.reshape(-1, 3)
+        i, j, k = ((points[np.isfinite(points[:, 0])] - self.origin_mm) / self.voxel_mm).astype(int).T
+        return i, j, k
+
     def values_at(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the shape function (N,) in mm and its gradient (N, 3) at points (N, 3); NaN outside the grid."""
         grid = np.ascontiguousarray((points_mm - self.origin_mm) / self.voxel_mm, dtype=np.float64)

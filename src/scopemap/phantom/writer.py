@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -29,25 +30,9 @@ _SEEN_MARGIN_VOXELS = 2
 _RIM_VOXELS = 4
 
 
-@dataclass
-class SeenVoxels:
-    """The voxels of the volume's surface that the cameras have seen, frame by frame."""
-
-    volume: Volume
-    voxels: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.voxels = np.zeros(self.volume.coefficients.shape, bool)
-
-    def add(self, rest_mm: np.ndarray) -> None:
-        """Mark the voxels of rest points (H, W, 3); NaN points are ignored."""
-        points = rest_mm.reshape(-1, 3)
-        cells = ((points[np.isfinite(points[:, 0])] - self.volume.origin_mm) / self.volume.voxel_mm).astype(int)
-        self.voxels[tuple(cells.T)] = True
-
-    def mesh(self) -> trimesh.Trimesh:
-        """Return the true surface at rest where it was seen, with a rim of 2 voxels."""
-        return surface_mesh(self.volume, ndimage.binary_dilation(self.voxels, iterations=_SEEN_MARGIN_VOXELS))
+def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
+    """Return the true surface at rest in the voxels `seen` (X, Y, Z) bool, with a rim of 2 voxels."""
+    return surface_mesh(volume, ndimage.binary_dilation(seen, iterations=_SEEN_MARGIN_VOXELS))
 
 
 def surface_mesh(volume: Volume, where: np.ndarray) -> trimesh.Trimesh:
@@ -82,21 +67,23 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
     _check_free(folder)
     phantom = prepare(spec)
     try:
-        _clear(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in chain.from_iterable(folder.glob(pattern) for pattern in _OWN_FILES):
+            file.unlink()
         _write_description(phantom, folder / "phantom.json")
         # C3VD's lines: 16 numbers, transposed, so that the translation is the last row.
         rows = phantom.poses.transpose(0, 2, 1).reshape(-1, 16)
         np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
         _write_camera(spec, folder / "camera.yaml")
-        seen = SeenVoxels(phantom.volume)
+        seen = np.zeros(phantom.volume.coefficients.shape, bool)
         for index in range(len(phantom.poses)):
             rgb, surface = render_frame(phantom, index)
-            seen.add(surface.rest_mm)
+            seen[phantom.volume.cells_of(surface.rest_mm)] = True
             _write_image(folder / f"{index:04d}_color.png", rgb[..., ::-1])
             _write_image(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
             if progress is not None:
                 progress(index + 1, len(phantom.poses))
-        _write_meshes(phantom, seen, folder)
+        _write_meshes(phantom, seen_surface(phantom.volume, seen), folder)
     except OSError as error:
         raise InputError(f"cannot write the phantom to {folder}: {error}") from None
 
@@ -114,41 +101,29 @@ def _check_free(folder: Path) -> None:
         raise InputError(f"will not write a phantom into {folder}: it holds other files; name a new or empty folder")
 
 
-def _clear(folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for pattern in _OWN_FILES:
-        for file in folder.glob(pattern):
-            file.unlink()
-
-
 def _write_image(file: Path, image: np.ndarray) -> None:
     if not cv2.imwrite(str(file), image):
         raise OSError(f"{file.name} could not be encoded or stored")
 
 
 def _write_camera(spec: PhantomSpec, file: Path) -> None:
-    camera = spec.camera
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    if not storage.isOpened():
-        raise OSError(f"{file.name} could not be opened")
-    storage.write("image_width", camera.width)
-    storage.write("image_height", camera.height)
-    storage.write("camera_matrix", camera.matrix)
+    storage.write("image_width", spec.width)
+    storage.write("image_height", spec.height)
+    storage.write("camera_matrix", spec.camera.matrix)
     storage.write("distortion_coefficients", np.zeros((1, 5)))
     storage.write("depth_scale", spec.depth_scale_mm)
     storage.write("fps", spec.fps)
     storage.release()
 
 
-def _write_meshes(phantom: Phantom, seen: SeenVoxels, folder: Path) -> None:
-    mesh = seen.mesh()
+def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None:
     mesh.export(folder / "mesh_truth.ply")
-    if not phantom.spec.deform:
-        return
-    (folder / "mesh_truth").mkdir(exist_ok=True)
-    for index in range(len(phantom.poses)):
-        moved = phantom.breath.at(index).move(np.asarray(mesh.vertices))
-        trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
+    if phantom.spec.deform:
+        (folder / "mesh_truth").mkdir(exist_ok=True)
+        for index in range(len(phantom.poses)):
+            moved = phantom.breath.at(index).move(np.asarray(mesh.vertices))
+            trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
 
 
 def _write_description(phantom: Phantom, file: Path) -> None:
