@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.consistency import ConsistencyMeter
 from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher
 from scopemap.evaluation.depth import depth_scale, evaluate_depth, scale_jitter
 from scopemap.flow.consistency import pair_flow
@@ -292,7 +292,7 @@ def steadiness(
     meter, scales = ConsistencyMeter(camera), []
     previous_mm = None
     for valid, depth_mm, link in zip(counted, depths_mm, links, strict=True):
-        meter.add(DepthFrame(depth_mm, valid), link)
+        meter.add(depth_mm, valid, link)
         current_mm = np.where(valid, depth_mm, np.nan).astype(np.float32)
         if previous_mm is not None and link is not None and link.to_previous is not None:
             before_mm = np.where(link.consistent, pull(previous_mm, link.to_previous), np.nan)

@@ -61,7 +61,7 @@ def test_json_is_all_that_is_printed(say: Say, video: Path, tmp_path: Path) -> N
     assert (told["facts"]["pictures"], told["facts"]["width"], told["facts"]["field"]) == (36, 320, "full")
     codes = [finding["code"] for finding in told["findings"]]
     assert codes == ["overlay", "inset", "overlay-privacy"]
-    assert told["findings"][0].keys() == {"severity", "code", "message", "advice", "stretches"}
+    assert told["findings"][0].keys() == {"severity", "code", "message", "advice", "segments"}
     assert len(told["overlays"]) == len(told["insets"]) == 1
     assert file.is_file()
     assert [mask.name for mask in masks.iterdir()] == ["mask.png"]

@@ -34,7 +34,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.errors import InputError
-from scopemap.inspection.clip import VideoFinding, covered, stretches_of
+from scopemap.inspection.clip import VideoFinding, covered, segments_of
 from scopemap.inspection.inspecting import Inspection, inspect
 from scopemap.inspection.picture import write_mask
 from scopemap.io.opening import open_sequence
@@ -162,17 +162,17 @@ def test_a_picture_in_the_picture_is_found_and_its_masks_are_read_by_runs(inspec
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "stretch", "advice"),
+    ("name", "code", "segment", "advice"),
     [("blur", "blurred", (15, 24), "the longest part without them: --frames 25:"),
      ("black", "black", (0, 9), "leave them out with --frames 10:"),
      ("drape", "not-tissue", (38, 49), "leave them out with --frames :38")],
 )  # fmt: skip
-def test_stretches_of_no_use(inspected: Inspect, name: str, code: str, stretch: tuple[int, int], advice: str) -> None:
+def test_segments_of_no_use(inspected: Inspect, name: str, code: str, segment: tuple[int, int], advice: str) -> None:
     found = by_code(inspected(name))
     assert list(found) == [code]
-    (first, last), *others = found[code].stretches
+    (first, last), *others = found[code].segments
     assert not others
-    assert (first, last) == pytest.approx(stretch, abs=1)
+    assert (first, last) == pytest.approx(segment, abs=1)
     assert found[code].advice.endswith(advice)
 
 
@@ -187,12 +187,12 @@ def test_freezes_and_duplicates(tmp_path: Path) -> None:
     pictures = clip(COUNT)
     found = inspect(write(tmp_path / "freeze.mp4", pictures[:30] + [pictures[29]] * 12 + pictures[30:40]))
     assert set(by_code(found)) == {"frozen"}
-    (stretch,) = by_code(found)["frozen"].stretches
-    assert stretch == pytest.approx((30, 41), abs=1)
+    (segment,) = by_code(found)["frozen"].segments
+    assert segment == pytest.approx((30, 41), abs=1)
     # From 25 to 30 pictures per second: every fifth twice.
     twice = [p for i, p in enumerate(pictures) for p in ([p, p] if i % 5 == 4 else [p])]
     duplicates = by_code(inspect(write(tmp_path / "twice.mp4", twice)))["duplicates"]
-    assert duplicates.stretches == tuple((5 + 6 * i, 5 + 6 * i) for i in range(10))
+    assert duplicates.segments == tuple((5 + 6 * i, 5 + 6 * i) for i in range(10))
     assert "every 6th" in duplicates.message
 
 
@@ -200,7 +200,7 @@ def test_holes_and_an_uneven_rate_of_time_stamps(tmp_path: Path) -> None:
     pictures = clip(COUNT)
     found = by_code(inspect(write(tmp_path / "hole.mp4", pictures, stamps_with_a_hole(COUNT))))
     assert set(found) == {"frames-dropped"}
-    assert found["frames-dropped"].stretches == ((COUNT // 2 - 1, COUNT // 2),)
+    assert found["frames-dropped"].segments == ((COUNT // 2 - 1, COUNT // 2),)
     assert "about 5 picture(s)" in found["frames-dropped"].message
     uneven = [number * 3 + (number % 3 == 1) for number in range(COUNT)]
     assert set(by_code(inspect(write(tmp_path / "uneven.mp4", pictures, uneven)))) == {"rate-variable"}
@@ -223,13 +223,13 @@ def test_positions_count_unreadable_images_as_frames_does(tmp_path: Path) -> Non
     inspection = inspect(tmp_path)
     found = by_code(inspection)
     assert set(found) == {"source", "not-tissue"}
-    assert found["not-tissue"].stretches == ((25, 39),)
+    assert found["not-tissue"].segments == ((25, 39),)
     assert found["not-tissue"].advice.endswith("--frames :25")
     assert [view.measures.position for view in inspection.samples][-1] > 30
     told = [finding.message for finding in inspection.findings if finding.code == "source"]
     assert (len(told), told[-1]) == (4, "and 3 more warnings of the reader")
     part = by_code(inspect(tmp_path, frames=slice(10, None, 2)))["not-tissue"]
-    assert part.stretches == ((26, 38),)
+    assert part.segments == ((26, 38),)
     assert part.advice.endswith("--frames 10:26:2")
 
 
@@ -275,22 +275,22 @@ def test_what_breaks_off_is_said_and_what_is_no_video_refused(tmp_path: Path) ->
 def test_an_overlay_changes_no_other_finding(inspected: Inspect, tmp_path: Path, name: str) -> None:
     at = np.random.default_rng(len(name)).integers((70, 100), (110, 180))
     written = clip(COUNT, *CHANGES[name], text("DR. X 09:15", tuple(at.tolist())))
-    codes = {f.code: f.stretches for f in inspect(write(tmp_path / "text.mp4", written)).findings}
-    without = {f.code: f.stretches for f in inspected(name).findings}
+    codes = {f.code: f.segments for f in inspect(write(tmp_path / "text.mp4", written)).findings}
+    without = {f.code: f.segments for f in inspected(name).findings}
     assert {code: where for code, where in codes.items() if not code.startswith("overlay")} == without
     assert "overlay" in codes
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(0, 4))
-def test_stretches_cover_what_they_are_of(flags: list[bool], least: int, gap: int) -> None:
+def test_segments_cover_what_they_are_of(flags: list[bool], least: int, gap: int) -> None:
     true = np.array(flags, bool)
-    stretches = stretches_of(true, least, gap)
-    assert all(true[first] and true[last] and last - first + 1 >= least for first, last in stretches)
-    assert all(b[0] - a[1] > gap + 1 for a, b in pairwise(stretches))
+    segments = segments_of(true, least, gap)
+    assert all(true[first] and true[last] and last - first + 1 >= least for first, last in segments)
+    assert all(b[0] - a[1] > gap + 1 for a, b in pairwise(segments))
     if least == 1:
-        assert not (true & ~covered(stretches, len(true))).any()
+        assert not (true & ~covered(segments, len(true))).any()
         if gap == 0:
-            np.testing.assert_array_equal(covered(stretches, len(true)), true)
+            np.testing.assert_array_equal(covered(segments, len(true)), true)
 
 
 @pytest.mark.real

@@ -11,7 +11,7 @@ from plane_scene import CAMERA, EVERYWHERE, SIX_PIXELS_MM, View, pose, see, true
 from scopemap.evaluation.correspondences import (
     Matches,
     displacement_figures,
-    displacements,
+    lifted_matches,
     match_features,
     orb_features,
 )
@@ -32,6 +32,10 @@ def exact_matches(previous: View, current: View) -> Matches:
     return Matches(current_px + true_flow(current, previous)[v.ravel(), u.ravel()], current_px.astype(float))
 
 
+def apart_mm(lifted: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    return np.asarray(np.linalg.norm(lifted[0] - lifted[1], axis=1))
+
+
 def test_a_camera_that_moves_six_pixels_aside_moves_its_matches_by_six_pixels() -> None:
     matches = matched(START, ASIDE)
     assert len(matches.current_px) > 100
@@ -41,43 +45,43 @@ def test_a_camera_that_moves_six_pixels_aside_moves_its_matches_by_six_pixels() 
 
 
 def test_exact_depth_and_poses_put_matches_onto_each_other() -> None:
-    found = displacements(
+    found = lifted_matches(
         matched(START, ASIDE), START.depth_mm, ASIDE.depth_mm, CAMERA, (START.T_world_camera, ASIDE.T_world_camera)
     )
-    assert np.median(found.displacement_mm) < 1e-3
+    assert np.median(apart_mm(found)) < 1e-3
     # A pixel is a third of a millimetre here.
-    assert np.mean(found.displacement_mm) < 0.15
-    assert found.relative == pytest.approx(found.displacement_mm / 50, rel=1e-6)
+    assert np.mean(apart_mm(found)) < 0.15
+    assert found[2] == pytest.approx(50, rel=1e-6)
 
 
 @pytest.mark.parametrize("turn_rad", [(0.0, 0.0, 0.0), (0.05, -0.1, 0.2)])
 def test_exact_matches_lift_to_one_point_of_the_plane(turn_rad: tuple[float, ...]) -> None:
     view = see(pose(at_mm=(3.0, -2.0, 4.0), turn_rad=turn_rad))
     poses = (START.T_world_camera, view.T_world_camera)
-    found = displacements(exact_matches(START, view), START.depth_mm, view.depth_mm, CAMERA, poses)
-    assert len(found.displacement_mm) > 50
-    assert found.displacement_mm.max() < 2e-3
-    assert found.current_mm[:, 2] == pytest.approx(scene.PLANE_MM, abs=1e-3)
+    found = lifted_matches(exact_matches(START, view), START.depth_mm, view.depth_mm, CAMERA, poses)
+    assert len(apart_mm(found)) > 50
+    assert apart_mm(found).max() < 2e-3
+    assert found[1][:, 2] == pytest.approx(scene.PLANE_MM, abs=1e-3)
 
 
 def test_without_poses_the_displacement_is_the_camera_s_motion() -> None:
     matches = exact_matches(START, ASIDE)
-    found = displacements(matches, START.depth_mm, ASIDE.depth_mm, CAMERA)
-    assert found.displacement_mm == pytest.approx(SIX_PIXELS_MM, abs=1e-3)
+    found = lifted_matches(matches, START.depth_mm, ASIDE.depth_mm, CAMERA)
+    assert apart_mm(found) == pytest.approx(SIX_PIXELS_MM, abs=1e-3)
 
 
 def test_poses_the_wrong_way_round_double_the_motion_instead_of_removing_it() -> None:
     poses = (inverse(START.T_world_camera), inverse(ASIDE.T_world_camera))
-    found = displacements(exact_matches(START, ASIDE), START.depth_mm, ASIDE.depth_mm, CAMERA, poses)
-    assert found.displacement_mm == pytest.approx(2 * SIX_PIXELS_MM, abs=1e-3)
+    found = lifted_matches(exact_matches(START, ASIDE), START.depth_mm, ASIDE.depth_mm, CAMERA, poses)
+    assert apart_mm(found) == pytest.approx(2 * SIX_PIXELS_MM, abs=1e-3)
 
 
 def test_depth_that_is_one_percent_off_moves_points_by_one_percent_of_their_distance() -> None:
     matches = exact_matches(START, START)
-    found = displacements(matches, START.depth_mm, 1.01 * START.depth_mm, CAMERA)
+    found = lifted_matches(matches, START.depth_mm, 1.01 * START.depth_mm, CAMERA)
     from_camera_mm = scene.PLANE_MM * np.linalg.norm(CAMERA.unproject(matches.current_px), axis=1)
-    assert found.displacement_mm == pytest.approx(0.01 * from_camera_mm, rel=1e-4)
-    assert found.depth_mm == pytest.approx(1.005 * scene.PLANE_MM)
+    assert apart_mm(found) == pytest.approx(0.01 * from_camera_mm, rel=1e-4)
+    assert found[2] == pytest.approx(1.005 * scene.PLANE_MM)
 
 
 def test_matches_without_depth_at_both_ends_are_left_out() -> None:
@@ -86,10 +90,10 @@ def test_matches_without_depth_at_both_ends_are_left_out() -> None:
     )
     holes = START.depth_mm.copy()
     holes[10, 10] = np.nan
-    found = displacements(matches, holes, START.depth_mm, CAMERA)
+    found = lifted_matches(matches, holes, START.depth_mm, CAMERA)
     # The first starts in the hole, the last ends outside the image.
-    assert len(found.displacement_mm) == 1
-    assert found.current_mm[0] == pytest.approx(50 * CAMERA.unproject(np.array([22.0, 20.0])))
+    assert len(apart_mm(found)) == 1
+    assert found[1][0] == pytest.approx(50 * CAMERA.unproject(np.array([22.0, 20.0])))
 
 
 def test_matching_is_the_same_every_time() -> None:
@@ -134,8 +138,8 @@ def test_images_without_texture_have_no_features_and_no_matches() -> None:
     blank = orb_features(np.full_like(START.rgb, 90))
     assert blank[0].shape == (0, 2)
     assert len(match_features(blank, orb_features(START.rgb), CAMERA).current_px) == 0
-    nothing = displacements(match_features(blank, blank, CAMERA), START.depth_mm, START.depth_mm, CAMERA)
-    assert nothing.displacement_mm.shape == (0,)
+    nothing = lifted_matches(match_features(blank, blank, CAMERA), START.depth_mm, START.depth_mm, CAMERA)
+    assert apart_mm(nothing).shape == (0,)
 
 
 def test_fewer_than_eight_features_match_nothing() -> None:

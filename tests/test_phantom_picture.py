@@ -1,4 +1,4 @@
-"""The phantom's pictures: the physics of its lamp, its noise, its bad stretches."""
+"""The phantom's pictures: the physics of its lamp, its noise, its bad segments."""
 
 from __future__ import annotations
 

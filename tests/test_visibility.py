@@ -17,7 +17,7 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.io.datasets.c3vd import CAMERA, C3vdFolder
 from scopemap.phantom.render import prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import surface_mesh
+from scopemap.phantom.writer import seen_surface
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)
 HERE = np.eye(4)
@@ -94,7 +94,7 @@ def test_a_phantom_is_seen_where_no_tissue_cuts_the_line_of_sight() -> None:
     spec = PhantomSpec(frames=40, width=SIZE[0], height=SIZE[1], seed=3)
     phantom = prepare(spec)
     volume = phantom.volume
-    whole = surface_mesh(volume, np.ones(volume.coefficients.shape, bool))
+    whole = seen_surface(volume, np.ones(volume.coefficients.shape, bool))
     points = whole.vertices[np.random.default_rng(0).permutation(len(whole.vertices))[:600]]
 
     def in_sight(T_world_camera: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from scopemap.benchmark.tables import write_tables
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
-from scopemap.evaluation.correspondences import FrameMatcher, displacements
+from scopemap.evaluation.correspondences import FrameMatcher, lifted_matches
 from scopemap.evaluation.poses import match
 from scopemap.frame import Frame, Truth
 from scopemap.geometry.se3 import inverse, se3, transform
@@ -177,10 +177,10 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
     if T_previous is not None and T_current is not None:
         posed = dict.fromkeys(depths, (T_previous, T_current))
     if posed:
-        found = {
-            m: displacements(correspondence.matches, *depths[m], frames.camera, poses) for m, poses in posed.items()
+        points = {
+            method: lifted_matches(correspondence.matches, *depths[method], frames.camera, poses)[:2]
+            for method, poses in posed.items()
         }
-        points = {method: (ends.previous_mm, ends.current_mm) for method, ends in found.items()}
         draw_matched_points(points, folder / f"orb_points_{name}.png", where=_WORLD[where])
         yield folder / f"orb_points_{name}.png"
 

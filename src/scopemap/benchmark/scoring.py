@@ -14,7 +14,7 @@ from scopemap.benchmark.result import Figures
 from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
-from scopemap.evaluation.consistency import ConsistencyMeter, DepthFrame
+from scopemap.evaluation.consistency import ConsistencyMeter
 from scopemap.evaluation.correspondences import FrameMatcher
 from scopemap.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling, evaluate_depth_sequence, fit_sequence
 from scopemap.evaluation.paper import paper_figures
@@ -217,14 +217,12 @@ def _consistency(
         before = frame.rgb
         depth_mm = depth.read(frame.index)
         meter.add(
-            DepthFrame(
-                np.full(valid.shape, np.nan, np.float32) if depth_mm is None else depth_mm,
-                valid,
-                poses.get(frame.index),
-                None if truth is None else truth.T_world_camera,
-                None if truth is None else truth.depth_mm,
-            ),
+            np.full(valid.shape, np.nan, np.float32) if depth_mm is None else depth_mm,
+            valid,
             correspondence,
+            T_world_camera=poses.get(frame.index),
+            T_reference_camera=None if truth is None else truth.T_world_camera,
+            true_depth_mm=None if truth is None else truth.depth_mm,
         )
     return {"consistency": meter.report() | {"flow": estimator.name}}
 

@@ -4,7 +4,7 @@
     for each frame:
         found = matcher.match(rgb, valid, to_previous, consistent)
         for name, meter in meters.items():
-            meter.add(DepthFrame(depth_mm[name], valid, T_world_camera=..., T_reference_camera=...), found)
+            meter.add(depth_mm[name], valid, found, T_world_camera=..., T_reference_camera=...)
 
 - OPW and rTC: Khan et al., "Temporally consistent online depth estimation in dynamic scenes", WACV 2023, in the form of
     facebookresearch/TemporallyConsistentDepth, `eval/metrics.py`.
@@ -17,14 +17,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError, check_shape
-from scopemap.evaluation.correspondences import FrameCorrespondences, displacement_figures, displacements
+from scopemap.evaluation.correspondences import FrameCorrespondences, displacement_figures, lifted_matches
 from scopemap.evaluation.depth import depth_scale, scale_jitter
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.geometry.warp import moved_depth, pull
@@ -96,25 +95,6 @@ def alignment_errors(
     return forth["relative"], back["relative"]
 
 
-@dataclass(frozen=True)
-class DepthFrame:
-    """One method's depth of one frame, and the poses that are known.
-
-    Attributes
-    ----------
-    depth_mm : (H, W) float, mm or the method's own unit, NaN = unknown.
-    valid : (H, W) bool, True where depth counts.
-    T_world_camera : (4, 4) the method's own pose, in the unit of its depth; T_reference_camera : the reference's, mm.
-    true_depth_mm : (H, W), NaN = unknown; for scale jitter only.
-    """
-
-    depth_mm: np.ndarray
-    valid: np.ndarray
-    T_world_camera: np.ndarray | None = None
-    T_reference_camera: np.ndarray | None = None
-    true_depth_mm: np.ndarray | None = None
-
-
 class ConsistencyMeter:
     """Measures one method's depth frame by frame; keeps the previous frame and a few numbers per match.
 
@@ -132,18 +112,36 @@ class ConsistencyMeter:
         self._alignments: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self._displacements: defaultdict[str, list[np.ndarray]] = defaultdict(list)
 
-    def add(self, frame: DepthFrame, found: FrameCorrespondences | None = None) -> None:
-        """Measure the next frame against the one before; without `found`, no measure along flow or on matches."""
-        camera, truth = self._camera, frame.true_depth_mm
-        depth_mm, poses = self._scaled(frame)
-        self._scales.append(float("nan") if truth is None else depth_scale(depth_mm, truth))
+    def add(
+        self,
+        depth_mm: np.ndarray,
+        valid: np.ndarray,
+        found: FrameCorrespondences | None = None,
+        *,
+        T_world_camera: np.ndarray | None = None,
+        T_reference_camera: np.ndarray | None = None,
+        true_depth_mm: np.ndarray | None = None,
+    ) -> None:
+        """Measure the next frame against the one before; without `found`, no measure along flow or on matches.
+
+        depth_mm : (H, W) float, mm or the method's own unit, NaN = unknown. valid : (H, W) bool, where it counts.
+        T_world_camera : (4, 4) the method's own pose, in the unit of its depth.
+        T_reference_camera : (4, 4) the reference's, mm. true_depth_mm : (H, W), NaN = unknown; for scale jitter only.
+        """
+        camera = self._camera
+        check_shape("depth_mm", depth_mm, (camera.height, camera.width))
+        counts = valid & np.isfinite(depth_mm) & (depth_mm > 0)
+        depth_mm = np.where(counts, self._scale * depth_mm, np.nan).astype(np.float32)
+        T = T_world_camera
+        estimated = None if T is None else se3(T[:3, :3], self._scale * T[:3, 3])
+        known = {"reference": T_reference_camera, "estimated": estimated}
+        poses = {name: pose for name, pose in known.items() if pose is not None}
+        self._scales.append(float("nan") if true_depth_mm is None else depth_scale(depth_mm, true_depth_mm))
         previous, self._previous = self._previous, (depth_mm, poses)
         if previous is None:
             return
         previous_mm, previous_poses = previous
-        pairs = {
-            name: (previous_poses[name], poses[name]) for name in _POSES if name in previous_poses and name in poses
-        }
+        pairs = {name: (previous_poses[name], pose) for name, pose in poses.items() if name in previous_poses}
         motions = {name: inverse(current) @ before for name, (before, current) in pairs.items()}
         self._changes["same_pixel"].append(depth_change(previous_mm, depth_mm))
         for name, motion in motions.items():
@@ -152,8 +150,9 @@ class ConsistencyMeter:
             # A pair without matches or poses keeps its place, so that pair k stays pair k in every figure.
             measured = np.empty((2, 0), np.float32)
             if found is not None and (name in pairs or name == "camera"):
-                ends = displacements(found.matches, previous_mm, depth_mm, camera, pairs.get(name))
-                measured = np.stack([ends.displacement_mm, ends.relative]).astype(np.float32)
+                before, now, z_mm = lifted_matches(found.matches, previous_mm, depth_mm, camera, pairs.get(name))
+                apart_mm = np.linalg.norm(before - now, axis=1)
+                measured = np.stack([apart_mm, apart_mm / z_mm]).astype(np.float32)
             self._displacements[name].append(measured)
         if found is not None and found.to_previous is not None:
             before_mm = pull(previous_mm, found.to_previous)
@@ -184,18 +183,3 @@ class ConsistencyMeter:
         return figures | {
             f"orb_{name}": displacement_figures(self._displacements[name]) for name in ("camera", *_POSES)
         }
-
-    def _scaled(self, frame: DepthFrame) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return depth (H, W) float32, mm, NaN where it does not count, and the known poses by name, mm."""
-        size = (self._camera.height, self._camera.width)
-        check_shape("DepthFrame.depth_mm", frame.depth_mm, size)
-        check_shape("DepthFrame.valid", frame.valid, size)
-        counts = frame.valid & np.isfinite(frame.depth_mm) & (frame.depth_mm > 0)
-        depth_mm = np.where(counts, self._scale * frame.depth_mm, np.nan).astype(np.float32)
-        poses: dict[str, np.ndarray] = {}
-        if frame.T_reference_camera is not None:
-            poses["reference"] = frame.T_reference_camera
-        if frame.T_world_camera is not None:
-            T = frame.T_world_camera
-            poses["estimated"] = se3(T[:3, :3], self._scale * T[:3, 3])
-        return depth_mm, poses

@@ -7,7 +7,7 @@ paper's depth-consistency experiment (arXiv 2508.11282) names ORB, consecutive f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
+from scopemap.evaluation.poses import ErrorSummary
 from scopemap.geometry.se3 import transform
 from scopemap.geometry.warp import pull
 
@@ -89,9 +90,7 @@ class FrameMatcher:
         matches = match_features(previous[1], self._previous[1], self._camera)
         if to_previous is None:
             return FrameCorrespondences(matches)
-        check_shape("to_previous", to_previous, (*size, 2))
         trusted = np.ones(size, dtype=bool) if consistent is None else consistent
-        check_shape("consistent", trusted, size)
         same_colour = trusted & have_same_colour(previous[0], rgb, to_previous)
         return FrameCorrespondences(matches, to_previous, trusted, same_colour)
 
@@ -145,42 +144,18 @@ def have_same_colour(rgb_previous: np.ndarray, rgb_current: np.ndarray, to_previ
     return same_colour & (np.abs(to_previous) < _FLOW_LIMIT_PX).all(axis=-1)
 
 
-@dataclass(frozen=True)
-class Displacements:
-    """Matched points of one pair of frames, lifted; M counts those with depth at both ends.
-
-    Attributes
-    ----------
-    previous_mm, current_mm : (M, 3) float64, in the world if poses were given, else each in its own camera.
-    depth_mm : (M,) mean depth of the two ends.
-    """
-
-    previous_mm: np.ndarray
-    current_mm: np.ndarray
-    depth_mm: np.ndarray
-
-    @property
-    def displacement_mm(self) -> np.ndarray:
-        """Distance (M,) between the two ends."""
-        return np.asarray(np.linalg.norm(self.previous_mm - self.current_mm, axis=1))
-
-    @property
-    def relative(self) -> np.ndarray:
-        """Distance (M,) over the point's depth."""
-        return self.displacement_mm / self.depth_mm
-
-
-def displacements(
+def lifted_matches(
     matches: Matches,
     depth_previous_mm: np.ndarray,
     depth_current_mm: np.ndarray,
     camera: PinholeCamera,
     poses: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Displacements:
-    """Lift both ends of each match with its frame's depth (H, W), NaN = unknown; those without depth are left out.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return both ends of the matches in space, (M, 3) float64 mm each, and the mean depth (M,) of the two ends, mm.
 
-    The nearest pixel counts: at a fold's edge an interpolated depth would be on neither surface. `poses` are
-    T_world_camera (4, 4) of the previous and of the current frame; without them points stay in their cameras.
+    M counts the matches with depth (H, W), NaN = unknown, at both ends. The nearest pixel counts: at a fold's edge an
+    interpolated depth would be on neither surface. `poses` are T_world_camera (4, 4) of the previous and of the current
+    frame; without them points stay in their cameras.
     """
     z_previous = _nearest_depth(depth_previous_mm, matches.previous_px)
     z_current = _nearest_depth(depth_current_mm, matches.current_px)
@@ -189,7 +164,7 @@ def displacements(
     if poses is not None:
         previous, current = transform(poses[0], previous), transform(poses[1], current)
     known = np.isfinite(previous).all(axis=1) & np.isfinite(current).all(axis=1)
-    return Displacements(previous[known], current[known], ((z_previous + z_current) / 2)[known])
+    return previous[known], current[known], ((z_previous + z_current) / 2)[known]
 
 
 def _nearest_depth(depth_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -207,20 +182,17 @@ def displacement_figures(pairs: Sequence[np.ndarray]) -> dict[str, Any]:
     mean_mm, median_mm, std_mm, relative_mean, relative_median : over all matches; NaN where there are none.
     pair_mean_mm, pair_median_mm, pair_matches : of every pair in order.
     """
-
-    def or_nan(statistic: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:
-        return float(statistic(values)) if len(values) else float("nan")
-
-    all_mm, all_relative = np.concatenate([*pairs, np.empty((2, 0))], axis=1).astype(float)
+    mm, relative = (ErrorSummary.of(row) for row in np.concatenate([*pairs, np.empty((2, 0))], axis=1).astype(float))
+    each_mm = [ErrorSummary.of(pair[0]) for pair in pairs]
     return {
         "pairs": sum(pair.shape[1] > 0 for pair in pairs),
-        "matches": len(all_mm),
-        "mean_mm": or_nan(np.mean, all_mm),
-        "median_mm": or_nan(np.median, all_mm),
-        "std_mm": or_nan(np.std, all_mm),
-        "relative_mean": or_nan(np.mean, all_relative),
-        "relative_median": or_nan(np.median, all_relative),
-        "pair_mean_mm": tuple(or_nan(np.mean, pair[0]) for pair in pairs),
-        "pair_median_mm": tuple(or_nan(np.median, pair[0]) for pair in pairs),
+        "matches": sum(pair.shape[1] for pair in pairs),
+        "mean_mm": mm.mean,
+        "median_mm": mm.median,
+        "std_mm": mm.std,
+        "relative_mean": relative.mean,
+        "relative_median": relative.median,
+        "pair_mean_mm": tuple(one.mean for one in each_mm),
+        "pair_median_mm": tuple(one.median for one in each_mm),
         "pair_matches": tuple(pair.shape[1] for pair in pairs),
     }

@@ -143,18 +143,23 @@ def associate(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, 
 
     By frame index where both have one, else by the nearest time stamp, one to one, at most 0.01 s apart (as evo).
     """
-    if estimate.has_indices and reference.has_indices:
-        _, rows_estimate, rows_reference = np.intersect1d(estimate.indices, reference.indices, return_indices=True)
-        return rows_estimate, rows_reference
-    if not len(estimate) or not len(reference):
+    stamps, true_stamps, most_gap = _stamps(estimate, reference)
+    if not len(stamps) or not len(true_stamps):
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    gaps_s, nearest = cKDTree(reference.times_s[:, None]).query(estimate.times_s[:, None])
-    order = np.argsort(gaps_s, kind="stable")
+    gaps, nearest = cKDTree(true_stamps[:, None]).query(stamps[:, None])
+    order = np.argsort(gaps, kind="stable")
     # A reference frame goes to the estimated frame nearest to it, the first in this order.
     rows_reference, claim = np.unique(nearest[order], return_index=True)
     rows_estimate = order[claim]
-    near = gaps_s[rows_estimate] <= _MOST_GAP_S
+    near = gaps[rows_estimate] <= most_gap
     return rows_estimate[near], rows_reference[near]
+
+
+def _stamps(estimate: Trajectory, reference: Trajectory) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return what frames are matched by, numbers where both have them, else times in s, and the largest gap."""
+    if estimate.has_indices and reference.has_indices:
+        return estimate.indices, reference.indices, 0.0
+    return estimate.times_s, reference.times_s, _MOST_GAP_S
 
 
 def match(
@@ -172,10 +177,8 @@ def match(
     estimated = _with_last_pose(estimate)[rows_estimate]
     truth = known.T_world_camera[rows_reference]
     _, similarity = align_trajectories(estimated[tracked], truth[tracked], align, first=first)
-    stamps, reference_stamps, gap = estimate.times_s, known.times_s, _MOST_GAP_S
-    if estimate.has_indices and known.has_indices:
-        stamps, reference_stamps, gap = estimate.indices, known.indices, 0.0
-    in_span = (reference_stamps >= stamps.min() - gap) & (reference_stamps <= stamps.max() + gap)
+    stamps, true_stamps, gap = _stamps(estimate, known)
+    in_span = (true_stamps >= stamps.min() - gap) & (true_stamps <= stamps.max() + gap)
     return MatchedTrajectories(
         estimated=estimated,
         aligned=similarity.transform_poses(estimated),
@@ -195,11 +198,10 @@ def _with_last_pose(trajectory: Trajectory) -> np.ndarray:
 
 
 def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
-    numbered = estimate.has_indices and reference.has_indices
-    stamps = [known.indices if numbered else known.times_s for known in (estimate, reference)]
+    *stamps, gap = _stamps(estimate, reference)
     spans = [f"{values[0]:.10g}..{values[-1]:.10g}" if len(values) else "none" for values in stamps]
     start = f"cannot compare the trajectories: {found} tracked frames match, at least {MIN_MATCHED} are needed; "
-    if numbered:
+    if gap == 0:
         return f"{start}frame numbers are {spans[0]} and {spans[1]}"
     times = f"time stamps are {spans[0]} s and {spans[1]} s (30 frames per s where a file has none)"
     return f"{start}{times}; frame numbers as stamps match too"

@@ -37,7 +37,7 @@ _MOST_ITERATIONS = 60
 # Neighbours that swap places never let the last thousandths of a mm come to rest.
 _STILL_MM = 5e-3
 # Directions in which the surface slides along itself (a plane has three) are not moved in.
-_FREE_RATIO = 1e-4
+_FREE_RATIO = 1e-2
 
 
 def distance_to_mesh(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
@@ -230,9 +230,7 @@ def _step(points: np.ndarray, onto: np.ndarray, normals: np.ndarray) -> Similari
     radius = max(float(np.sqrt(np.mean(np.sum(arms**2, axis=1)))), 1e-12)
     jacobian = np.hstack([np.cross(arms, normals) / radius, normals])
     gaps = np.sum((onto - points) * normals, axis=1)
-    values, axes = np.linalg.eigh(jacobian.T @ jacobian)
-    held = values > _FREE_RATIO * values[-1]
-    unknowns = axes[:, held] @ ((axes[:, held].T @ (jacobian.T @ gaps)) / values[held])
+    unknowns = np.linalg.lstsq(jacobian, gaps, rcond=_FREE_RATIO)[0]
     R = so3_exp(unknowns[:3] / radius)
     return Similarity(1.0, R, centre + unknowns[3:6] - R @ centre)
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from scopemap.inspection.clip import Clip, Stretch, VideoFinding, covered, stretches_of, worded
+from scopemap.inspection.clip import Clip, Segment, VideoFinding, covered, segments_of, worded
 from scopemap.io.video_format.interlacing import is_interlaced
 from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE
 from scopemap.io.video_format.stereo_packing import Packing
@@ -102,10 +102,10 @@ def repeated(clip: Clip) -> np.ndarray:
 
 
 def check_repeats(clip: Clip) -> Iterator[VideoFinding]:
-    """Yield duplicates, as conversions between rates make them, and frozen stretches."""
+    """Yield duplicates, as conversions between rates make them, and frozen segments."""
     flags = repeated(clip)
-    frozen = clip.stretches(flags, seconds=0.3, least=4)
-    single = stretches_of(flags & ~covered(frozen, len(clip)))
+    frozen = clip.segments(flags, seconds=0.3, least=4)
+    single = segments_of(flags & ~covered(frozen, len(clip)))
     advice = "runs leave them out (--set input.skip_duplicates=false keeps them)"
     if frozen:
         message = f"the picture is frozen for {clip.counted(frozen)}"
@@ -115,7 +115,7 @@ def check_repeats(clip: Clip) -> Iterator[VideoFinding]:
         yield VideoFinding("info", "duplicates", message, advice, clip.positions(single))
 
 
-def _rhythm(single: tuple[Stretch, ...]) -> str:
+def _rhythm(single: tuple[Segment, ...]) -> str:
     """Return the interval in words where duplicates come at an even pace, as from 25 to 30 frames per second."""
     steps = np.diff([first for first, _ in single])
     if steps.size < 3 or np.percentile(steps, 90) - np.percentile(steps, 10) > 1:
@@ -126,48 +126,48 @@ def _rhythm(single: tuple[Stretch, ...]) -> str:
 def _blank(clip: Clip) -> Iterator[VideoFinding]:
     blank, black = clip["blank"], clip["brightness"] <= _BLACK_LEVEL
     for flags, code, words in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
-        stretches = stretches_of(flags)
-        if stretches:
-            message = f"{words}: {clip.counted(stretches)}"
-            yield VideoFinding("warning", code, message, clip.selecting(stretches), clip.positions(stretches))
+        segments = segments_of(flags)
+        if segments:
+            message = f"{words}: {clip.counted(segments)}"
+            yield VideoFinding("warning", code, message, clip.selecting(segments), clip.positions(segments))
 
 
 def _blurred(clip: Clip) -> Iterator[VideoFinding]:
     shown, detail = ~clip["blank"], clip["detail"]
     usual = np.median(detail[shown]) if shown.any() else 0.0
-    stretches = clip.stretches(shown & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2)
-    if stretches:
-        share = np.median(detail[covered(stretches, len(clip))]) / usual
+    segments = clip.segments(shown & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2)
+    if segments:
+        share = np.median(detail[covered(segments, len(clip))]) / usual
         message = (
-            f"blurred, or without texture: {clip.counted(stretches)} show {share:.0%} of the usual detail (a smear on "
+            f"blurred, or without texture: {clip.counted(segments)} show {share:.0%} of the usual detail (a smear on "
             "the lens, defocus, or tissue very near)"
         )
-        yield VideoFinding("warning", "blurred", message, clip.selecting(stretches), clip.positions(stretches))
+        yield VideoFinding("warning", "blurred", message, clip.selecting(segments), clip.positions(segments))
 
 
 def _colour(clip: Clip) -> Iterator[VideoFinding]:
     flags = (clip["redness"] < _LEAST_REDNESS) & ~clip["blank"]
-    stretches = clip.stretches(flags, seconds=0.3, least=4, gap=3)
-    if not stretches:
+    segments = clip.segments(flags, seconds=0.3, least=4, gap=3)
+    if not segments:
         return
     advice = "look at them; narrow-band light is fine to run on"
     if np.mean(flags) > _MOSTLY:
         message = "hardly any picture has the colour of tissue in white light: is it narrow-band light, or no tissue?"
     else:
-        frames = clip.counted(stretches)
+        frames = clip.counted(segments)
         message = f"not the colour of tissue in white light (outside the patient, or narrow-band light): {frames}"
-        advice += f", else {clip.selecting(stretches)}" if clip.selecting(stretches) else ""
-    yield VideoFinding("warning", "not-tissue", message, advice, clip.positions(stretches))
+        advice += f", else {clip.selecting(segments)}" if clip.selecting(segments) else ""
+    yield VideoFinding("warning", "not-tissue", message, advice, clip.positions(segments))
 
 
 def _exposure(clip: Clip) -> Iterator[VideoFinding]:
     shown = ~clip["blank"]
     for name, most, words in _EXPOSURES:
-        stretches = clip.stretches(shown & (clip[name] > most), seconds=0.15, least=3, gap=2)
-        if stretches:
-            worst, frames = float(np.max(clip[name][shown])), clip.counted(stretches)
+        segments = clip.segments(shown & (clip[name] > most), seconds=0.15, least=3, gap=2)
+        if segments:
+            worst, frames = float(np.max(clip[name][shown])), clip.counted(segments)
             message = f"more than {most:.0%} of the field is {words} in {frames}, {worst:.0%} at worst"
-            yield VideoFinding("info", name, message, "", clip.positions(stretches))
+            yield VideoFinding("info", name, message, "", clip.positions(segments))
 
 
 def exposure_figures(clip: Clip) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The measures of a whole video as arrays over its frames, and findings about stretches of frames."""
+"""The measures of a whole video as arrays over its frames, and findings about segments of frames."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from scopemap.io.datasets import checking
 
 _NAMED = 4
 
-Stretch = tuple[int, int]
+Segment = tuple[int, int]
 """First and last position of frames that follow each other; positions count from 0, as `--frames` does."""
 
 
 @dataclass(frozen=True)
 class VideoFinding(checking.Finding):
-    """One finding: `advice` is the option in full, or ""; `stretches` are its frames, empty: the whole video."""
+    """One finding: `advice` is the option in full, or ""; `segments` are its frames, empty: the whole video."""
 
     advice: str = ""
-    stretches: tuple[Stretch, ...] = ()
+    segments: tuple[Segment, ...] = ()
 
 
-def stretches_of(flags: np.ndarray, least: int = 1, gap: int = 0) -> tuple[Stretch, ...]:
+def segments_of(flags: np.ndarray, least: int = 1, gap: int = 0) -> tuple[Segment, ...]:
     """Return where `flags` (N,) bool is True for `least` frames or more; up to `gap` False between two are bridged."""
     true = np.flatnonzero(flags)
     if not true.size:
@@ -35,18 +35,18 @@ def stretches_of(flags: np.ndarray, least: int = 1, gap: int = 0) -> tuple[Stret
     return tuple((first, last) for first, last in found if last - first + 1 >= least)
 
 
-def covered(stretches: Sequence[Stretch], count: int) -> np.ndarray:
-    """Return (count,) bool: which frames are in any of the stretches."""
+def covered(segments: Sequence[Segment], count: int) -> np.ndarray:
+    """Return (count,) bool: which frames are in any of the segments."""
     flags = np.zeros(count, bool)
-    for first, last in stretches:
+    for first, last in segments:
         flags[first : last + 1] = True
     return flags
 
 
-def worded(stretches: Sequence[Stretch]) -> str:
-    """Return the stretches in words, those after the fourth counted."""
-    named = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in stretches[:_NAMED])
-    return named + (f" and {len(stretches) - _NAMED} more" if len(stretches) > _NAMED else "")
+def worded(segments: Sequence[Segment]) -> str:
+    """Return the segments in words, those after the fourth counted."""
+    named = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in segments[:_NAMED])
+    return named + (f" and {len(segments) - _NAMED} more" if len(segments) > _NAMED else "")
 
 
 @dataclass(frozen=True)
@@ -86,32 +86,27 @@ class Clip:
         usual_s = float(np.median(steps_s)) if steps_s.size else 0.0
         return 1 / usual_s if usual_s > 0 else 0.0
 
-    def stretches(self, flags: np.ndarray, seconds: float, least: int, gap: int = 0) -> tuple[Stretch, ...]:
-        """Return the stretches of `flags` (N,) bool that last `seconds` and have at least `least` frames."""
-        return stretches_of(flags, max(least, round(seconds * self.rate_hz / self.step)), gap)
+    def segments(self, flags: np.ndarray, seconds: float, least: int, gap: int = 0) -> tuple[Segment, ...]:
+        """Return the segments of `flags` (N,) bool that last `seconds` and have at least `least` frames."""
+        return segments_of(flags, max(least, round(seconds * self.rate_hz / self.step)), gap)
 
-    def positions(self, stretches: tuple[Stretch, ...]) -> tuple[Stretch, ...]:
-        """Return stretches of the frames that were read as stretches of positions in the video."""
-        return tuple((self.measures[a].position, self.measures[b].position) for a, b in stretches)
+    def positions(self, segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
+        """Return segments of the frames that were read as segments of positions in the video."""
+        return tuple((self.measures[a].position, self.measures[b].position) for a, b in segments)
 
-    def counted(self, stretches: tuple[Stretch, ...]) -> str:
-        """Return the number of frames in stretches of the frames that were read, and their positions, in words."""
-        count = sum(last - first + 1 for first, last in stretches)
-        return f"{count} frame{'s' * (count != 1)} ({worded(self.positions(stretches))})"
+    def counted(self, segments: tuple[Segment, ...]) -> str:
+        """Return the number of frames in segments of the frames that were read, and their positions, in words."""
+        count = sum(last - first + 1 for first, last in segments)
+        return f"{count} frame{'s' * (count != 1)} ({worded(self.positions(segments))})"
 
-    def selecting(self, stretches: tuple[Stretch, ...]) -> str:
-        """Return the option that leaves out stretches of the frames that were read, in words."""
-        first, last = stretches[0][0], stretches[-1][1]
-        inner = [(a, b) for a, b in stretches if a > 0 and b < len(self) - 1]
-        begin = stretches[0][1] + 1 if first == 0 else 0
-        end = stretches[-1][0] if last == len(self) - 1 else len(self)
-        if begin >= end:
+    def selecting(self, segments: tuple[Segment, ...]) -> str:
+        """Return the option that leaves out segments of the frames that were read, in words; "" if nothing is left."""
+        parts = segments_of(~covered(segments, len(self)))
+        if not parts:
             return ""
-        bounds = [begin, *(bound for a, b in inner for bound in (a, b + 1)), end]
-        parts = [(a, b) for a, b in zip(bounds[::2], bounds[1::2], strict=True) if b > a]
-        a, b = max(parts, key=lambda part: part[1] - part[0])
-        start = self.selection.start if a == 0 else self.measures[a].position
-        stop = self.selection.stop if b == len(self) else self.measures[b].position
-        bounds_in_words = f"{start or ''}:{'' if stop is None else stop}"
-        option = f"--frames {bounds_in_words}" + (f":{self.step}" if self.step > 1 else "")
-        return f"leave them out with {option}" if not inner else f"the longest part without them: {option}"
+        first, last = max(parts, key=lambda part: part[1] - part[0])
+        start = self.selection.start if first == 0 else self.measures[first].position
+        stop = self.selection.stop if last == len(self) - 1 else self.measures[last + 1].position
+        bounds = f"{start or ''}:{'' if stop is None else stop}" + (f":{self.step}" if self.step > 1 else "")
+        what = "leave them out with" if len(parts) == 1 else "the longest part without them:"
+        return f"{what} --frames {bounds}"

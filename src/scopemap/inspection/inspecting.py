@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from scopemap.config import InputSettings
 from scopemap.errors import InputError, ScopemapError
@@ -27,17 +24,13 @@ from scopemap.inspection.container import check_container, read_container
 from scopemap.inspection.field import Field, FieldWatcher
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
 from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher, ShareBox
-from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.opening import open_sequence, open_source
-from scopemap.io.prepared import UNKNOWN_MAKE
+from scopemap.io.prepared import OF_UNKNOWN_VIEWS, sample_pictures
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import Source
-from scopemap.io.video import VideoFile
 from scopemap.io.video_format.stereo_packing import Packing, packing
 
 _KEPT = 8
-# Frames for the detection of stereo packing: from all parts of a video, else every tenth of the beginning.
-_SAMPLED, _SAMPLED_EVERY = 9, 10
 _NAMED = 3
 _ORDER = ("error", "warning", "info")
 
@@ -153,16 +146,9 @@ def inspect(
 
 
 def _packed(source: Source) -> Packing | None:
-    if source.name not in (*UNKNOWN_MAKE, RosBag.name):
+    if source.name not in OF_UNKNOWN_VIEWS:
         return None  # the readers of data sets know what a picture holds
-    pictures: list[np.ndarray] = []
-    # Where reading stops here, it stops in the pass over the video, too, and is reported there.
-    with suppress(ScopemapError):
-        if isinstance(source, VideoFile):
-            pictures = source.samples(_SAMPLED)
-        else:
-            pictures.extend(frame.rgb for frame in source.frames(slice(0, _SAMPLED * _SAMPLED_EVERY, _SAMPLED_EVERY)))
-    return packing(pictures, source.pixel_aspect)
+    return packing(sample_pictures(source), source.pixel_aspect)
 
 
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:

@@ -9,7 +9,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from scopemap.inspection.clip import VideoFinding, stretches_of
+from scopemap.inspection.clip import VideoFinding, segments_of
 from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.masker import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
@@ -138,8 +138,10 @@ class InsetWatcher:
         columns, rows = {0, width, *_strongest(upright.sum(0))}, {0, height, *_strongest(level.sum(1))}
         across, down = list(combinations(sorted(columns), 2)), list(combinations(sorted(rows), 2))
         boxes = [(left, top, right, bottom) for left, right in across for top, bottom in down]
-        kept = _largest_first([box for box in boxes if self._is_inset(box, upright, level)])
-        return [(a / width, b / height, c / width, d / height) for a, b, c, d in kept]
+        found = [(a, b, c - a, d - b) for a, b, c, d in boxes if self._is_inset((a, b, c, d), upright, level)]
+        # The largest first, and none that overlaps one before it.
+        kept = [found[n] for n in cv2.dnn.NMSBoxes(found, [float(w * h) for _, _, w, h in found], 0.0, 0.0)]
+        return [(x / width, y / height, (x + w) / width, (y + h) / height) for x, y, w, h in kept]
 
     def findings(self) -> Iterator[VideoFinding]:
         """Yield a finding where there is an inset."""
@@ -179,14 +181,5 @@ def _lines(strength: np.ndarray, least_px: int) -> np.ndarray:
 
 def _strongest(lengths: np.ndarray) -> list[int]:
     """Return the middles of the longest groups of lines."""
-    groups = [(int(lengths[a : b + 1].max()), round((a + b) / 2)) for a, b in stretches_of(lengths > 0)]
+    groups = [(int(lengths[a : b + 1].max()), round((a + b) / 2)) for a, b in segments_of(lengths > 0)]
     return [middle for _, middle in sorted(groups, reverse=True)[:_MOST_LINES]]
-
-
-def _largest_first(boxes: list[Box]) -> list[Box]:
-    """Return boxes of which none overlaps a larger one that was kept."""
-    kept: list[Box] = []
-    for box in sorted(boxes, key=lambda b: -(b[2] - b[0]) * (b[3] - b[1])):
-        if all(box[2] <= k[0] or k[2] <= box[0] or box[3] <= k[1] or k[3] <= box[1] for k in kept):
-            kept.append(box)
-    return kept

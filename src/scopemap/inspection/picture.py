@@ -44,7 +44,7 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     the mask of a run leaves out, in blue. Then figures over time, and a band for each kind of finding.
     """
     views = _chosen(inspection.samples)
-    bands = [(f.code, f.stretches) for f in inspection.findings if f.stretches and f.code in _BANDS]
+    bands = [(f.code, f.segments) for f in inspection.findings if f.segments and f.code in _BANDS]
     shapes = (views[0].rgb.shape, views[0].frame.rgb.shape)
     rows_in = [_WIDTH_IN / _SHOWN * min(height / width, 1.6) + 0.25 for height, width, _ in shapes]
     heights = [*rows_in, *[_LINE_IN] * len(_LINES), *([_BANDS_IN * len(bands) + 0.4] if bands else [])]
@@ -53,24 +53,23 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     for column, view in enumerate(views):
         _draw_found(figure.add_subplot(grid[0, column]), view, inspection)
         _draw_masked(figure.add_subplot(grid[1, column]), view)
-    first: Axes | None = None
-    positions = inspection.clip["position"]
-    for row, (name, label) in enumerate(_LINES, start=2):
-        axes = figure.add_subplot(grid[row, :], sharex=first)
-        first = first or axes
+    lower = [figure.add_subplot(grid[row, :]) for row in range(2, len(heights))]
+    positions, again = inspection.clip["position"], np.flatnonzero(repeated(inspection.clip))
+    for axes, (name, label) in zip(lower, _LINES, strict=False):
         values = inspection.clip[name] * (100 if name == "motion" else 1)
         axes.plot(positions, values, color="#404040", linewidth=1.0)
-        again = np.flatnonzero(repeated(inspection.clip))
         axes.plot(positions[again], values[again], ".", color=_BANDS["duplicates"], markersize=4)
         axes.set_ylabel(label, fontsize=8)
         axes.set_ylim(bottom=0)
-        _finish(axes, inspection, views)
     if bands:
-        axes = figure.add_subplot(grid[len(heights) - 1, :], sharex=first)
-        _draw_bands(axes, bands)
-        _finish(axes, inspection, views)
-    dots = " (orange dots: repeated)" if repeated(inspection.clip).any() else ""
-    figure.axes[-1].set_xlabel(f"frame, counted from 0{dots}")
+        _draw_bands(lower[-1], bands)
+    for axes in lower:
+        for view in views:
+            axes.axvline(view.measures.position, color="#9ecae1", linewidth=0.8, zorder=0)
+        axes.set_xlim(positions[0] - 0.5, positions[-1] + 0.5)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    lower[-1].set_xlabel(f"frame, counted from 0{' (orange dots: repeated)' if again.size else ''}")
     headline(figure, _title(inspection))
     figure.savefig(file)
 
@@ -127,20 +126,11 @@ def _draw_masked(axes: Axes, view: InspectedFrame) -> None:
 
 
 def _draw_bands(axes: Axes, bands: list[tuple[str, tuple[tuple[int, int], ...]]]) -> None:
-    for row, (code, stretches) in enumerate(bands):
-        spans = [(first - 0.5, last - first + 1) for first, last in stretches]
+    for row, (code, segments) in enumerate(bands):
+        spans = [(first - 0.5, last - first + 1) for first, last in segments]
         axes.broken_barh(spans, (row - 0.4, 0.8), color=_BANDS[code])
     axes.set_yticks(range(len(bands)), [code for code, _ in bands], fontsize=8)
     axes.set_ylim(len(bands) - 0.5, -0.5)
-
-
-def _finish(axes: Axes, inspection: Inspection, views: list[InspectedFrame]) -> None:
-    for view in views:
-        axes.axvline(view.measures.position, color="#9ecae1", linewidth=0.8, zorder=0)
-    measures = inspection.clip.measures
-    axes.set_xlim(measures[0].position - 0.5, measures[-1].position + 0.5)
-    axes.tick_params(labelsize=7)
-    axes.grid(alpha=0.3)
 
 
 def _title(inspection: Inspection) -> str:

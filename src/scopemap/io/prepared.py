@@ -40,7 +40,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
             f"reading {source.path}: the reader of the data set '{source.name}' defines the view; leave "
             f"input.stereo={settings.stereo} (--stereo) out"
         )
-    samples = _samples(source) if source.name in UNKNOWN_MAKE else []
+    samples = sample_pictures(source) if source.name in UNKNOWN_MAKE else []
     packed, note = _packing(source, settings, samples)
     if not settings.deinterlace and is_interlaced(samples):
         source.warnings.append(
@@ -126,7 +126,7 @@ def of_one_view(source: Source) -> str:
     )
 
 
-def _samples(source: Source) -> list[np.ndarray]:
+def sample_pictures(source: Source) -> list[np.ndarray]:
     """Return a few pictures from all parts of the input, fewer where they are large: all are held at once."""
     picture_bytes = max(1, 3 * source.width * source.height)
     count = max(_FEWEST_SAMPLES, min(_SAMPLES, _SAMPLES_BYTES // picture_bytes))

@@ -43,8 +43,8 @@ class Tint:
     voxel_mm: float
 
     def at(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return linear RGB (N, 3) float32 at points (N, 3); NaN points give the colour of the origin."""
-        grid = np.nan_to_num((points_mm - self.origin_mm) / self.voxel_mm).T
+        """Return linear RGB (..., 3) float32 at points (..., 3); NaN points give the colour of the origin."""
+        grid = np.moveaxis(np.nan_to_num((points_mm - self.origin_mm) / self.voxel_mm), -1, 0)
         channels = [
             ndimage.map_coordinates(self.colours[..., c], grid, np.float32, order=1, mode="nearest") for c in range(3)
         ]
@@ -130,16 +130,16 @@ def _organs(p: np.ndarray, depth: float, seed: int) -> list[np.ndarray]:
     ]
 
 
-def _ellipsoid(p: np.ndarray, centre: np.ndarray, radii: np.ndarray, turn_rad: float) -> np.ndarray:
-    """Distance to an ellipsoid turned about z, first order: exact in sign, slope 1 at the surface."""
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
+def _ellipsoid(p: np.ndarray, centre: np.ndarray, radii: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Distance to an ellipsoid rotated about z, first order: exact in sign, slope 1 at the surface."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
     q = (p - centre) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     scaled = np.linalg.norm(q / radii, axis=1)
     return scaled * (scaled - 1) / np.maximum(np.linalg.norm(q / radii**2, axis=1), 1e-6)
 
 
 def _torus(p: np.ndarray, centre: np.ndarray, ring: float, pipe: float) -> np.ndarray:
-    """Distance to a lying torus with haustra, mm."""
+    """Distance to a horizontal torus with haustra, mm."""
     q = p - centre
     around = np.arctan2(q[:, 1], q[:, 0])
     thickness = pipe * (1.0 + 0.06 * np.cos(11.0 * around))

@@ -47,10 +47,11 @@ def _fill(points: np.ndarray, period: float, seed: int, out: np.ndarray) -> None
 
 
 def noise_at(points_mm: np.ndarray, period_mm: float, seed: int) -> np.ndarray:
-    """Return smooth noise (N,) float32, within -1..1, at points (N, 3); NaN points give 0.
+    """Return smooth noise (...) float32, within -1..1, at points (..., 3); NaN points give 0.
 
     `period_mm` is the lattice spacing. The standard deviation is about 0.3; equal on every machine.
     """
-    out = np.empty(len(points_mm), np.float32)
-    _fill(np.ascontiguousarray(points_mm, dtype=np.float64), float(period_mm), int(seed), out)
-    return out
+    points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
+    out = np.empty(len(points), np.float32)
+    _fill(points, float(period_mm), int(seed), out)
+    return out.reshape(points_mm.shape[:-1])

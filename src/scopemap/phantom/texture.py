@@ -37,26 +37,23 @@ class Appearance:
 
     def albedo(self, rest_mm: np.ndarray, footprint_mm: np.ndarray) -> np.ndarray:
         """Return linear RGB (H, W, 3) float32, 0..1, at rest points (H, W, 3) seen by pixels that wide (H, W)."""
-        points = rest_mm.reshape(-1, 3)
-        footprint = np.nan_to_num(footprint_mm.ravel(), nan=1.0)
-        colour = self.base.at(points) if isinstance(self.base, Tint) else self.base.astype(np.float32)
+        footprint = np.nan_to_num(footprint_mm, nan=1.0)
+        colour = self.base.at(rest_mm) if isinstance(self.base, Tint) else self.base.astype(np.float32)
         if self.texture > 0:
-            colour = colour * self._mottling(points, footprint) * self._vessels(points, footprint)
-        return np.minimum(np.broadcast_to(colour, points.shape), 1.0).reshape(rest_mm.shape)
+            colour = colour * self._mottling(rest_mm, footprint) * self._vessels(rest_mm, footprint)
+        return np.minimum(np.broadcast_to(colour, rest_mm.shape), 1.0)
 
     def ripple(self, rest_mm: np.ndarray, footprint_mm: np.ndarray) -> np.ndarray:
         """Return the tilt (H, W, 3) float32, about -1..1, of the fluid film; zero without gloss."""
         if self.gloss == 0:
             return np.zeros(rest_mm.shape, np.float32)
-        points = rest_mm.reshape(-1, 3)
-        fade = _visible(_RIPPLE_MM, np.nan_to_num(footprint_mm, nan=1.0))[..., None]
-        axes = [noise_at(points, _RIPPLE_MM, self.seed + 41 + n) for n in range(3)]
-        return np.stack(axes, -1).reshape(rest_mm.shape) * fade
+        axes = [noise_at(rest_mm, _RIPPLE_MM, self.seed + 41 + n) for n in range(3)]
+        return np.stack(axes, -1) * _visible(_RIPPLE_MM, np.nan_to_num(footprint_mm, nan=1.0))[..., None]
 
     def film(self, rest_mm: np.ndarray) -> np.ndarray:
         """Return the strength (H, W) float32, >= 0, of specular reflection: larger in wet places, never 0."""
-        wetness = 0.5 + 1.6 * noise_at(rest_mm.reshape(-1, 3), _PUDDLE_MM, self.seed + 45)
-        return (self.gloss * np.clip(wetness, 0.05, 1.0)).reshape(rest_mm.shape[:2]).astype(np.float32)
+        wetness = 0.5 + 1.6 * noise_at(rest_mm, _PUDDLE_MM, self.seed + 45)
+        return (self.gloss * np.clip(wetness, 0.05, 1.0)).astype(np.float32)
 
     def _mottling(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         brightness = sum(
@@ -65,18 +62,18 @@ class Appearance:
         )
         redness = noise_at(points, 12.0, self.seed + 36)
         tone = np.array([0.02, -0.22, -0.18], np.float32)
-        return np.exp(self.texture * (brightness[:, None] + redness[:, None] * tone)).astype(np.float32)
+        return np.exp(self.texture * (brightness[..., None] + redness[..., None] * tone)).astype(np.float32)
 
     def _vessels(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Vessels run along the zero crossings of smooth noise; a second noise selects where."""
-        stain = np.zeros(len(points), np.float32)
+        stain = np.zeros(footprint.shape, np.float32)
         for n, (period, width, depth) in enumerate(_VESSELS):
-            bent = points + 0.9 * noise_at(points, period / 3, self.seed + 51 + n)[:, None]
+            bent = points + 0.9 * noise_at(points, period / 3, self.seed + 51 + n)[..., None]
             away_mm = np.abs(noise_at(bent, period, self.seed + 53 + n)) * period / 1.6
             wide = np.hypot(width, 0.7 * footprint)
             there = np.clip(2.2 * noise_at(points, 1.7 * period, self.seed + 55 + n) + 0.25, 0, 1)
             stain += depth * there * (width / wide) * np.exp(-((away_mm / wide) ** 2))
-        return _VESSEL_COLOUR ** (self.texture * stain[:, None])
+        return _VESSEL_COLOUR ** (self.texture * stain[..., None])
 
 
 def _visible(period_mm: float, footprint_mm: np.ndarray) -> np.ndarray:

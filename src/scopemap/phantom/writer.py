@@ -31,19 +31,15 @@ _RIM_VOXELS = 4
 
 
 def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
-    """Return the true surface at rest in the voxels `seen` (X, Y, Z) bool, with a rim of 2 voxels."""
-    return surface_mesh(volume, ndimage.binary_dilation(seen, iterations=_SEEN_MARGIN_VOXELS))
+    """Return the true surface at rest in the voxels `seen` (X, Y, Z) bool and a rim of 2 around them, world mm.
 
-
-def surface_mesh(volume: Volume, where: np.ndarray) -> trimesh.Trimesh:
-    """Return the surface inside the voxels `where` (X, Y, Z) bool, world mm, vertices on it to 1e-4 mm.
-
-    Faces are counter-clockwise seen from the camera. Raises `InputError` where there is no surface in these voxels.
+    Vertices are exact to 1e-4 mm, faces counter-clockwise seen from the camera. Raises `InputError` where there is no
+    surface in these voxels.
     """
     # The spline is defined where the whole neighbourhood of a voxel is inside the grid.
-    defined = np.zeros(where.shape, bool)
-    defined[(slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3] = True
-    where = where & defined
+    inner = (slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3
+    where = np.zeros(seen.shape, bool)
+    where[inner] = ndimage.binary_dilation(seen, iterations=_SEEN_MARGIN_VOXELS)[inner]
     values = volume.coefficients
     for axis in range(3):
         values = ndimage.convolve1d(values, np.array([1, 4, 1]) / 6, axis=axis, mode="nearest")
