@@ -22,7 +22,7 @@ from scopemap.evaluation.poses import (
     rpe_over_path,
     translation_errors_mm,
 )
-from scopemap.geometry.align import align_trajectories
+from scopemap.geometry.align import Similarity, align_trajectories
 
 _PATH_MM = 10.0
 
@@ -83,9 +83,7 @@ def _per_axis(errors: np.ndarray) -> dict[str, dict[str, float]]:
 def _end_point_drift(matched: MatchedTrajectories, scale: float) -> tuple[float, float]:
     """Return the last tracked frame's error, mm and rad, after scaling and aligning the first tracked poses."""
     estimated, reference = matched.estimated[matched.tracked], matched.reference[matched.tracked]
-    scaled = estimated.copy()
-    scaled[:, :3, 3] *= scale
+    scaled = Similarity(scale, np.eye(3), np.zeros(3)).transform_poses(estimated)
     moved, _ = align_trajectories(scaled, reference, "origin")
-    end = slice(-1, None)
-    error_mm = translation_errors_mm(moved[end], reference[end])
-    return float(error_mm[0]), float(rotation_errors_rad(moved[end], reference[end])[0])
+    error_mm, error_rad = translation_errors_mm(moved, reference), rotation_errors_rad(moved, reference)
+    return float(error_mm[-1]), float(error_rad[-1])

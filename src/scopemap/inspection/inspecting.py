@@ -11,14 +11,7 @@ from typing import Any
 from scopemap.config import InputSettings
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
-from scopemap.inspection.checks import (
-    check_frames,
-    check_packing,
-    check_repeats,
-    check_timing,
-    exposure_figures,
-    repeated,
-)
+from scopemap.inspection import checks
 from scopemap.inspection.clip import Clip, VideoFinding
 from scopemap.inspection.container import check_container, read_container
 from scopemap.inspection.field import Field, FieldWatcher
@@ -67,11 +60,12 @@ class Inspection:
             "pictures": len(self.clip),
             "span_s": float(times_s[-1] - times_s[0]),
             "usual_rate_hz": self.clip.rate_hz,
-            "repeated": int(repeated(self.clip).sum()),
+            "repeated": int(checks.repeated(self.clip).sum()),
             "field": self.field.shape,
             "field_share": self.field.share,
         }
-        return {name: value for name, value in (facts | exposure_figures(self.clip)).items() if value is not None}
+        facts |= checks.exposure_figures(self.clip)
+        return {name: value for name, value in facts.items() if value is not None}
 
     @property
     def report(self) -> dict[str, Any]:
@@ -125,11 +119,11 @@ def inspect(
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
         *_of_source(sequence.warnings),
         *(check_container(container) if container else []),
-        *check_timing(clip, container["length_s"] if container else None),
-        *check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
-        *check_repeats(clip),
+        *checks.check_timing(clip, container["length_s"] if container else None),
+        *checks.check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
+        *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
-        *check_frames(clip),
+        *checks.check_frames(clip),
     ]
     return Inspection(
         path=sequence.path,

@@ -119,13 +119,7 @@ def _march(grids: Grids, waves: np.ndarray, origin: np.ndarray, d: np.ndarray, h
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _march_image(
-    grids: Grids,
-    waves: np.ndarray,
-    T_grid_camera: np.ndarray,
-    rays: np.ndarray,
-    out: np.ndarray,
-) -> None:
+def _march_image(grids: Grids, waves: np.ndarray, T_grid_camera: np.ndarray, rays: np.ndarray, out: np.ndarray) -> None:
     """Fill out (H, W, 7): distance in voxels, rest point in grid coordinates, gradient in grid axes."""
     R, origin = np.ascontiguousarray(T_grid_camera[:3, :3]), np.ascontiguousarray(T_grid_camera[:3, 3])
     for row in prange(rays.shape[0]):
