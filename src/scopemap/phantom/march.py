@@ -146,7 +146,7 @@ def march(
     T_grid_camera[:3, 3] = (T_grid_camera[:3, 3] - volume.origin_mm) / volume.voxel_mm
     rays = camera.unproject(np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1))
     out = np.empty((camera.height, camera.width, 7))
-    grids = (volume.coefficients, volume.skip, volume.steepest, volume.slope_unit, displacement.stretch)
+    grids = (volume.coefficients, volume.skip, *volume.steepest, displacement.stretch)
     _march_image(grids, displacement.in_grid(volume.origin_mm, volume.voxel_mm), T_grid_camera, rays, out)
     distance = out[..., 0] * volume.voxel_mm
     normal = out[..., 4:] @ T_world_camera[:3, :3]

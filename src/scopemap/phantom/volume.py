@@ -91,23 +91,16 @@ class Volume:
         return np.minimum(ndimage.distance_transform_cdt(lowest > 0, "chessboard"), 255).astype(np.uint8)
 
     @cached_property
-    def steepest(self) -> np.ndarray:
-        """(X, Y, Z) uint8: bound of the slope (mm per voxel, in units of `slope_unit`) within a voxel of the cell."""
-        return np.ceil(self._slope_bound / self.slope_unit).astype(np.uint8)
-
-    @cached_property
-    def slope_unit(self) -> float:
-        """Unit of `steepest`, mm per voxel."""
-        return max(float(self._slope_bound.max()), 1e-6) / 255 * (1 + 1e-6)
-
-    @cached_property
-    def _slope_bound(self) -> np.ndarray:
+    def steepest(self) -> tuple[np.ndarray, float]:
+        """(X, Y, Z) uint8, a bound of the slope within a voxel of each cell, and its unit, mm per voxel."""
         squared = np.zeros(self.coefficients.shape, np.float32)
         for axis in range(3):
             last = self.coefficients.take([-1], axis)
             slope = np.abs(np.diff(self.coefficients, axis=axis, append=last))
             squared += ndimage.maximum_filter(slope, size=6, origin=-1, mode="nearest") ** 2
-        return np.sqrt(squared)
+        bound = np.sqrt(squared)
+        unit = max(float(bound.max()), 1e-6) / 255 * (1 + 1e-6)
+        return np.ceil(bound / unit).astype(np.uint8), unit
 
     def cells_of(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the cells, three index arrays (N,), of points (..., 3); NaN points are left out."""
