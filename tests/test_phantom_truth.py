@@ -203,7 +203,7 @@ def test_moving_is_the_inverse_of_the_warp() -> None:
         displacement = breath.at(index)
         moved = displacement.move(rest)
         np.testing.assert_allclose(moved - displacement.at(moved), rest, atol=1e-6)
-    assert len(breath.at(0).waves) == 0
+    assert (breath.at(0).waves[:, 3:6] == 0).all()
     assert breath.at(5).stretch < 2.0
 
 
