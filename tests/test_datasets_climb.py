@@ -10,7 +10,7 @@ import pytest
 from drawn_climb import path_of, write_clip, write_foreign_run, write_reference
 from test_datasets_endomapper import KB4, SIZE
 
-from scopemap.benchmark.methods.registry import create_method
+from scopemap.benchmark.methods.method import create_method
 from scopemap.benchmark.plan import MethodPlan, found_sequences, read_plan
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera

@@ -22,12 +22,9 @@ def submission_problems(submission: Path, videos: Path | None = None) -> list[st
 
     videos : folder of the `*.mp4` that must have been processed; without it the clips are the folders that are there.
     """
-    if videos is None:
-        clips, where = _folders(submission), submission
-    else:
-        clips, where = sorted(file.stem for file in videos.glob("*.mp4")), videos
+    clips = _folders(submission) if videos is None else sorted(file.stem for file in videos.glob("*.mp4"))
     if not clips:
-        return [f"{where}: no clip"]
+        return [f"{videos or submission}: no clip"]
     return [problem for clip in clips for problem in _clip_problems(submission / clip)]
 
 

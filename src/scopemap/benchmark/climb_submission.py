@@ -51,9 +51,9 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
 
 
 def _write_maps(run: Path, folder: Path) -> None:
+    submaps = read_run(run, "mm")
     folder.mkdir(parents=True)
     (folder / "camera_trajectory").mkdir()
-    submaps = read_run(run, "mm")
     for number, (place, submap) in enumerate(zip(submap_folders(run), (submaps, *submaps.others), strict=True)):
         write_submap(folder / "camera_trajectory" / f"cam_traj_map_{number:03d}.txt", submap)
         file = folder / "3D_maps" / str(number) / "points3D.txt"

@@ -25,10 +25,7 @@ def export(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write each run as the five runs of a clip, and check the whole submission by the challenge's rules.
-
-    Exit code 1 where a rule is broken.
-    """
+    """Write each run as the five runs of a clip, and check the submission by the challenge's rules (exit code 1)."""
     from scopemap.benchmark.climb_check import submission_problems
     from scopemap.benchmark.climb_submission import write_submission
 

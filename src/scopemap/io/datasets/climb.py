@@ -24,8 +24,7 @@ class ClimbClip(EndoMapperSequence):
     def __init__(self, path: Path) -> None:
         clip = _clip_of(path)
         PosedVideo.__init__(self, path, clip)
-        procedure, _, _ = clip.stem.rpartition("_")
-        self._use_endoscope(path / f"{procedure}_info.json")
+        self._use_endoscope(path / f"{clip.stem.rpartition('_')[0]}_info.json")
         reference = read_climb_reference(path)
         self.poses = dict(zip(reference.indices.tolist(), reference.T_world_camera, strict=True))
         self.notes.append(f"truth: {reference.source}: {len(self.poses)} frames; no depth is known")
