@@ -20,6 +20,7 @@ from scopemap.frame import Frame
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02
+_MIN_SHARE_NOTED = 0.005
 _MAX_SHARE_BEYOND = 0.5  # of the depth that may be beyond the limit without a note
 _FACTOR_MM = 1000.0
 
@@ -130,13 +131,13 @@ class AnchoredDepth:
         return MetricDepth(depth_mm, sigma_mm, limit_note)
 
     def _beyond_limit(self, depth_mm: np.ndarray, usable: np.ndarray) -> tuple[float, str]:
-        """Return the share of the usable positive depths that are beyond `max_depth_mm`, and that in words."""
+        """Return the share of the usable positive depths that are beyond `max_depth_mm`, and a note from 0.5 % on."""
         positive_mm, limit_mm = depth_mm[usable & (depth_mm > 0)], max_depth_mm(self._settings)
-        if not positive_mm.size:
-            return 0.0, ""
-        share, median_mm = float(np.mean(positive_mm > limit_mm)), float(np.median(positive_mm))
+        share = float(np.mean(positive_mm > limit_mm)) if positive_mm.size else 0.0
+        if share < _MIN_SHARE_NOTED:
+            return share, ""
         limit = f"depth.max_depth_mm = {limit_mm:g}"
-        return share, f"{share:.0%} of its depth is beyond {limit} (median {median_mm:.0f} mm)"
+        return share, f"{share:.0%} of its depth is beyond {limit} (median {np.median(positive_mm):.0f} mm)"
 
     def _after_power_law(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
         """Return the estimate after the power law; its relative error is multiplied by the exponent."""
@@ -188,11 +189,11 @@ class AnchoredDepth:
             self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
         else:
             reference = self._reference.estimate(frame)
-            beyond, limit_note = self._beyond_limit(reference.values, usable)
+            _, limit_note = self._beyond_limit(reference.values, usable)
             known = usable & (reference.values > 0) & (reference.values <= max_depth_mm(self._settings))
             if known.mean() < _MIN_SHARE:
-                return None, f"no scale by {self._reference.name}: {limit_note}" if beyond else ""
-            details = self._details(reference, frame) + (f"; {limit_note}, and left the fit" if beyond > 0 else "")
+                return None, f"no scale by {self._reference.name}: {limit_note}" if limit_note else ""
+            details = self._details(reference, frame) + (f"; {limit_note}, and left the fit" if limit_note else "")
             focal_px = reference.focal_px or frame.camera.fx
             target = _Target(estimate.values[known], reference.values[known], focal_px)
             self._conversion = self._fitted(estimate, target)
