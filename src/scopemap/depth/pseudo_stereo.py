@@ -42,31 +42,29 @@ class AffineDisparity:
         return None
 
 
-def baseline_closed_form(
+def fit_baseline_lbfgsb(
     depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float, floor_share: float = 0.0
 ) -> float:
-    """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2: B = sum(D g) / sum(g g), g = f / d.
+    """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2, found as in the paper, by L-BFGS-B.
 
     depth_mm, disparity : arrays of one shape; pixels that are not finite and positive are left out.
     floor_share : pixels below this share of the largest disparity are left out, too: f / d of d near 0 would dominate
         the sum.
-    Raises `InputError` if no pixel is left.
+
+    The variables are brought to order one first: the optimiser's tolerances are absolute in the gradient. Raises
+    `InputError` if no pixel is left.
     """
-    depth, disparity = _usable(depth_mm, disparity, floor_share)
-    per_baseline = focal_px / disparity
-    return float(np.sum(depth * per_baseline) / np.sum(per_baseline**2))
-
-
-def fit_baseline_lbfgsb(
-    depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float, floor_share: float = 0.0
-) -> float:
-    """Return the same baseline as `baseline_closed_form`, found as the paper finds it, by L-BFGS-B.
-
-    The variables are brought to order one first: the optimiser's tolerances are absolute in the gradient.
-    """
-    depth, disparity = _usable(depth_mm, disparity, floor_share)
-    per_baseline = focal_px / disparity
-    depth_unit, baseline_unit = float(np.median(depth)), float(np.median(depth) / np.median(per_baseline))
+    depth, d = np.asarray(depth_mm, np.float64).ravel(), np.asarray(disparity, np.float64).ravel()
+    known = np.isfinite(depth) & np.isfinite(d) & (depth > 0) & (d > 0)
+    known[known] = d[known] >= floor_share * d[known].max(initial=0)
+    if not known.any():
+        raise InputError(
+            "fitting the pseudo-stereo baseline: no pixel has both a depth and a positive disparity; "
+            "check the depth source on the first frame"
+        )
+    depth, per_baseline = depth[known], focal_px / d[known]
+    depth_unit = float(np.median(depth))
+    baseline_unit = depth_unit / float(np.sqrt(np.mean(per_baseline**2)))
     target, slope = depth / depth_unit, per_baseline * (baseline_unit / depth_unit)
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -107,18 +105,6 @@ def fit_affine_disparity(depth_mm: np.ndarray, disparity: np.ndarray, max_depth_
             "rather than disparity set depth.files_kind=depth, else give the range by --near-far"
         )
     return AffineDisparity(float(slope / spread), float(level - slope * origin / spread))
-
-
-def _usable(depth_mm: np.ndarray, disparity: np.ndarray, floor_share: float) -> tuple[np.ndarray, np.ndarray]:
-    depth, d = np.asarray(depth_mm, np.float64).ravel(), np.asarray(disparity, np.float64).ravel()
-    known = np.isfinite(depth) & np.isfinite(d) & (depth > 0) & (d > 0)
-    known[known] = d[known] >= floor_share * d[known].max(initial=0)
-    if not known.any():
-        raise InputError(
-            "fitting the pseudo-stereo baseline: no pixel has both a depth and a positive disparity; "
-            "check the depth source on the first frame"
-        )
-    return depth[known], d[known]
 
 
 def _robust_least_squares(design: np.ndarray, target: np.ndarray) -> np.ndarray:
