@@ -57,7 +57,8 @@ def test_what_is_missing_or_too_much_is_told(tmp_path: Path) -> None:
     shutil.move(tmp_path / "longer" / "Seq_001_a" / "results_txt", folder)
     (folder / "Seq_001_info.json").unlink()
     sequence = open_sequence(folder)
-    assert sequence.warnings == ["2 poses are of frames beyond the 6 of Seq_001_a.mp4"]
+    assert len(sequence.warnings) == 1
+    assert "Seq_001_a.mp4: 2 of 8 poses are of frames beyond the 6 of the video" in sequence.warnings[0]
     assert any("scale unknown" in note for note in sequence.notes)
     assert any("no calibration: Seq_001_info.json is missing" in note for note in sequence.notes)
 

@@ -176,7 +176,7 @@ def test_an_image_that_is_not_posed_has_no_pose(tmp_path: Path) -> None:
 def test_poses_beyond_the_video_are_told(tmp_path: Path) -> None:
     folder = write_endomapper(tmp_path)
     write_models(archive_of(folder), {0: images_bin([1, 7, 8])})
-    assert any("2 poses are of frames beyond the 6" in warning for warning in open_sequence(folder).warnings)
+    assert any("2 of 3 poses are of frames beyond the 6" in warning for warning in open_sequence(folder).warnings)
 
 
 def test_a_large_list_of_points_does_not_end_in_memory(tmp_path: Path) -> None:
@@ -194,8 +194,8 @@ def test_a_large_list_of_points_does_not_end_in_memory(tmp_path: Path) -> None:
         (images_bin([1, 2])[:40], "cut off"),
         (images_bin([]), "no image with its pose"),
         (images_bin([1, 1]), "comes again"),
-        (images_bin([1, 2], name="frame{}.png"), "'frame1.png' is not that of a frame"),
-        (images_bin([0, 1]), "'out0.png' is not that of a frame"),
+        (images_bin([1, 2], name="frame{}.png"), "'frame1.png' is none of a frame"),
+        (images_bin([0, 1]), "'out0.png' is none of a frame"),
         (images_bin([1, 2], quaternion=(2.0, 0.0, 0.0, 0.0)), "quaternion has length 2"),
     ],
 )
@@ -251,7 +251,7 @@ def test_one_video_is_wanted_and_readable(tmp_path: Path) -> None:
     shutil.copy(folder / "Seq_001.mov", folder / "other.mov")
     assert open_sequence(folder).count == FRAMES
     shutil.copy(folder / "Seq_001.mov", folder / "Seq_002.mov")
-    with pytest.raises(InputError, match=r"holds one Seq_NNN\.mov, found 2 \(Seq_001\.mov, Seq_002\.mov\)"):
+    with pytest.raises(InputError, match=r"holds one video, found 2 \(Seq_001\.mov, Seq_002\.mov\)"):
         open_sequence(folder)
     (folder / "Seq_002.mov").unlink()
     (folder / "Seq_001.mov").write_bytes(b"")

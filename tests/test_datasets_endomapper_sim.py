@@ -13,7 +13,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
 from scopemap.io.datasets import endomapper_sim
-from scopemap.io.datasets.exr import read_exr_red
+from scopemap.io.datasets.endomapper_sim import read_exr_red
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
 
@@ -166,7 +166,7 @@ def test_times_that_do_not_increase_are_left_out(tmp_path: Path) -> None:
 
 
 def test_without_a_decoder_there_is_no_depth_and_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(endomapper_sim, "can_read_exr", lambda: False)
+    monkeypatch.setattr(endomapper_sim, "find_spec", lambda name: None)
     sequence = open_sequence(write_sim(tmp_path / "Seq_0"))
     assert sequence.source.truth(0).depth_mm is None
     assert any("pip install 'scopemap[datasets]'" in warning for warning in sequence.warnings)

@@ -16,10 +16,10 @@ from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
 
 from scopemap.cameras.formats.colmap import read_largest_model
 from scopemap.errors import InputError
-from scopemap.io.datasets import posed_video, spreadsheet
-from scopemap.io.datasets.exr import read_exr_red
+from scopemap.io.datasets import endoslam, posed_video
+from scopemap.io.datasets.endomapper_sim import read_exr_red
+from scopemap.io.datasets.endoslam import read_sheet
 from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.spreadsheet import read_sheet
 from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
 from scopemap.io.video import VideoFile
@@ -43,13 +43,13 @@ def write_damaged_lzma(file: Path, member: str, content: bytes) -> None:
 
 def test_a_workbook_of_much_text_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_xlsx(tmp_path / "a.xlsx", [["a" * 1000] * 3])
-    monkeypatch.setattr(spreadsheet, "_MOST_BYTES", 2000)
+    monkeypatch.setattr(endoslam, "_MOST_BYTES", 2000)
     with pytest.raises(InputError, match=r"a\.xlsx: it holds 0 MB, expected 0 MB at most"):
         read_sheet(file)
 
 
 def test_without_its_package_a_workbook_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spreadsheet, "find_spec", lambda name: None)
+    monkeypatch.setattr(endoslam, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'scopemap\[datasets\]'"):
         read_sheet(tmp_path / "a.xlsx")
 
@@ -91,12 +91,12 @@ def test_a_count_of_frames_beyond_the_file_is_not_believed(
     else:
         folder = write_endomapper(tmp_path)
         write_models(archive_of(folder), {0: images_bin([1, 2])})
-    monkeypatch.setattr("scopemap.io.video._claimed_frames", lambda *_: 2_000_000_000)
+    monkeypatch.setattr(posed_video, "_SMALLEST_FRAME_BYTES", 10**9)
     sequence = open_sequence(folder)
     assert (sequence.source.name, sequence.count) == (layout, None)
     assert sequence.source.stamps(slice(None)) is None
     assert sequence.source.pose(0) is not None
-    assert [warning for warning in sequence.warnings if "claims 2000000000 frames" in warning] == sequence.warnings
+    assert [warning for warning in sequence.warnings if f"claims {FRAMES} frames" in warning] == sequence.warnings
     assert reference_trajectory(sequence) is None
     found = survey(sequence)
     assert (found.announced, len(found.frames), found.stopped) == (None, FRAMES, "")

@@ -243,7 +243,7 @@ def test_masks_and_depth_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "depths" / "00000009.png"), np.full((64, 80), 50, np.uint8))
     write_mask(folder)
     source = open_sequence(folder).source
-    with pytest.raises(InputError, match=r"depth of 40x32 px beside a mask\.bmp of 80x64 px"):
+    with pytest.raises(InputError, match=r"depth is 40x32 px, mask\.bmp 80x64 px"):
         source.truth(3)
     with pytest.raises(InputError, match="one 16-bit channel"):
         source.truth(9)

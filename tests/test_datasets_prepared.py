@@ -16,9 +16,9 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io import prepared
+from scopemap.io.frame_choice import is_repeat, mean_difference
 from scopemap.io.opening import open_sequence
 from scopemap.io.video_format.interlacing import combing
-from scopemap.io.video_format.redundant_frames import is_repeat, mean_difference
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]
@@ -224,7 +224,7 @@ def test_what_creeps_adds_up(tmp_path: Path) -> None:
 def test_a_still_is_one_frame_and_says_so(tmp_path: Path) -> None:
     for number in range(4):
         save(tmp_path / f"{number}.png", tissue(0))
-    with pytest.raises(InputError, match=r"3 skipped: frame 3 repeats frame 0; .*input\.skip_duplicates=false"):
+    with pytest.raises(InputError, match=r"frame 3 repeats frame 0; .*input\.skip_duplicates=false"):
         _indices(tmp_path)
     assert _indices(tmp_path, skip_duplicates=False) == [0, 1, 2, 3]
 

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from drawn_scared import (
@@ -14,6 +15,7 @@ from drawn_scared import (
     PLANE,
     WIDTH,
     json_files,
+    left_view,
     point_files,
     red_in,
     true_depth_mm,
@@ -126,9 +128,33 @@ def _video_beside(keyframe: Path) -> None:
     (keyframe / "data" / "rgb.mp4").rename(keyframe / "rgb.mp4")
 
 
+def _images_of_one(place: str) -> Callable[[Path], None]:
+    """Copies with the left views as images, which count from 1."""
+
+    def change(keyframe: Path) -> None:
+        (keyframe / "data" / "rgb.mp4").unlink()
+        pictures = {n + 1: cv2.imencode(".png", left_view(n)[..., ::-1])[1].tobytes() for n in range(4)}
+        write_loose(keyframe / place, {f"{n:010d}.png": content for n, content in pictures.items()})
+
+    return change
+
+
+def _other_names(keyframe: Path) -> None:
+    (keyframe / "endoscope_calibration.yaml").rename(keyframe / "camera_calibration.yaml")
+    for name in ("frame_data", "scene_points"):
+        (keyframe / "data" / f"{name}.tar.gz").rename(keyframe / "data" / f"{name}.tgz")
+
+
+def _unpacked_for_learning(keyframe: Path) -> None:
+    _unpacked(keyframe)
+    _images_of_one("image_02/data")(keyframe)
+    (keyframe / "data" / "frame_data").rename(keyframe / "image_02" / "data" / "frame_data")
+    (keyframe / "data" / "scene_points").rename(keyframe / "image_02" / "data" / "groundtruth")
+
+
 @pytest.mark.parametrize(
     "change",
-    [_unpacked, _plain_tar, _video_beside],
+    [_unpacked, _plain_tar, _video_beside, _other_names, _images_of_one("left"), _unpacked_for_learning],
 )
 def test_other_copies_say_the_same(change: Callable[[Path], None], keyframe: Path) -> None:
     change(keyframe)
@@ -143,7 +169,9 @@ def test_other_copies_say_the_same(change: Callable[[Path], None], keyframe: Pat
     assert sequence.warnings == []
 
 
-@pytest.mark.parametrize("inner", ["dataset_8/keyframe_0", "dataset_8/dataset_8/keyframe_0", "dataset8_keyframe0"])
+@pytest.mark.parametrize(
+    "inner", ["dataset8/keyframe0", "dataset_8/keyframe_0", "dataset_8/dataset_8/keyframe_0", "dataset8_keyframe0"]
+)
 def test_a_test_keyframe_has_a_video_and_no_truth(inner: str, tmp_path: Path) -> None:
     folder = tmp_path / inner
     write_stereo_calibration(folder / "endoscope_calibration.yaml")
@@ -164,7 +192,7 @@ def test_the_data_folder_means_its_keyframe(downloaded: Path) -> None:
 def test_several_keyframes_are_named(downloaded: Path, tmp_path: Path) -> None:
     for name in ("keyframe_1", "keyframe_2"):
         shutil.copytree(downloaded, tmp_path / "dataset_1" / name)
-    with pytest.raises(InputError, match=r"holds 2 sequences \(keyframe_1, keyframe_2\)"):
+    with pytest.raises(InputError, match=r"holds 2 sequences \(dataset_1/keyframe_1, dataset_1/keyframe_2\)"):
         open_sequence(tmp_path)
     shutil.rmtree(tmp_path / "dataset_1" / "keyframe_2")
     (tmp_path / "notes").mkdir()

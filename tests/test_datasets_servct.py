@@ -82,7 +82,7 @@ def test_it_is_found_from_outside_and_two_are_named(outer: str, tmp_path: Path) 
     folder = write_experiment(tmp_path / outer / "Experiment_1", [1, 2])
     assert open_sequence(tmp_path).path == folder
     write_experiment(tmp_path / outer / "Experiment_2")
-    with pytest.raises(InputError, match=r"holds 2 sequences \(Experiment_1, Experiment_2\); give one of them"):
+    with pytest.raises(InputError, match=r"holds 2 sequences \(.*Experiment_1, .*Experiment_2\); give one of them"):
         open_sequence(tmp_path)
 
 
@@ -212,5 +212,5 @@ def test_occlusions_of_another_size_or_damaged_are_refused(tmp_path: Path) -> No
     file = folder / "Ground_truth_CT" / "OcclusionL" / "010.png"
     for content in (cv2.imencode(".png", np.zeros((32, 40, 3), np.uint8))[1].tobytes(), b"damaged"):
         file.write_bytes(content)
-        with pytest.raises(InputError, match=r"010\.png: expected an image of 80x64 px, the size of the depth"):
+        with pytest.raises(InputError, match=r"010\.png: expected an image of the size of the depth"):
             open_sequence(folder).source.truth(10)

@@ -186,7 +186,7 @@ def test_without_poses_it_is_a_video(tmp_path: Path) -> None:
 def test_poses_that_do_not_fit_the_video_are_told(tmp_path: Path) -> None:
     folder = write_stereomis(tmp_path / "P1")
     write_poses(folder / "groundtruth.txt", frames=FRAMES + 2)
-    assert any(f"2 of its {FRAMES + 2} rows" in warning for warning in open_sequence(folder).warnings)
+    assert any(f"2 of {FRAMES + 2} poses are of frames beyond" in warning for warning in open_sequence(folder).warnings)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_one_video_is_wanted_and_readable(tmp_path: Path) -> None:
     folder = write_stereomis(tmp_path / "P1")
     shutil.copy(folder / "endoscope_part0001.mp4", folder / "endoscope_part0002.mp4")
     with pytest.raises(
-        InputError, match=r"holds one \.mp4, found 2 \(endoscope_part0001\.mp4, endoscope_part0002\.mp4"
+        InputError, match=r"holds one video, found 2 \(endoscope_part0001\.mp4, endoscope_part0002\.mp4"
     ):
         open_sequence(folder)
     (folder / "endoscope_part0002.mp4").unlink()
@@ -225,7 +225,7 @@ def test_one_video_is_wanted_and_readable(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="reading the video"):
         open_sequence(folder)
     (folder / "endoscope_part0001.mp4").unlink()
-    with pytest.raises(InputError, match=r"P1: a StereoMIS recording holds one \.mp4, found 0 \(none\)"):
+    with pytest.raises(InputError, match=r"P1: a folder of stereomis holds one video, found 0 \(none\)"):
         StereoMisFolder(folder)
 
 

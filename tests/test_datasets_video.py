@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
-from scopemap.io.time_stamps import TimeStamps
-from scopemap.io.video import VideoFile
+from scopemap.io.video import TimeStamps, VideoFile
 
 
 def test_a_video_whose_title_is_no_utf8_is_read(tmp_path: Path) -> None:
@@ -34,7 +33,7 @@ def test_a_video_of_an_unknown_codec_is_one_sentence(tmp_path: Path) -> None:
     content = file.read_bytes()
     assert b"FMP4" in content
     file.write_bytes(content.replace(b"FMP4", b"ZZZZ"))
-    with pytest.raises(InputError, match=r"v\.avi: FFmpeg has no decoder for it"):
+    with pytest.raises(InputError, match=r"v\.avi: it has no picture that FFmpeg can decode"):
         open_sequence(file)
 
 

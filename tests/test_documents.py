@@ -12,8 +12,8 @@ import typer.main
 from scopemap import __version__
 from scopemap.cli import app
 from scopemap.config import PRESETS, setting_names
-from scopemap.io.checkpoints import REGISTRY
 from scopemap.io.opening import DATASETS
+from scopemap.io.weights import REGISTRY
 from scopemap.reconstruction import _COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]

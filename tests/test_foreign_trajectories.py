@@ -109,18 +109,15 @@ def test_bad_scared_files_are_named(tmp_path: Path, text: str, message: str) -> 
             read_trajectory(path)
 
 
-def test_damaged_empty_and_doubled_scared_archives_are_refused(tmp_path: Path) -> None:
+def test_damaged_and_empty_scared_archives_are_refused(tmp_path: Path) -> None:
     documents = scared_documents(moving_camera(50), list(range(50)))
     good = write_tar(tmp_path / "frame_data.tar.gz", documents).read_bytes()
     for damaged in (b"no tar", good[: len(good) // 2]):
         (tmp_path / "frame_data.tar.gz").write_bytes(damaged)
-        with pytest.raises(InputError, match=r"frame_data\.tar\.gz: the tar is damaged"):
+        with pytest.raises(InputError, match=r"frame_data\.tar\.gz: the archive is damaged"):
             read_trajectory(tmp_path)
     with pytest.raises(InputError, match="holds no frame_data"):
         read_trajectory(write_tar(tmp_path / "other.tar.gz", {"readme.txt": "hello"}))
-    documents = {f"{folder}/{name}": text for folder in "ab" for name, text in documents.items()}
-    with pytest.raises(InputError, match=r"b/frame_data000000\.json: frame 0 comes a second time"):
-        read_trajectory(write_tar(tmp_path / "both.tar.gz", documents))
     with pytest.raises(InputError, match="looked for frame_data"):
         read_trajectory(write_files(tmp_path / "empty", {}), kind="scared")
 

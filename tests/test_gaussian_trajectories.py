@@ -92,7 +92,7 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "params.npz", **arrays, exp_list=trap)
     assert len(read_trajectory(tmp_path / "params.npz", kind="splatam")) == 20
     np.savez(tmp_path / "params.npz", **(arrays | {"cam_trans": trap}))
-    with pytest.raises(InputError, match="pickled objects, which are never loaded"):
+    with pytest.raises(InputError, match="no pickled objects"):
         read_trajectory(tmp_path / "params.npz", kind="splatam")
     for name, protocol in (("test1.pkl", 4), ("odometry", 2), ("old.pickle", 0)):
         (tmp_path / name).write_bytes(pickle.dumps(Trap(sprung), protocol=protocol))

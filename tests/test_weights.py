@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from scopemap.cli import models
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.io import checkpoints, weights
-from scopemap.io.checkpoints import REGISTRY, Checkpoint, find
+from scopemap.io import weights
 from scopemap.io.device import choose_device
+from scopemap.io.weights import REGISTRY, Checkpoint, find
 
 CONTENT = b"not really a network"
 TOY = Checkpoint(
@@ -35,7 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty weights folder, one toy checkpoint beside the registered ones, and a network that must not be used."""
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
-    monkeypatch.setitem(checkpoints.REGISTRY, TOY.name, TOY)
+    monkeypatch.setitem(weights.REGISTRY, TOY.name, TOY)
     monkeypatch.setitem(REGISTRY, "toy", TOY)
     monkeypatch.setattr("torch.hub.download_url_to_file", _forbidden)
     monkeypatch.setattr("huggingface_hub.snapshot_download", _forbidden)
@@ -116,13 +116,13 @@ def test_pull_fetches_checks_and_records(folder: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(
     ("name", "revision"),
-    [("depth-pro", checkpoints.find("depth-pro").revision), ("someone/their-depth", "c0ffee")],
+    [("depth-pro", weights.find("depth-pro").revision), ("someone/their-depth", "c0ffee")],
 )
 def test_repository_is_held_to_its_first_pull(folder: Path, hub: dict[str, bytes], name: str, revision: str) -> None:
     assert not weights.is_present(name)
     place = weights.pull(name)
     assert weights.recorded_revision(name) == revision
-    assert weights.locate(name) == weights.locate(checkpoints.find(name).location) == place
+    assert weights.locate(name) == weights.locate(weights.find(name).location) == place
     (place / "model.safetensors").write_bytes(b"WEIGHTS")
     with pytest.raises(WeightsError, match="damaged"):
         weights.locate(name)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from scopemap.errors import WeightsError
 from scopemap.io import weights
-from scopemap.io.checkpoints import REGISTRY
+from scopemap.io.weights import REGISTRY
 
 if TYPE_CHECKING:
     from transformers import PreTrainedModel

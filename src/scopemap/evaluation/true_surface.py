@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import CameraModel
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.evaluation.surface import (
     Surface,
     compare_surfaces,
@@ -31,7 +31,7 @@ from scopemap.evaluation.surface import (
     surface_points,
 )
 from scopemap.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
-from scopemap.io.decoding import read_decoded, reporting
+from scopemap.io.decoding import read_decoded
 
 _OBSERVED, _MISSED = 1, 2
 

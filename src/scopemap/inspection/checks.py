@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from scopemap.inspection.clip import Clip, Segment, VideoFinding, covered, segments_of, worded
+from scopemap.io.frame_choice import LEAST_DIFFERENCE
 from scopemap.io.video_format.interlacing import is_interlaced
-from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE
 from scopemap.io.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant
-from scopemap.io.video_format.redundant_frames import LEAST_DIFFERENCE, mean_difference
+from scopemap.io.frame_choice import LEAST_DIFFERENCE, mean_difference
 from scopemap.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, is_lit, specular
 from scopemap.tracking.sharpness import sharpness
 

@@ -10,14 +10,13 @@ import io
 import math
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from scopemap.errors import InputError, ScopemapError
+from scopemap.errors import InputError
 
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
@@ -32,12 +31,9 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
     """
     claimed = _claimed_pixels(content)
     check_pixels(claimed)
-    if claimed == 0:
-        return None
-    try:
-        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
-    except cv2.error:
-        return None
+    with suppress(cv2.error):
+        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags) if claimed else None
+    return None
 
 
 def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
@@ -53,44 +49,17 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
 
 def first_bytes(file: Path, count: int) -> bytes:
     """Return the first bytes of a file; none of a pipe, and none where it cannot be read."""
-    try:
-        if not file.is_file():
-            return b""
-        with file.open("rb") as stream:
-            return stream.read(count)
-    except OSError:
-        return b""
-
-
-@contextmanager
-def reporting(fault: str, *, quoting: bool = True) -> Iterator[None]:
-    """Turn the exceptions of a parser into `InputError` of `fault` and, with `quoting`, the parser's own message.
-
-    Damaged bytes end in exceptions of any kind. The parser's warnings are suppressed.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except ScopemapError:
-        raise
-    except Exception as error:
-        quoted = " ".join(str(error).split()) if quoting else ""
-        raise InputError(f"{fault} ({quoted or type(error).__name__})") from None
+    with suppress(OSError):
+        if file.is_file():
+            with file.open("rb") as stream:
+                return stream.read(count)
+    return b""
 
 
 def check_pixels(claimed: float, doing: str = "decoding an image") -> None:
     """Raise `InputError` where an image claims more pixels than the limit."""
     if claimed > most_pixels():
         raise InputError(f"{doing}: its header claims {limit_in_words()}")
-
-
-def check_bytes(what: str, claimed: int, most: int) -> None:
-    """Raise `InputError` where `what`, a file or a member of an archive, holds more than `most` bytes unpacked."""
-    if claimed > most:
-        raise InputError(
-            f"reading {what}: it holds {claimed >> 20} MB, expected {most >> 20} MB at most; is it damaged?"
-        )
 
 
 def limit_in_words() -> str:

@@ -1,15 +1,29 @@
-"""Frames that are skipped because they repeat another or exceed the rate; the others keep their numbers."""
+"""Frames that are skipped because they repeat another or exceed the rate; the others keep their numbers.
+
+A conversion from 25 to 30 frames a second repeats frames, a frozen screen does. The noise of a camera at rest differs
+from frame to frame, so it repeats nothing. A frame is compared with the last one that was kept, so that small
+differences add up until they count.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
-from scopemap.io.source import SourceFrame
-from scopemap.io.video_format.redundant_frames import is_repeat
+import numpy as np
 
+from scopemap.frame import is_constant
+from scopemap.io.source import SourceFrame
+
+LEAST_DIFFERENCE = 0.5
+"""Mean absolute difference below which a frame repeats another, grey levels of 255: what lossy coding leaves."""
+
+# Black borders are the same in all frames: they are not compared.
+_BLACK_LEVEL = 16
+_LONGEST_SIDE_PX = 480
 # Rounding of stamps to milliseconds must not skip a frame; the tolerance is at most a share of a frame.
 _SLACK_S, _SLACK_SHARE = 1e-3, 0.25
 
@@ -45,18 +59,34 @@ class FrameChoice:
         start_s, taken, last = math.nan, -math.inf, None
         for frame in frames:
             start_s = frame.time_s if last is None else start_s
-            due = math.inf if self.fps is None else _slot(frame.time_s - start_s, self.fps)
+            due = math.inf
+            if self.fps is not None:
+                due = math.floor((frame.time_s - start_s) * self.fps + min(_SLACK_S * self.fps, _SLACK_SHARE))
+            skipped = partial(SkippedFrame, frame.index, frame.time_s, frame.name)
             if due <= taken and self.fps is not None:
-                self._skip(frame, "thinned", f"beyond {self.fps:g} frames/s")
+                self.skipped[frame.index] = skipped("thinned", f"beyond {self.fps:g} frames/s")
             elif last is not None and self.skip_repeated and is_repeat(last.rgb, frame.rgb):
-                self._skip(frame, "repeated", f"repeats frame {last.index}")
+                self.skipped[frame.index] = skipped("repeated", f"repeats frame {last.index}")
             else:
                 taken, last = due, frame
                 yield frame
 
-    def _skip(self, frame: SourceFrame, kind: Literal["repeated", "thinned"], reason: str) -> None:
-        self.skipped[frame.index] = SkippedFrame(frame.index, frame.time_s, frame.name, kind, reason)
+
+def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the mean absolute difference, grey levels, of two images (h, w, 3) uint8 over pixels not black in both.
+
+    All pixels are compared where both images are black.
+    """
+    step = max(1, min(one.shape[:2]) // _LONGEST_SIDE_PX)
+    one, other = one[::step, ::step], other[::step, ::step]
+    difference = np.abs(one.astype(np.int16) - other)
+    lit = np.maximum(one, other).max(-1) > _BLACK_LEVEL
+    return float(difference[lit].mean() if lit.any() else difference.mean())
 
 
-def _slot(passed_s: float, fps: float) -> int:
-    return math.floor(passed_s * fps + min(_SLACK_S * fps, _SLACK_SHARE))
+def is_repeat(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether two images (h, w, 3) uint8 of one size differ by no more than lossy coding changes.
+
+    Constant images repeat nothing.
+    """
+    return mean_difference(one, other) < LEAST_DIFFERENCE and not is_constant(other)

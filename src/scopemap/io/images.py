@@ -11,17 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.cameras.formats.calibration import Calibration, fitted
-from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import CalibrationError, InputError
-from scopemap.frame import TruthQuality
 from scopemap.io.decoding import decoded, read_decoded
-from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
+from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-FOLDER_RATE_HZ = 30.0
-OWN_CALIBRATION = "camera.yaml"
 _COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
 
 DepthCode = tuple[tuple[int, float, int], ...]
@@ -77,54 +71,28 @@ def decoded_image(content: bytes) -> np.ndarray | None:
     return _rgb(decoded(content, cv2.IMREAD_COLOR))
 
 
-def depth_of_levels(file: Path, levels: np.ndarray | None, code: DepthCode, scale_mm: float | None) -> np.ndarray:
-    """Return the depth (h, w) float32, mm, NaN = unknown, of an image as it is in `file`.
+class ImageFolder(Source):
+    """A folder of images. A reader of a data set fills in what it knows: `poses`, `times_s`, and
 
-    `scale_mm` replaces the mm per level of `code`. Raises `InputError` unless the image has one channel of as many bits
-    as `code` knows.
-    """
-    bits = 8 * levels.itemsize if levels is not None and levels.ndim == 2 and levels.dtype.kind == "u" else 0
-    known = next((entry for entry in code if entry[0] == bits), None)
-    if levels is None or known is None:
-        allowed = "- or ".join(str(entry[0]) for entry in code)
-        raise InputError(f"reading {file}: expected a depth image of one {allowed}-bit channel")
-    _, mm_per_level, largest = known
-    depth_mm = levels * np.float32(scale_mm or mm_per_level)
-    return np.where((levels > 0) & (levels <= largest), depth_mm, np.nan).astype(np.float32)
-
-
-class ImageFolder(SourceDefaults):
-    """A folder of images. A reader of a data set fills in what the data set knows of them:
-
-    poses : camera-to-world (4, 4), mm, by frame number. depth_files : depth images by frame number, stored as
-    `depth_code` has it. times_s : time stamps by frame number; a frame without one has its number / `rate_hz`.
-    quality : how poses and depth came about.
+    depth_files : depth images by frame number, stored as `depth_code` has it.
 
     The calibration is `camera.yaml` in the folder, else beside the images; one that cannot be read is its
     `camera_fault`. Raises `InputError` where no image can be read.
     """
 
     name = "images"
-    quality: TruthQuality = "registered"
     depth_code: DepthCode = ((16, 1.0, 65535),)
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
-        self.path = path
+        super().__init__(path)
         self.files = image_files(path) if files is None else files
-        self.numbers = _numbers(self.files)
-        self.count: int | None = len(self.files)
-        self.poses: dict[int, np.ndarray] = {}
+        self.numbers: list[int] = _numbers(self.files)
+        self.count = len(self.files)
         self.depth_files: dict[int, Path] = {}
-        self.times_s: dict[int, float] = {}
-        self.rate_hz = FOLDER_RATE_HZ
-        self.notes = [f"time stamps: frame number / {FOLDER_RATE_HZ:g} s (the folder holds none)"]
-        self.warnings: list[str] = []
+        self.notes = [f"time stamps: frame number / {self.rate_hz:g} s (the folder holds none)"]
         self.height, self.width = self._size()
-        own = (folder / OWN_CALIBRATION for folder in (path, self.files[0].parent))
-        calibration_file = next((file for file in own if file.is_file()), None)
-        if calibration_file is not None:
-            with self._making_camera():
-                self._use_calibration(stated_calibration(calibration_file, (self.width, self.height)))
+        with self._making_camera():
+            self._use_first_calibration(path / OWN_CALIBRATION, self.files[0].with_name(OWN_CALIBRATION))
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -146,33 +114,26 @@ class ImageFolder(SourceDefaults):
             self._check_size(rgb, f"{file}: it")
             yield SourceFrame(number, self._time_s(number), rgb, file.name)
 
-    def stamps(self, selection: slice) -> list[tuple[int, float]]:
-        """Return number and time stamp of the selected frames, including files that turn out unreadable."""
-        return [(number, self._time_s(number)) for number in self.numbers[selection]]
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the true pose of a frame, or None."""
-        return self.poses.get(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return pose and depth of a frame; None where neither is known."""
-        pose, depth_mm = self.pose(index), self._depth_mm(index)
-        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
-
     def _image(self, file: Path) -> np.ndarray | None:
         return read_image(file)
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
+        """Return the depth (h, w) float32, mm, NaN = unknown; `InputError` unless stored as `depth_code` has it."""
         file = self.depth_files.get(index)
         if file is None:
             return None
-        return depth_of_levels(file, self._depth_levels(file), self.depth_code, self.depth_scale_mm)
+        levels = self._depth_levels(file)
+        bits = 8 * levels.itemsize if levels is not None and levels.ndim == 2 and levels.dtype.kind == "u" else 0
+        known = next((entry for entry in self.depth_code if entry[0] == bits), None)
+        if levels is None or known is None:
+            allowed = "- or ".join(str(entry[0]) for entry in self.depth_code)
+            raise InputError(f"reading {file}: expected a depth image of one {allowed}-bit channel")
+        _, mm_per_level, largest = known
+        depth_mm = levels * np.float32(self.depth_scale_mm or mm_per_level)
+        return np.where((levels > 0) & (levels <= largest), depth_mm, np.nan).astype(np.float32)
 
     def _depth_levels(self, file: Path) -> np.ndarray | None:
         return read_decoded(file)
-
-    def _time_s(self, number: int) -> float:
-        return self.times_s.get(number, number / self.rate_hz)
 
     def _size(self) -> tuple[int, int]:
         for file in self.files:
@@ -181,11 +142,6 @@ class ImageFolder(SourceDefaults):
                 return image.shape[0], image.shape[1]
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
         raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
-
-    def _set_camera(self, camera: CameraModel, source: str, name: str) -> None:
-        """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
-        calibration = fitted(Calibration(camera, None, source, file=name), (self.width, self.height), "scale")
-        self.camera, self.camera_source = calibration.camera, calibration.source
 
     def _check_numbers(self) -> None:
         """Raise `InputError` where frames had to be counted, as their names do not number them."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -40,35 +38,13 @@ from scopemap.io.sequence import Sequence
 from scopemap.io.source import Source, assumed_camera
 from scopemap.io.video import VideoFile
 
-# Data sets of folders of images are ImageFolders.
-Reader: TypeAlias = (
-    ScaredCKeyframe | ScaredKeyframe | EndoMapperSequence | StereoMisFolder | RosBag | Dicom | VideoFile | ImageFolder
+_KINDS: tuple[type[Source], ...] = (
+    *(ScaredCKeyframe, ScaredKeyframe, HamlynFolder, HamlynTrackingFolder, EndoSlamFolder, SimColFolder),
+    *(EndoMapperSequence, ClimbClip, EndoMapperSimFolder, StereoMisFolder, C3vdFolder, EndoNerfFolder),
+    *(ServCtFolder, SevenScenesFolder, TumRgbdFolder, OneSlamFolder, ColmapFolder),
+    *(RosBag, Dicom, VideoFile, ImageFolder),
 )
-
-_KINDS: tuple[type[Reader], ...] = (
-    ScaredCKeyframe,
-    ScaredKeyframe,
-    HamlynFolder,
-    HamlynTrackingFolder,
-    EndoSlamFolder,
-    SimColFolder,
-    EndoMapperSequence,
-    ClimbClip,
-    EndoMapperSimFolder,
-    StereoMisFolder,
-    C3vdFolder,
-    EndoNerfFolder,
-    ServCtFolder,
-    SevenScenesFolder,
-    TumRgbdFolder,
-    OneSlamFolder,
-    ColmapFolder,
-    RosBag,
-    Dicom,
-    VideoFile,
-    ImageFolder,
-)
-DATASETS: dict[str, type[Reader]] = {kind.name: kind for kind in _KINDS}
+DATASETS = {kind.name: kind for kind in _KINDS}
 """The readers by name, in the order in which `recognises` is called."""
 
 _OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
@@ -78,8 +54,7 @@ _IMAGES = "images"
 _MOST_NAMED = 3
 _USUAL_FOV_DEG = 70.0
 _SMALLEST_SIDE_PX = 32
-_DEEPEST_NESTING = 3
-_SEARCH_DEPTH = 2
+_SEARCH_DEPTH = 5
 _DEEPEST_CLOSED, _MOST_FOLDERS = 4, 500
 
 
@@ -108,10 +83,8 @@ def open_sequence(
         reader = _reader(Path(path), dataset)
         source = prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
-    if size is None:
-        size, size_source = working_size(source.width, source.height, settings.longest_side_px), "chosen"
-    else:
-        size_source = "given (--size)"
+    size_source = "chosen" if size is None else "given (--size)"
+    size = size or working_size(source.width, source.height, settings.longest_side_px)
     if min(size) < _SMALLEST_SIDE_PX:
         raise InputError(
             f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
@@ -154,25 +127,21 @@ def _errors_of_the_system(path: Path | str) -> Iterator[None]:
         raise InputError(f"reading {error.filename or path}: {error.strerror or error}") from None
 
 
-def _reader(path: Path, dataset: str | None) -> Reader:
+def _reader(path: Path, dataset: str | None) -> Source:
     dataset, _, part = (dataset or "").partition(":")
     if dataset and dataset not in DATASETS:
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
-    closed: list[Path] = []
-    if path.is_dir():
-        closed = _closed_folders(path)
-        path = _innermost(path, dataset or None)
-    elif not path.is_file():
+    if not path.is_dir() and not path.is_file():
         raise InputError(f"reading {path}: it is no file and no folder")
+    closed = _closed_folders(path) if path.is_dir() else []
+    path = _innermost(path, dataset or None) if path.is_dir() else path
     kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), ImageFolder.name)
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
     if part and kind != RosBag.name:
-        raise InputError(
-            f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon, got '{part}'"
-        )
+        raise InputError(f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon")
     within = next((folder for folder in closed if folder.is_relative_to(path)), None)
     if within is not None and DATASETS[kind] not in _WITHOUT_LAYOUT:
         raise InputError(f"reading {path}: no permission to look into {within}")
@@ -182,19 +151,13 @@ def _reader(path: Path, dataset: str | None) -> Reader:
 
 
 def _closed_folders(folder: Path) -> list[Path]:
-    """Return the folders in `folder` without permission, four levels deep; links are not followed.
-
-    Whether a file in such a folder exists cannot be told, so that truth would be left out silently. Raises `InputError`
-    where `folder` itself has no permission.
-    """
+    """Return the folders in `folder` without permission: whether they hold truth cannot be told."""
     if not _may_enter(folder):
         raise InputError(f"reading {folder}: no permission to look into it")
-    closed: list[Path] = []
-    for root, inner, _ in islice(os.walk(folder), _MOST_FOLDERS):
-        inner[:] = [name for name in inner if not _is_ignored(name)]
-        closed += [path for name in inner if not _may_enter(path := Path(root, name))]
-        if len(Path(root).relative_to(folder).parts) + 1 >= _DEEPEST_CLOSED:
-            inner.clear()
+    level, closed = [folder], list[Path]()
+    for _ in range(_DEEPEST_CLOSED):
+        level = [inner for outer in level if _may_enter(outer) for inner in _folders_in(outer)][:_MOST_FOLDERS]
+        closed += [inner for inner in level if not _may_enter(inner)]
     return closed
 
 
@@ -202,59 +165,49 @@ def _may_enter(folder: Path) -> bool:
     return os.access(folder, os.R_OK | os.X_OK)
 
 
-def _is_ignored(name: str) -> bool:
-    """Return whether a folder belongs to no data set: hidden, of the file system, or left by a zip made on a Mac."""
-    return name.startswith(".") or name in ("lost+found", "__MACOSX")
-
-
 def _innermost(path: Path, dataset: str | None) -> Path:
     """Return the folder in `path` that the reader `dataset` recognises, `path` where none; None: that any reader does.
 
-    A bag or a DICOM file that is beside a data set or `images` does not hide them. Raises `InputError` where a folder
-    holds several sequences of a data set.
+    A bag or a DICOM file that is beside a data set or `images` does not hide them.
     """
     if dataset is not None:
-        found = _descended(path, [DATASETS[dataset]])
-        return found if DATASETS[dataset].recognises(found) else path
-    others = [kind for kind in _KINDS if kind not in (RosBag, Dicom)]
-    found = _descended(path, others)
-    has_images = ImageFolder.recognises(found) and (found == path or found.name == _IMAGES)
-    if has_images or any(kind.recognises(found) for kind in others if kind not in _WITHOUT_LAYOUT):
-        return found
-    return _descended(path, list(_KINDS))
+        return _recognised_below(path, (DATASETS[dataset],)) or path
+    others = tuple(kind for kind in _KINDS if kind not in (RosBag, Dicom))
+    found = _recognised_below(path, others)
+    is_alone = found is not None and found != path and found.name != _IMAGES
+    if found is None or (is_alone and not any(k.recognises(found) for k in others if k not in _WITHOUT_LAYOUT)):
+        found = _recognised_below(path, _KINDS)
+    return found or path
 
 
-def _descended(path: Path, kinds: list[type[Reader]]) -> Path:
-    """Step into a folder that holds nothing but one folder, that keeps its frames in `images`, or one sequence only."""
-    for _ in range(_DEEPEST_NESTING):
-        if any(kind.recognises(path) for kind in kinds):
-            return path
-        inner = _folders_in(path)
-        images = [folder for folder in inner if folder.name == _IMAGES]
-        if len(images or inner) != 1:
-            return _only_sequence_below(path, kinds) or path
-        path = (images or inner)[0]
-    return path
+def _recognised_below(path: Path, kinds: tuple[type[Source], ...]) -> Path | None:
+    """Return the folder that one of `kinds` recognises, `path` or the only one some levels below it; or None.
 
-
-def _only_sequence_below(path: Path, kinds: list[type[Reader]]) -> Path | None:
-    """Return the one sequence of a data set in the folders below, or None; several are an error that names them."""
-    kinds = [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
-    level = _folders_in(path)
+    Images alone are found in a folder around them that holds nothing else, or in `images`. Raises `InputError` where
+    there are several sequences of a data set.
+    """
+    level = [path]
     for _ in range(_SEARCH_DEPTH):
+        sought = kinds if len(level) == 1 else [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
         level = [folder for folder in level if _may_enter(folder)]
-        found = [folder for folder in level if any(kind.recognises(folder) for kind in kinds)]
+        found = [folder for folder in level if any(kind.recognises(folder) for kind in sought)]
         if len(found) > 1:
             names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
             raise InputError(f"reading {path}: it holds {len(found)} sequences ({names}); give one of them")
         if found:
             return found[0]
-        level = [inner for folder in level for inner in _folders_in(folder)]
+        inner = [inner for folder in level for inner in _folders_in(folder)]
+        images = [folder for folder in inner if folder.name == _IMAGES]
+        level = images if len(level) == len(images) == 1 else inner
     return None
 
 
 def _folders_in(path: Path) -> list[Path]:
-    return sorted(folder for folder in path.iterdir() if folder.is_dir() and not _is_ignored(folder.name))
+    """Return the folders in one, but those of the file system, hidden ones and what a zip made on a Mac leaves."""
+    with os.scandir(path) as entries:  # it knows folders without asking for each file
+        found = [entry for entry in entries if entry.is_dir(follow_symlinks=False) or entry.is_symlink()]
+        names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
+    return sorted(path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
 
 
 def _calibration_of(

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.images import ImageFolder
-from scopemap.io.source import Source, SourceDefaults, SourceFrame, SourceTruth
+from scopemap.io.source import Source, SourceFrame
 from scopemap.io.video import VideoFile
 from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
@@ -26,6 +26,11 @@ OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag")
 
 _SAMPLES, _SAMPLED_EVERY = 8, 10
 _FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
+# Attributes and methods of a source that are the same for one view of it.
+_KEPT = (
+    *("name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings"),
+    *("quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media", "pose", "truth"),
+)
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
@@ -54,40 +59,29 @@ def prepared(source: Source, settings: InputSettings) -> Source:
     return PreparedSource(source, packed, settings)
 
 
-class PreparedSource(SourceDefaults):
+class PreparedSource(Source):
     """A source of which one view and one field of each picture is used; all else is the source's own.
 
     packed : the packing of two views, of which the left eye's is used; None: the picture is one view.
-
-    Attributes
-    ----------
-    two_views : whether the pictures hold two.
     """
 
     def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
-        self._source, self._packed, self._deinterlace = source, packed, settings.deinterlace
-        self.two_views = packed is not None
-        self.name, self.path = source.name, source.path
-        self.notes, self.warnings = source.notes, source.warnings
-        self.count, self.stamped = source.count, source.stamped
-        self.width, self.height, self.pixel_aspect = source.width, source.height, source.pixel_aspect
-        self.depth_scale_mm, self.depth_sensor, self.masks = source.depth_scale_mm, source.depth_sensor, source.masks
+        self._source, self.packed, self._deinterlace = source, packed, settings.deinterlace
+        super().__init__(source.path)
+        for attribute in _KEPT:
+            setattr(self, attribute, getattr(source, attribute))
         if settings.deinterlace:
             self.notes.append("deinterlaced: the even rows of each picture are used, the odd ones interpolated")
         if packed is not None:
             self.width, self.height = packed.view_size(source.width, source.height)
             self.pixel_aspect *= packed.pixel_aspect
-        self._take_camera()
-
-    def _take_camera(self) -> None:
-        source = self._source
-        if not self.two_views:
+        if packed is None:
             self.calibration, self.camera, self.camera_source = source.calibration, source.camera, source.camera_source
             self.camera_fault = source.camera_fault
         elif source.calibration is not None and source.calibration.file is not None:
             # Without a size of its own, the file beside the images is for one view; any other camera is of both.
             try:
-                self._use_calibration(stated_calibration(source.calibration.file, (self.width, self.height)))
+                self._use_first_calibration(Path(source.calibration.file))
             except CalibrationError as fault:
                 self.camera_fault = fault
         elif isinstance(source, ImageFolder):
@@ -97,28 +91,12 @@ class PreparedSource(SourceDefaults):
         """Yield the selected frames, each with what is used of its picture."""
         for frame in self._source.frames(selection):
             rgb = deinterlaced(frame.rgb) if self._deinterlace else frame.rgb
-            yield replace(frame, rgb=rgb if self._packed is None else self._packed.first(rgb))
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
-        """Return number and time stamp of the selected frames, None where only reading on would tell."""
-        return self._source.stamps(selection)
-
-    def media(self) -> str | None:
-        """Return what FFmpeg opens, None where there is no video."""
-        return self._source.media()
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the true pose of a frame, or None."""
-        return self._source.pose(index)
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return what is known of a frame, or None."""
-        return self._source.truth(index)
+            yield replace(frame, rgb=rgb if self.packed is None else self.packed.first(rgb))
 
 
 def of_one_view(source: Source) -> str:
     """Return what an error about a camera of another size adds where pictures hold two views, else ""."""
-    if not isinstance(source, PreparedSource) or not source.two_views:
+    if not isinstance(source, PreparedSource) or source.packed is None:
         return ""
     return (
         f"; the pictures hold two views, and the camera must be that of one, {source.width}x{source.height} px "
@@ -146,25 +124,19 @@ def sample_pictures(source: Source) -> list[np.ndarray]:
 def _packing(source: Source, settings: InputSettings, samples: list[np.ndarray]) -> tuple[Packing | None, str]:
     """Return the stereo packing, None for one view, and a note about it or ""."""
     width, height, aspect = source.width, source.height, source.pixel_aspect
+    packed, why = None, "as asked"
     if settings.stereo in ("left-right", "top-bottom"):
-        asked = Packing(settings.stereo, squeezed_views(width, height, settings.stereo, aspect), float("nan"))
-        return asked, _packing_note(asked, "as asked")
-    packed = packing(samples, aspect) if settings.stereo == "auto" else None
+        packed = Packing(settings.stereo, squeezed_views(width, height, settings.stereo, aspect), float("nan"))
+    elif settings.stereo == "auto" and (packed := packing(samples, aspect)) is not None:
+        why = f"the halves correlate by {packed.correlation:.2f}; --stereo none (input.stereo) uses the whole picture"
     if packed is not None:
-        alike = f"the halves correlate by {packed.correlation:.2f}; --stereo none (input.stereo) uses the whole picture"
-        return packed, _packing_note(packed, alike)
+        pixels = "twice as wide" if packed.layout == "left-right" else "half as wide"
+        squeezed = f", of pixels that are {pixels} as the picture has them" if packed.squeezed else ""
+        return packed, f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is used{squeezed}: {why}"
     layout = suspected(width, height, aspect) if settings.stereo == "auto" and samples else None
     if layout is None:
         return None, ""
     return None, (
         f"stereo: pictures of {width}x{height} px have the shape of two views, {layout}, but their halves do not show "
         f"the same; used as one view (--stereo {layout} uses {_LEFT[layout]})"
-    )
-
-
-def _packing_note(packed: Packing, why: str) -> str:
-    squeezed = ", of pixels that are " + ("twice as wide" if packed.layout == "left-right" else "half as wide")
-    return (
-        f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is used"
-        f"{squeezed + ' as the picture has them' if packed.squeezed else ''}: {why}"
     )

@@ -91,7 +91,12 @@ class Sequence:
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
         for frame in self.frames():
-            yield frame, self._truth(frame.index)
+            truth = self.source.truth(frame.index)
+            if truth is None:
+                yield frame, None
+            else:
+                depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
+                yield frame, Truth(frame.index, truth.T_world_camera, depth_mm, truth.quality)
 
     def frames(self) -> Iterator[Frame]:
         """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two."""
@@ -101,9 +106,10 @@ class Sequence:
             yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
             found += 1
         if found < 2:
-            raise InputError(
-                f"reading {self.path}: {found} readable frame(s) in the selection, two are needed{self._why_so_few()}"
-            )
+            skipped = "".join(f"; frame {frame.index} {frame.reason}" for frame in self.skipped[-1:])
+            remedy = "; a higher input.fps or input.skip_duplicates=false uses more" * bool(skipped)
+            few = f"{found} readable frame(s) in the selection, two are needed"
+            raise InputError(f"reading {self.path}: {few}{skipped}{remedy}")
 
     def with_focal(self, focal_px: float, source: str, sigma_px: float | None = None) -> Sequence:
         """Return the sequence with another guess of an unknown camera.
@@ -116,18 +122,3 @@ class Sequence:
         camera = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
         target = working_camera(camera, (self.camera.width, self.camera.height))
         return replace(self, rectifier=Rectifier(camera, target), camera_source=source, focal_sigma_px=sigma_px)
-
-    def _why_so_few(self) -> str:
-        if not self.skipped:
-            return ""
-        frame, kinds = self.skipped[-1], {skipped.kind for skipped in self.skipped}
-        remedies = {"thinned": "a higher input.fps", "repeated": "input.skip_duplicates=false"}
-        remedy = " or ".join(text for kind, text in remedies.items() if kind in kinds)
-        return f" ({len(self.skipped)} skipped: frame {frame.index} {frame.reason}; {remedy} uses more)"
-
-    def _truth(self, index: int) -> Truth | None:
-        truth = self.source.truth(index)
-        if truth is None:
-            return None
-        depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
-        return Truth(index, truth.T_world_camera, depth_mm, truth.quality)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.calibration import Calibration
+from scopemap.cameras.formats.calibration import Calibration, fitted
+from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import TruthQuality
+
+ASSUMED_RATE_HZ = 30.0
+"""Frames per s of inputs that state none."""
+
+OWN_CALIBRATION = "camera.yaml"
+"""Calibration file beside the frames, which comes before a data set's own."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +57,21 @@ class SourceTruth:
     quality: TruthQuality
 
 
-class Source(Protocol):
-    """Something that holds frames: a video, a folder of one data set's layout.
+class Source:
+    """Frames of a video, a folder or a data set, as they are in the files. Readers derive from it.
 
     Attributes
     ----------
-    name : the data set's name.
-    path : the file or folder.
-    width, height : size of the images, px.
-    count : number of frames, or None where only reading on would tell.
-    calibration : what the calibration file beside the frames says, of whatever size; None where there is none.
+    name : the data set's name. path : the file or folder.
+    width, height : size of the images, px. pixel_aspect : width of a pixel over its height.
+    count : number of frames. numbers : the frames' numbers. Both are None where only reading on tells.
+    stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
+    times_s : time stamps, s, by frame number; a frame without one has its number / `rate_hz`.
+    calibration : content of the calibration file beside the frames, of whatever size; None where there is none.
     camera : the camera of the images, or None where it is unknown; that of `calibration` where there is one.
     camera_source : how the camera is known, one phrase, or "".
     camera_fault : why the data set's own camera cannot be used, None where it can.
-    pixel_aspect : width of a pixel over its height.
-    stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
+    poses : true poses, camera to world, (4, 4) float64, mm, by frame number. quality : how poses and depth came about.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
     masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
@@ -74,65 +80,60 @@ class Source(Protocol):
     """
 
     name: str
-    path: Path
     width: int
     height: int
-    count: int | None
-    calibration: Calibration | None
-    camera: CameraModel | None
-    camera_source: str
-    camera_fault: ScopemapError | None
-    pixel_aspect: float
-    stamped: bool
-    depth_scale_mm: float | None
-    depth_sensor: DepthSensor | None
-    masks: Path | None
-    notes: list[str]
-    warnings: list[str]
-
-    def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
-        """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
-
-    def media(self) -> str | None:
-        """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
-
-    def pose(self, index: int) -> np.ndarray | None:
-        """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
-
-    def truth(self, index: int) -> SourceTruth | None:
-        """Return what is known of the frame with this `SourceFrame.index`, or None."""
-
-
-class SourceDefaults:
-    """Attributes of a `Source` of which nothing but the frames is known; readers derive from it."""
-
     pixel_aspect = 1.0
+    count: int | None = None
+    numbers: Sequence[int] | None = None
     stamped = False
+    rate_hz = ASSUMED_RATE_HZ
     calibration: Calibration | None = None
     camera: CameraModel | None = None
     camera_source = ""
     camera_fault: ScopemapError | None = None
+    quality: TruthQuality = "registered"
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
-    warnings: list[str]
-    width: int
-    height: int
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.poses: dict[int, np.ndarray] = {}
+        self.times_s: dict[int, float] = {}
+        self.notes: list[str] = []
+        self.warnings: list[str] = []
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` is of this kind."""
+        return False
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
+        return iter(())
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
+        return None if self.numbers is None else [(number, self._time_s(number)) for number in self.numbers[selection]]
 
     def media(self) -> str | None:
-        """Nothing: no video."""
+        """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
         return None
 
     def pose(self, index: int) -> np.ndarray | None:
-        """No pose is known."""
-        return None
+        """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
+        return self.poses.get(index)
 
     def truth(self, index: int) -> SourceTruth | None:
-        """No truth is known."""
+        """Return pose and depth of the frame with this `SourceFrame.index`; None where neither is known."""
+        pose, depth_mm = self.pose(index), self._depth_mm(index)
+        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
         return None
+
+    def _time_s(self, number: int) -> float:
+        return self.times_s.get(number, number / self.rate_hz)
 
     def _check_size(self, rgb: np.ndarray, what: str) -> None:
         """Raise `InputError` where an image is not of the source's size."""
@@ -147,11 +148,23 @@ class SourceDefaults:
         if message not in self.warnings:
             self.warnings.append(message)
 
-    def _use_calibration(self, calibration: Calibration) -> None:
-        """Use the calibration beside the frames, which comes before a data set's own; opening fits it."""
-        self.calibration = replace(calibration, source=f"{calibration.source} beside the frames")
-        self.camera, self.camera_source = calibration.camera, self.calibration.source
-        self.depth_scale_mm = calibration.depth_scale_mm
+    def _set_camera(self, camera: CameraModel, source: str, name: str) -> None:
+        """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
+        calibration = fitted(Calibration(camera, None, source, file=name), (self.width, self.height), "scale")
+        self.camera, self.camera_source = calibration.camera, calibration.source
+
+    def _use_first_calibration(self, *files: Path) -> bool:
+        """Use the first of these files beside the frames that exists; return whether there is one.
+
+        It comes before a data set's own constants; opening fits it.
+        """
+        file = next((file for file in files if file.is_file()), None)
+        if file is not None:
+            stated = stated_calibration(file, (self.width, self.height))
+            self.calibration = replace(stated, source=f"{stated.source} beside the frames")
+            self.camera, self.camera_source = stated.camera, self.calibration.source
+            self.depth_scale_mm = stated.depth_scale_mm
+        return file is not None
 
 
 def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:

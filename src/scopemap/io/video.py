@@ -13,14 +13,11 @@ import av
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
-from av.video.stream import VideoStream
 
 from scopemap.errors import InputError
 from scopemap.io.decoding import limit_in_words, most_pixels
-from scopemap.io.source import SourceDefaults, SourceFrame
-from scopemap.io.time_stamps import TimeStamps
+from scopemap.io.source import Source, SourceFrame
 
-DEFAULT_RATE_HZ = 30.0
 # Some headers give the unit of their clock for the rate.
 _HIGHEST_RATE_HZ = 1000.0
 # Headers round durations and count pictures that are never shown: less than this is not a video that breaks off.
@@ -30,9 +27,13 @@ _MOST_CODED_PIXELS = 2**31 - 1
 _SAMPLED_EVERY = 10
 # FFmpeg draws text files as a terminal would show them.
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
+# A recording may pause, a time lapse be slow; a stamp that runs ahead by more is of another clock.
+_LONGEST_GAP_S, _LONGEST_GAP_FRAMES = 60.0, 10
+# AVI and WMV keep the stamps of reordered frames slightly out of order; a clock that goes back by more began anew.
+_DISORDER_S = 1.0
 
 
-class VideoFile(SourceDefaults):
+class VideoFile(Source):
     """A video; frame number = order of decoding, time stamps from the stream, pictures turned as they are to be shown.
 
     Colours are converted to 8-bit sRGB by the matrix and range of the stream; where it states none, BT.601, limited. A
@@ -44,30 +45,29 @@ class VideoFile(SourceDefaults):
     stamped = True
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.notes: list[str] = []
-        self.warnings: list[str] = []
-        self.rate_hz, self._counted = DEFAULT_RATE_HZ, False
+        super().__init__(path)
+        self._counted = False
         first = [frame for _, _, frame in islice(self._decoded(), 2)]
-        if len(first) < 2:
-            found = "holds one frame, two are needed" if first else self._unreadable()
-            raise InputError(f"reading the video {path}: it {found}")
-        self._coded_size = (first[0].width, first[0].height)
+        if len(first) == 1:
+            raise InputError(f"reading the video {path}: it holds one frame, two are needed")
+        if not first:
+            raise InputError(f"reading the video {path}: it holds no readable frame, or pictures of {limit_in_words()}")
+        self.height, self.width = _shown(first[0]).shape[:2]
         matrix = _display_matrix(first[0])
-        sideways = matrix is not None and _swaps_sides(matrix)
-        self.width, self.height = self._coded_size[::-1] if sideways else self._coded_size
         with self._opened() as container:
             stream = container.streams.video[0]
             rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
-            if 0 < rate_hz <= _HIGHEST_RATE_HZ:
-                self.rate_hz = rate_hz
+            self.rate_hz = rate_hz if 0 < rate_hz <= _HIGHEST_RATE_HZ else self.rate_hz
             self.stamped = any(frame.time is not None for frame in first)
             if not self.stamped:
                 self.notes.append(f"time stamps: frame number / {self.rate_hz:g} s (the video holds none)")
             aspect = float(stream.sample_aspect_ratio or 1.0)
-            self.pixel_aspect = 1 / aspect if sideways else aspect
+            self.pixel_aspect = 1 / aspect if matrix is not None and _swaps_sides(matrix) else aspect
             self._counted = stream.frames > 0
-            self.count = _claimed_frames(stream, container.duration, self.rate_hz)
+            duration_s = None if container.duration is None else container.duration / av.time_base
+            if stream.duration is not None and stream.time_base is not None:
+                duration_s = float(stream.duration * stream.time_base)
+            self.count = stream.frames or (None if duration_s is None else round(duration_s * self.rate_hz))
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -77,12 +77,9 @@ class VideoFile(SourceDefaults):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames."""
         for index, time_s, frame in islice(self._decoded(), *self._bounds(selection)):
-            if (frame.width, frame.height) != self._coded_size:
-                raise InputError(
-                    f"reading the video {self.path}: frame {index} is {frame.width}x{frame.height} px, those before it "
-                    f"are {self._coded_size[0]}x{self._coded_size[1]} px; cut the video there"
-                )
-            yield SourceFrame(index, time_s, _shown(frame))
+            rgb = _shown(frame)
+            self._check_size(rgb, f"the video {self.path}: frame {index}")
+            yield SourceFrame(index, time_s, rgb)
 
     def samples(self, count: int) -> list[np.ndarray]:
         """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, fewer where it cannot be searched.
@@ -95,15 +92,11 @@ class VideoFile(SourceDefaults):
             for part in range(count):
                 container.seek(start + length * part // count)
                 frame = next(container.decode(container.streams.video[0]))
-                if (frame.width, frame.height) == self._coded_size:
-                    found[frame.pts] = _shown(frame)
+                found[frame.pts] = _shown(frame)
+        found = {pts: rgb for pts, rgb in found.items() if rgb.shape[:2] == (self.height, self.width)}
         if len(found) >= count // 2:
             return list(found.values())
         return [frame.rgb for frame in self.frames(slice(0, count * _SAMPLED_EVERY, _SAMPLED_EVERY))]
-
-    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
-        """Only decoding tells how many frames there are, and when."""
-        return None
 
     def media(self) -> str:
         """Return what FFmpeg opens: the file's name, or that of its bytes within another file."""
@@ -118,23 +111,15 @@ class VideoFile(SourceDefaults):
                 stream.codec_context.options = limit
         return container
 
-    def _unreadable(self) -> str:
-        with self._opened() as container:
-            sized = container.streams.video[0].width > 0
-        return "holds no readable frame" + ("" if sized else f", or pictures of {limit_in_words()}")
-
     def _decoded(self) -> Iterator[tuple[int, float, VideoFrame]]:
         """Yield number, time stamp, s, and picture of every frame."""
-        stamps = TimeStamps(self.rate_hz)
+        stamps, broken = TimeStamps(self.rate_hz), False
         index = damaged = 0
-        broken = False
         try:
             with self._opened() as container:
-                if not container.streams.video:
-                    raise InputError(f"reading the video {self.path}: it has no picture")
-                stream = container.streams.video[0]
-                if stream.codec_context is None:
-                    raise InputError(f"reading the video {self.path}: FFmpeg has no decoder for it")
+                stream = next(iter(container.streams.video), None)
+                if stream is None or stream.codec_context is None:
+                    raise InputError(f"reading the video {self.path}: it has no picture that FFmpeg can decode")
                 if stream.codec_context.name in _TEXT_CODECS:
                     raise InputError(f"reading the video {self.path}: it is a text file, not a video")
                 stream.thread_type = "AUTO"
@@ -157,17 +142,16 @@ class VideoFile(SourceDefaults):
         claimed = getattr(self, "count", None) or 0
         # What claims a duration and not a count, of frames at any rate, must be held to that.
         found = read if self._counted else max(read, round(stamps.span_s * self.rate_hz) + 1)
+        video = f"the video {self.path.name}"
         if broken or claimed - found > max(_MISSING_FRAMES, _MISSING_SHARE * claimed):
             of = f" of {claimed}" if claimed > read else ""
-            self._warn(f"the video {self.path.name} breaks off after {read}{of} frames; these were used")
+            self._warn(f"{video} breaks off after {read}{of} frames; these were used")
         if damaged:
-            self._warn(f"the video {self.path.name} holds {damaged} damaged picture(s), which were left out")
+            self._warn(f"{video} holds {damaged} damaged picture(s), which were left out")
         if stamps.repaired and self.stamped:
-            self._warn(
-                f"the video {self.path.name} has {stamps.repaired} time stamp(s) that are missing, do not increase or "
-                f"jump, first at frame {stamps.first_repaired}; these frames follow those before them at "
-                f"{self.rate_hz:g} frames/s"
-            )
+            wrong = f"{stamps.repaired} time stamp(s) that are missing, do not increase or jump"
+            follow = f"these frames follow those before them at {self.rate_hz:g} frames/s"
+            self._warn(f"{video} has {wrong}, first at frame {stamps.first_repaired}; {follow}")
 
     def _bounds(self, selection: slice) -> tuple[int | None, int | None, int | None]:
         """Return bounds that count from the start; the header's claim serves only those from the end."""
@@ -206,9 +190,44 @@ def _display_matrix(frame: VideoFrame) -> tuple[int, ...] | None:
     return None if stated is None else struct.unpack("=9i", bytes(stated)[: 9 * 4])
 
 
-def _claimed_frames(stream: VideoStream, container_duration: int | None, rate_hz: float) -> int | None:
-    if stream.frames:
-        return stream.frames
-    if stream.duration is not None and stream.time_base is not None:
-        return round(float(stream.duration * stream.time_base) * rate_hz)
-    return None if container_duration is None else round(container_duration / av.time_base * rate_hz)
+class TimeStamps:
+    """Repairs stamps while frames are read in order.
+
+    rate_hz : frames per second. A stamp that is missing is put at the rate after the last one that was there. One that
+    does not increase is too; where it goes back by more than a second, or runs ahead by more than a minute (ten frames
+    of a slow clip), all that follow are moved with it: files that were joined each begin at 0.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz, self._shift_s = rate_hz, 0.0
+        self._known = (0, 0.0)
+        self._last_s: float | None = None
+        self.repaired = 0
+        """How many stamps were missing or moved."""
+        self.first_repaired: int | None = None
+        """Number of the first such frame."""
+        self._stated_s: tuple[float, float] | None = None
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first to the last stamp as the stream has them, s."""
+        return 0.0 if self._stated_s is None else self._stated_s[1] - self._stated_s[0]
+
+    def __call__(self, index: int, stamp_s: float | None) -> float:
+        """Return when the frame with number `index` was taken, s, by its stamp, s or None."""
+        number, known_s = self._known
+        time_s = known_s + (index - number) / self._rate_hz
+        longest_s = max(_LONGEST_GAP_S, _LONGEST_GAP_FRAMES / self._rate_hz)
+        step_s = stamp_s + self._shift_s - self._last_s if stamp_s is not None and self._last_s is not None else None
+        if stamp_s is not None and (step_s is None or 0 < step_s <= longest_s):
+            time_s = stamp_s + self._shift_s
+        else:
+            if stamp_s is not None and step_s is not None and not -_DISORDER_S <= step_s <= 0:
+                self._shift_s = time_s - stamp_s
+            self.first_repaired = index if self.first_repaired is None else self.first_repaired
+            self.repaired += 1
+        if stamp_s is not None:
+            self._known = (index, time_s)
+            self._stated_s = (stamp_s if self._stated_s is None else self._stated_s[0], stamp_s)
+        self._last_s = time_s
+        return time_s

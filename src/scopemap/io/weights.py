@@ -1,4 +1,4 @@
-"""Weights on this machine: their folder, their verification by hash, their download.
+"""Weights that scopemap knows (`checkpoints.toml`): their folder, their verification by hash, their download.
 
 All weights are in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. `pull` downloads.
 Files must have the hashes of `checkpoints.toml`, and those recorded in the folder's `weights.lock.json` when they were
@@ -10,17 +10,52 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-from scopemap.errors import WeightsError
-from scopemap.io.checkpoints import REGISTRY, Checkpoint, find
+from scopemap.errors import WeightsError, reporting
 
 State = Literal["present", "by hand", "missing", "damaged"]
 LOCK_NAME = "weights.lock.json"
 _CONFIGURATION = ("config.json", "preprocessor_config.json")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One set of weights that scopemap can use.
+
+    Attributes
+    ----------
+    name : what the user calls it.
+    purpose : what it is, in a few words.
+    licence : licence of the weights.
+    size_mb : size on disk, MB; 0 = unknown.
+    place : file or folder, below the weights folder.
+    source : where it comes from: the Hugging Face hub, torchvision's weights enums, or by hand.
+    location : hub repository, torchvision's name of the weights, or where to fetch them by hand.
+    files : file below the weights folder to its SHA-256 or that hash's leading digits; empty = recorded when pulled.
+        torchvision puts the first eight digits of the hash into the file's name.
+    revision : commit of the hub repository; "" = the newest at the first pull, recorded then (the user's own choices).
+    """
+
+    name: str
+    purpose: str
+    licence: str
+    size_mb: float
+    place: str
+    source: Literal["hub", "torchvision", "hand"]
+    location: str
+    files: Mapping[str, str] = field(default_factory=dict)
+    revision: str = ""
+
+
+_TABLE = tomllib.loads(Path(__file__).with_name("checkpoints.toml").read_text(encoding="utf-8"))
+REGISTRY: dict[str, Checkpoint] = {name: Checkpoint(name, **entry) for name, entry in _TABLE.items()}
 
 
 @dataclass(frozen=True)
@@ -35,6 +70,23 @@ class Row:
     path: Path
 
 
+def find(name: str) -> Checkpoint:
+    """Return the checkpoint of a registered name or of any hub repository ("owner/model").
+
+    A repository that is not registered has no pinned hash: revision and hashes are recorded at its first pull.
+    Raises `WeightsError` for anything else.
+    """
+    for checkpoint in REGISTRY.values():
+        if name in (checkpoint.name, checkpoint.location):
+            return checkpoint
+    owner, _, model = name.partition("/")
+    if owner.strip(".") and model.strip(".") and "/" not in model:
+        place = f"{owner}--{model}"
+        return Checkpoint(name, "chosen by the user", "see its model card", 0.0, place, "hub", name)
+    known = ", ".join(REGISTRY)
+    raise WeightsError(f"unknown weights '{name}': choose one of {known}, a hub id, or a local folder")
+
+
 def weights_folder() -> Path:
     """Return the folder of all weights; it need not exist."""
     if chosen := os.environ.get("SCOPEMAP_WEIGHTS_DIR"):
@@ -43,7 +95,7 @@ def weights_folder() -> Path:
 
 
 def is_present(*names: str) -> bool:
-    """Return True if the files of any of `names` are there; their content is not looked at."""
+    """Return whether the files of any of `names` are there; their content is not looked at."""
     return any(_is_there(find(name)) for name in names)
 
 
@@ -62,10 +114,7 @@ def locate(*names: str) -> Path:
 def verify(name: str) -> Path:
     """Hash every file of `name` anew and return its place; raises `WeightsError` if one is missing or damaged."""
     _hash.cache_clear()
-    checkpoint = find(name)
-    if not _is_there(checkpoint):
-        raise WeightsError(_advice([checkpoint]))
-    return _checked(checkpoint)
+    return locate(name)
 
 
 def overview() -> list[Row]:
@@ -91,11 +140,10 @@ def pull(name: str, *, progress: bool = False) -> Path:
     if os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}:
         raise WeightsError(f"cannot pull '{name}' while HF_HUB_OFFLINE is set: unset it")
     download = _download_from_hub if checkpoint.source == "hub" else _download_from_torchvision
-    try:
+    # The clients raise the errors of half a dozen libraries.
+    with reporting(f"cannot pull '{name}' from {checkpoint.location}", kind=WeightsError):
         weights_folder().mkdir(parents=True, exist_ok=True)
         revision = download(checkpoint, progress)
-    except Exception as error:  # the clients raise the errors of half a dozen libraries
-        raise WeightsError(f"cannot pull '{name}' from {checkpoint.location}: {error}") from error
     _record(checkpoint, revision)
     return _checked(checkpoint)
 
@@ -154,13 +202,11 @@ def _checked(checkpoint: Checkpoint) -> Path:
 
 
 def _state(checkpoint: Checkpoint) -> State:
-    if not _is_there(checkpoint):
-        return "missing"
-    try:
-        _checked(checkpoint)
-    except WeightsError:
-        return "damaged"
-    return "by hand" if _is_by_hand(checkpoint) else "present"
+    with suppress(WeightsError):
+        if not (_is_there(checkpoint) and _checked(checkpoint)):
+            return "missing"
+        return "by hand" if _is_by_hand(checkpoint) else "present"
+    return "damaged"
 
 
 def _advice(checkpoints: list[Checkpoint]) -> str:
@@ -210,12 +256,8 @@ def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
 
 def _record(checkpoint: Checkpoint, revision: str) -> None:
     folder, place = weights_folder(), weights_folder() / checkpoint.place
-    if place.is_dir():
-        found = [
-            path for path in place.rglob("*") if path.suffix in {".json", ".safetensors"} and ".cache" not in path.parts
-        ]
-    else:
-        found = [place]
+    below = [path for path in place.rglob("*") if path.suffix in {".json", ".safetensors"}]
+    found = [path for path in below if ".cache" not in path.parts] if place.is_dir() else [place]
     if checkpoint.source == "hub" and not any(path.suffix == ".safetensors" for path in found):
         raise WeightsError(
             f"'{checkpoint.location}' holds no safetensors, and other formats are not loaded: use another"
@@ -229,9 +271,5 @@ def _record(checkpoint: Checkpoint, revision: str) -> None:
 
 def _read_lock() -> dict[str, Any]:
     path = weights_folder() / LOCK_NAME
-    try:
+    with reporting(f"cannot read the record of pulled weights {path}; delete it and pull again", kind=WeightsError):
         return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    except (OSError, ValueError) as error:
-        raise WeightsError(
-            f"cannot read the record of pulled weights {path}: {error}. Delete it and pull again"
-        ) from None

@@ -48,14 +48,17 @@ class C3vdFolder(ImageFolder):
         files, depths, folder = _layout(path)
         super().__init__(path, files)
         self.poses = dict(enumerate(read_poses(path / "pose.txt")))
-        missing = [file for number, file in self.file_of.items() if number not in self.poses]
-        if missing:
-            raise InputError(
-                f"reading {path}: {missing[0].name} has no line in pose.txt, which holds {len(self.poses)} poses "
-                "(line = image number, from 0)"
-            )
-        found = {number: _depth_file(file, depths) for number, file in self.file_of.items()}
-        self.depth_files = {number: file for number, file in found.items() if file is not None}
+        missing = next((file.name for number, file in self.file_of.items() if number not in self.poses), None)
+        if missing is not None:
+            held = f"which holds {len(self.poses)} poses (line = image number, from 0)"
+            raise InputError(f"reading {path}: {missing} has no line in pose.txt, {held}")
+        for number, file in self.file_of.items():
+            stem = file.stem.removesuffix("_color")
+            stems = [f"{stem}_depth"] if depths == file.parent else [f"{stem}_depth", stem]
+            found = (depths / f"{name}{suffix}" for name in stems for suffix in _DEPTH_SUFFIXES)
+            depth = next((file for file in found if file.is_file()), None)
+            if depth is not None:
+                self.depth_files[number] = depth
         # A calibration of its own marks a rendering; C3VD proper was registered to real video.
         self.quality = "registered" if self.camera is None else "exact"
         if self.camera is None and folder == "color" and self._is_reduced():
@@ -87,10 +90,3 @@ def _layout(path: Path) -> tuple[list[Path], Path, str]:
         if (path / name).is_dir() and ((path / "depth").is_dir() or not needs_depth):
             return image_files(path / name), path / "depth", name
     return [], path, ""
-
-
-def _depth_file(image: Path, folder: Path) -> Path | None:
-    stem = image.stem.removesuffix("_color")
-    stems = [f"{stem}_depth"] if folder == image.parent else [f"{stem}_depth", stem]
-    names = (folder / f"{name}{suffix}" for name in stems for suffix in _DEPTH_SUFFIXES)
-    return next((file for file in names if file.is_file()), None)

@@ -18,7 +18,7 @@ import numpy as np
 from scopemap.errors import CalibrationError, ScopemapError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.io.datasets.pose_depth import OTHERS, Agreement
-from scopemap.io.datasets.survey import RIGID_TOLERANCE, DepthFigures, Survey, deviation, extent_mm, positions_of
+from scopemap.io.datasets.survey import RIGID_TOLERANCE, Survey, deviation, extent_mm, positions_of
 from scopemap.io.images import frame_number
 
 Severity = Literal["error", "warning", "info"]
@@ -67,9 +67,7 @@ def refusal(error: ScopemapError) -> Finding:
 
 def check_reading(survey: Survey) -> list[Finding]:
     """Errors while reading, frames that are announced but cannot be read, and the reader's own warnings."""
-    found = []
-    if survey.stopped:
-        found.append(Finding("error", "reading-stopped", survey.stopped))
+    found = _when(bool(survey.stopped), "error", "reading-stopped", survey.stopped)
     if survey.truth_faults:
         first, *others = survey.truth_faults
         more = f" (and {len(others)} more such errors)" if others else ""
@@ -77,8 +75,8 @@ def check_reading(survey: Survey) -> list[Finding]:
     if not survey.stopped:
         missing = sorted(set(survey.announced or []) - {frame.index for frame in survey.frames})
         found += _about(missing, "frame-unreadable", "cannot be read: {}")
-        if len(survey.frames) < 2:
-            found.append(Finding("error", "frame-few", f"{len(survey.frames)} readable frame(s), two are needed"))
+        count = len(survey.frames)
+        found += _when(count < 2, "error", "frame-few", f"{count} readable frame(s), two are needed")
     warnings = survey.sequence.warnings
     more_warnings = [f"and {len(warnings) - _NAMED} more warnings of the reader"] * (len(warnings) > _NAMED)
     return found + [Finding("warning", "source", warning) for warning in warnings[:_NAMED] + more_warnings]
@@ -95,9 +93,7 @@ def check_numbers(survey: Survey) -> list[Finding]:
     found += _about(numbers[:-1][steps < 0], "number-unsorted", "numbers go back after {}", "error")
     found += _about(_repeated(numbers.tolist()), "number-repeated", "there more than once: {}", "error")
     found += _about(numbers[:-1][steps > max(usual, 1)], "number-gap", "numbers are missing after {}")
-    if usual > 1:
-        found.append(Finding("info", "number-step", f"frames are numbered in steps of {usual}"))
-    return found
+    return found + _when(usual > 1, "info", "number-step", f"frames are numbered in steps of {usual}")
 
 
 def check_frames(survey: Survey) -> list[Finding]:
@@ -130,20 +126,18 @@ def check_camera(survey: Survey) -> list[Finding]:
     camera = survey.sequence.rectifier.source.central
     if not survey.sequence.calibrated:
         return [Finding("info", "camera-assumed", "no calibration was found: the focal length is a guess (--camera)")]
-    size = f"images of {camera.width}x{camera.height} px"
-    widths = camera.fx / camera.width
-    found = []
-    if not _FOCAL_WIDTHS[0] <= widths <= _FOCAL_WIDTHS[1]:
-        message = f"a focal length of {camera.fx:.4g} px does not fit {size}: it is {widths:.2g} of their width"
-        found.append(Finding("error", "camera-focal", message))
+    size, point = f"images of {camera.width}x{camera.height} px", f"{camera.cx:.4g}, {camera.cy:.4g} px"
+    widths, lengths = camera.fx / camera.width, f"focal lengths {camera.fx:.4g} and {camera.fy:.4g} px"
     centre = ((camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height)
-    if not all(_MIDDLE[0] <= share <= _MIDDLE[1] for share in centre):
-        message = f"the principal point {camera.cx:.4g}, {camera.cy:.4g} px is outside the middle half of {size}"
-        found.append(Finding("warning", "camera-centre", message))
-    if abs(camera.fy / camera.fx / survey.sequence.source.pixel_aspect - 1) > _ASPECT_TOLERANCE:
-        lengths = f"focal lengths {camera.fx:.4g} and {camera.fy:.4g} px"
-        found.append(Finding("warning", "camera-aspect", f"{lengths} differ by more than a tenth: are pixels square?"))
-    return found
+    aspect = camera.fy / camera.fx / survey.sequence.source.pixel_aspect
+    return [
+        *_when(not _FOCAL_WIDTHS[0] <= widths <= _FOCAL_WIDTHS[1], "error", "camera-focal",
+               f"a focal length of {camera.fx:.4g} px does not fit {size}: it is {widths:.2g} of their width"),
+        *_when(not all(_MIDDLE[0] <= share <= _MIDDLE[1] for share in centre), "warning", "camera-centre",
+               f"the principal point {point} is outside the middle half of {size}"),
+        *_when(abs(aspect - 1) > _ASPECT_TOLERANCE, "warning", "camera-aspect",
+               f"{lengths} differ by more than a tenth: are pixels square?"),
+    ]  # fmt: skip
 
 
 def check_poses(survey: Survey) -> list[Finding]:
@@ -190,6 +184,7 @@ def check_depth(survey: Survey) -> list[Finding]:
     known = [(frame.index, frame.depth) for frame in survey.frames if frame.depth is not None]
     full = [(index, depth) for index, depth in known if depth.known_count]
     usual_mm = float(np.median([depth.median_mm for _, depth in full])) if full else _DEPTH_MM[0]
+    coarse = [i for i, d in full if not d.is_constant and d.distinct < _COARSE and d.known_count >= _COUNTED_IN]
     times = _OTHER_DEPTH_TIMES
     jumps = [i for i, depth in full if not 1 / times < depth.median_mm / usual_mm < times]
     return [
@@ -199,7 +194,7 @@ def check_depth(survey: Survey) -> list[Finding]:
         *_about([i for i, d in known if 1 - d.known_share > _MOST_UNKNOWN], "depth-unknown",
                 f"depth is unknown in more than {_MOST_UNKNOWN:.0%} of the pixels: {{}}"),
         *_about([i for i, d in full if d.is_constant], "depth-constant", "depth is the same everywhere: {}"),
-        *_about([i for i, d in full if _is_coarse(d)], "depth-coarse",
+        *_about(coarse, "depth-coarse",
                 f"depth has fewer than {_COARSE} different values, as of 8 bit or whole units: {{}}"),
         *_depth_unit(usual_mm, survey.sequence.source.name in _ROOMS),
         *_about(jumps, "depth-jump",
@@ -225,11 +220,9 @@ def check_agreement(survey: Survey) -> list[Finding]:
         off = f"depth moved by the poses is off by {near.given:.2%}{rest}"
         return [Finding("error", "pose-depth-disagree", f"{off}: poses, depth or camera do not belong together")]
     limit = max(_OUTLYING, _OUTLYING_TIMES * near.given)
-    return _about(
-        [index for index, error in (survey.depth_errors or {}).items() if error > limit],
-        "pose-depth-frame",
-        f"depth moved by the poses is off by more than {limit:.2%}, usually by {near.given:.2%}: {{}}",
-    )
+    outlying = [index for index, error in survey.depth_errors.items() if error > limit]
+    words = f"depth moved by the poses is off by more than {limit:.2%}, usually by {near.given:.2%}: {{}}"
+    return _about(outlying, "pose-depth-frame", words)
 
 
 def check_assumptions(survey: Survey) -> list[Finding]:
@@ -287,11 +280,12 @@ def _jumps(steps_mm: np.ndarray, usual_mm: float) -> np.ndarray:
 
 def _path_unit(median_mm: float, extent: float) -> list[Finding]:
     size = f"steps of {median_mm:.2g} mm, {extent:.2g} mm from end to end"
-    if median_mm > _LARGEST_STEP_MM or extent > _LARGEST_EXTENT_MM:
-        return [Finding("warning", "pose-unit", f"the path is too large ({size}): it looks like micrometres")]
-    if 0 < median_mm < _SMALLEST_STEP_MM and extent < _SMALLEST_EXTENT_MM:
-        return [Finding("warning", "pose-unit", f"the path is too small ({size}): it looks like metres")]
-    return []
+    is_large = median_mm > _LARGEST_STEP_MM or extent > _LARGEST_EXTENT_MM
+    is_small = 0 < median_mm < _SMALLEST_STEP_MM and extent < _SMALLEST_EXTENT_MM
+    return [
+        *_when(is_large, "warning", "pose-unit", f"the path is too large ({size}): it looks like micrometres"),
+        *_when(is_small, "warning", "pose-unit", f"the path is too small ({size}): it looks like metres"),
+    ]
 
 
 def _depth_unit(median_mm: float, is_room: bool) -> list[Finding]:
@@ -303,16 +297,16 @@ def _depth_unit(median_mm: float, is_room: bool) -> list[Finding]:
     return [Finding("warning", "depth-unit", f"a median depth of {median_mm:.4g} mm looks like {unit}")]
 
 
-def _is_coarse(depth: DepthFigures) -> bool:
-    return not depth.is_constant and depth.distinct < _COARSE and depth.known_count >= _COUNTED_IN
-
-
 def _missing(survey: Survey, known: list[int], what: str) -> list[Finding]:
     """Frames without truth: a fault where they are few, an info where most have none."""
     without = sorted({frame.index for frame in survey.frames} - set(known)) if known else []
     severity: Severity = "warning" if 2 * len(known) >= len(survey.frames) else "info"
     message = f"{len(without)} of {len(survey.frames)} frames have no {what}: {{}}"
     return _about(without, f"{what}-missing", message, severity)
+
+
+def _when(holds: bool, severity: Severity, code: str, message: str) -> list[Finding]:
+    return [Finding(severity, code, message)] if holds else []
 
 
 def _about(numbers: Iterable[int], code: str, message: str, severity: Severity = "warning") -> list[Finding]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.frame import TruthQuality
 from scopemap.io.datasets.endomapper import EndoMapperSequence
 from scopemap.io.datasets.posed_video import PosedVideo
 from scopemap.trajectory.formats.climb import read_climb_reference
@@ -19,17 +18,16 @@ class ClimbClip(EndoMapperSequence):
     """One clip; the reference's image `000001.png` is frame 0."""
 
     name = "climb"
-    quality: TruthQuality = "sfm"
+    quality = "sfm"
 
     def __init__(self, path: Path) -> None:
         clip = _clip_of(path)
-        PosedVideo.__init__(self, path, clip)
+        PosedVideo.__init__(self, path, [clip])
         self._use_endoscope(path / f"{clip.stem.rpartition('_')[0]}_info.json")
         reference = read_climb_reference(path)
         self.poses = dict(zip(reference.indices.tolist(), reference.T_world_camera, strict=True))
         self.notes.append(f"truth: {reference.source}: {len(self.poses)} frames; no depth is known")
-        if self._beyond():
-            self.warnings.append(f"{self._beyond()} poses are of frames beyond the {self.count} of {clip.name}")
+        self._warn_of_poses_beyond(clip)
 
     @staticmethod
     def recognises(path: Path) -> bool:

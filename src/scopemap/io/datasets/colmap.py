@@ -7,12 +7,12 @@ Schoenberger and Frahm, "Structure-from-motion revisited", CVPR 2016; colmap.git
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
-from scopemap.frame import TruthQuality
 from scopemap.io.images import ImageFolder, image_files
 from scopemap.trajectory.formats.colmap import camera_poses
 
@@ -29,7 +29,7 @@ class ColmapFolder(ImageFolder):
     """
 
     name = "colmap"
-    quality: TruthQuality = "sfm"
+    quality = "sfm"
 
     def __init__(self, path: Path) -> None:
         found = _model(path)
@@ -108,22 +108,15 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
             "reconstruct one of them, or leave the others out of the model"
         )
     wanted = {image.path.name for image in images}
+    # Names from a file of unknown origin must not lead out of the folder.
+    stays_inside = not inner[0].is_absolute() and ".." not in inner[0].parts
     for folder in _image_folders(path):
-        for place in (_below(folder, inner[0].parts), folder):
-            files = image_files(place) if place is not None else []
+        # Path.is_dir raises for names that no file system allows.
+        for place in (folder / inner[0], folder) if stays_inside and os.path.isdir(folder / inner[0]) else (folder,):
+            files = image_files(place)
             if any(file.name in wanted for file in files):
                 return files
     raise InputError(
         f"reading {path}: none of the {len(images)} images in the COLMAP model (such as {images[0].name!r}) is there; "
         f"put them into {path / _IMAGES}"
     )
-
-
-def _below(folder: Path, parts: tuple[str, ...]) -> Path | None:
-    """Return the folder at `parts` below `folder`; names from a file of unknown origin must not lead out of it."""
-    for part in parts:
-        inner = next((inner for inner in folder.iterdir() if inner.name == part and inner.is_dir()), None)
-        if inner is None:
-            return None
-        folder = inner
-    return folder

@@ -6,7 +6,9 @@ DICOM file may be about a patient.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -16,15 +18,15 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.io.datasets.dicom_files import EncapsulatedVideo, Header, images, read_header
 from scopemap.io.decoding import first_bytes
-from scopemap.io.images import FOLDER_RATE_HZ, image_files, numeric_order
-from scopemap.io.source import SourceDefaults, SourceFrame
+from scopemap.io.images import image_files, numeric_order
+from scopemap.io.source import Source, SourceFrame
 
 _PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
 # The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
 _DIRECTORY = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
 
 
-class Dicom(SourceDefaults):
+class Dicom(Source):
     """The images of one DICOM file, or of one series in a folder.
 
     Time stamps are a video's own, else those of the header (FrameTimeVector, FrameTime, CineRate,
@@ -35,37 +37,34 @@ class Dicom(SourceDefaults):
     name = "dicom"
 
     def __init__(self, path: Path) -> None:
-        if not self.is_installed():
+        if find_spec("pydicom") is None:
             raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'")
-        self.path = path
-        self.notes: list[str] = []
-        self.warnings = []
+        super().__init__(path)
         self._headers = self._in_folder(path) if path.is_dir() else [read_header(path)]
         first = self._headers[0]
-        self.numbers = range(first.frames) if len(self._headers) == 1 else self._instances()
-        self.count: int | None = len(self.numbers)
+        self.numbers, self.count = range(first.frames), first.frames
+        if len(self._headers) > 1:
+            self.numbers, self.count = range(len(self._headers)), len(self._headers)
+            instances = [header.instance for header in self._headers if header.instance is not None]
+            if len(instances) == self.count and all(a < b for a, b in pairwise(instances)):
+                self.numbers = instances
+            else:
+                self._warn("not every file of the series has a number of its own: counted in the order of their names")
         self.width, self.height = int(first.fields.Columns), int(first.fields.Rows)
         self.pixel_aspect = first.pixel_aspect or 1.0
-        self._times_s, self._rate_hz, clock = first.clock()
-        self._video: EncapsulatedVideo | None = None
-        self.stamped = bool(clock)
-        if first.is_video:
-            self._video = EncapsulatedVideo(first, self._rate_hz)
-            self.warnings = self._video.warnings
+        self.times_s, rate_hz, clock = first.clock()
+        self._video = EncapsulatedVideo(first, rate_hz) if first.is_video else None
+        self.rate_hz = rate_hz or self.rate_hz
+        if self._video is not None:
+            self.numbers, self.warnings, self.rate_hz = None, self._video.warnings, self._video.rate_hz
             self.width, self.height, self.count = self._video.width, self._video.height, self._video.count
             self.pixel_aspect = first.pixel_aspect or self._video.pixel_aspect
             if self._video.stamped:
                 # Rates in headers are rounded.
-                self._times_s, self._rate_hz, clock = None, None, "the video's"
-            self.stamped = bool(clock)
-            clock = clock or f"frame number / {self._video.rate_hz:g} s (neither the file nor the stream has stamps)"
-        self.notes.append(f"time stamps: {clock or f'frame number / {FOLDER_RATE_HZ:g} s (the file states none)'}")
+                self.times_s, clock = {}, "the video's"
+        self.stamped = bool(clock)
+        self.notes.append(f"time stamps: {clock or f'frame number / {self.rate_hz:g} s (the file states none)'}")
         self._report_header(first)
-
-    @staticmethod
-    def is_installed() -> bool:
-        """Whether the package `pydicom` is there."""
-        return find_spec("pydicom") is not None
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -78,49 +77,36 @@ class Dicom(SourceDefaults):
         """Yield the selected frames; one that cannot be decoded is left out with a warning."""
         if self._video is not None:
             for frame in self._video.frames(selection):
-                yield SourceFrame(frame.index, self._time_s(frame.index, frame.time_s), frame.rgb, str(frame.index))
+                time_s = self.times_s.get(frame.index, frame.time_s)
+                yield replace(frame, time_s=time_s, name=str(frame.index))
             return
-        for number, rgb in self._selected(range(len(self.numbers))[selection]):
+        for number, rgb in self._selected(selection):
             if rgb is None:
                 self._warn(f"image {number} cannot be decoded and was left out")
                 continue
             self._check_size(rgb, f"{self.path}: image {number}")
             yield SourceFrame(number, self._time_s(number), rgb, str(number))
 
-    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
-        """Return number and time of the selected frames; None for a video, where only decoding tells."""
-        if self._video is not None:
-            return None
-        return [(number, self._time_s(number)) for number in self.numbers[selection]]
-
     def media(self) -> str | None:
         """Return the video's stream; None where there is none."""
         return None if self._video is None else self._video.media()
 
-    def _selected(self, positions: range) -> Iterator[tuple[int, np.ndarray | None]]:
+    def _selected(self, selection: slice) -> Iterator[tuple[int, np.ndarray | None]]:
         if len(self._headers) == 1:
-            yield from images(self._headers[0], positions)
+            yield from images(self._headers[0], range(self._headers[0].frames)[selection])
             return
-        for position in positions:
-            for _, rgb in images(self._headers[position], range(1)):
-                yield self.numbers[position], rgb
-
-    def _time_s(self, number: int, own_s: float | None = None) -> float:
-        """Return the time by the header, else `own_s`, else by the assumed rate."""
-        if self._times_s is not None and number < len(self._times_s):
-            return float(self._times_s[number])
-        if self._rate_hz:
-            return number / self._rate_hz
-        return number / FOLDER_RATE_HZ if own_s is None else own_s
+        for number, header in list(zip(self.numbers or (), self._headers, strict=True))[selection]:
+            for _, rgb in images(header, range(1)):
+                yield number, rgb
 
     def _report_header(self, first: Header) -> None:
         """Add the notes and warnings on levels, time steps, missing images and burned-in notes."""
         stored = int(first.fields.get("BitsStored") or 8)
-        if first.window is not None:
+        if first.is_windowed:
             self.notes.append("grey levels: the window of the file (WindowCenter, WindowWidth), as 8 bit")
         elif stored > 8 and self._video is None:
             self.notes.append(f"levels: all {stored} stored bits (BitsStored), scaled to 8 bit")
-        if first.fields.get("FrameTimeVector") and self._times_s is None and self._video is None:
+        if first.fields.get("FrameTimeVector") and not self.times_s and self._video is None:
             self._warn("its FrameTimeVector does not increase, or not once for each image, and was left out")
         if first.missing:
             self._warn(f"it claims {first.frames + first.missing} images, {first.frames} are there; these were used")
@@ -130,14 +116,12 @@ class Dicom(SourceDefaults):
     def _in_folder(self, path: Path) -> list[Header]:
         """Return the headers of the one series in a folder, sorted."""
         files = _files(path)
-        headers, fault = [], ""
+        headers = []
         for file in files:
-            try:
+            with suppress(InputError):
                 headers.append(read_header(file))
-            except InputError as error:
-                fault = str(error)
         if not headers:
-            raise InputError(fault or f"reading {path}: it holds no DICOM file")
+            raise InputError(f"reading {path}: none of its {len(files)} DICOM files holds images that can be read")
         if len(headers) < len(files):
             left_out = f"{len(files) - len(headers)} of {len(files)} DICOM files"
             self._warn(f"{left_out} hold no images or cannot be read, and were left out")
@@ -149,13 +133,6 @@ class Dicom(SourceDefaults):
                 "frames; give one file, or a folder with one series"
             )
         return sorted(headers, key=lambda header: header.instance or 0)
-
-    def _instances(self) -> Sequence[int]:
-        numbers = [header.instance for header in self._headers if header.instance is not None]
-        if len(numbers) == len(self._headers) and all(a < b for a, b in pairwise(numbers)):
-            return numbers
-        self._warn("not every file of the series has a number of its own: they are counted in the order of their names")
-        return range(len(self._headers))
 
 
 def _is_dicom(file: Path) -> bool:

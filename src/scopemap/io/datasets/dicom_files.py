@@ -9,15 +9,16 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.io.decoding import check_bytes, check_pixels, reporting
+from scopemap.errors import InputError, check_bytes, reporting
+from scopemap.io.decoding import check_pixels
 from scopemap.io.video import VideoFile
 
 _IMPLICIT, _EXPLICIT = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
@@ -37,17 +38,11 @@ _TAGS = (
 
 @dataclass(frozen=True)
 class Header:
-    """What a file's header holds about its images.
+    """What the header of the file `path` holds about its images.
 
-    Attributes
-    ----------
-    path : the file.
-    syntax : UID of the transfer syntax.
-    frames : number of images that the file claims and has room for.
-    missing : number of images that it claims beyond these.
-    start : place of the pixel data in the file, bytes.
-    fragments : start and length of the pieces of the pixel data, bytes; one piece where it is native.
-    fields : the tags that were read.
+    syntax : UID of the transfer syntax. frames : number of images that the file claims and has room for. missing :
+    number of those that it claims beyond these. start : place of the pixel data in the file, bytes. fragments : start
+    and length of its pieces, bytes; one piece where it is native. fields : the tags that were read.
     """
 
     path: Path
@@ -61,7 +56,9 @@ class Header:
     @property
     def is_video(self) -> bool:
         """Whether the images are one MPEG stream."""
-        return _is_mpeg(self.syntax)
+        from pydicom.uid import MPEGTransferSyntaxes
+
+        return self.syntax in MPEGTransferSyntaxes
 
     @property
     def is_native(self) -> bool:
@@ -84,34 +81,27 @@ class Header:
             return across / down if 0.1 < across / (down or np.nan) < 10 else None
 
     @property
-    def window(self) -> tuple[float, float] | None:
-        """Lowest and highest stored level that are displayed, of grey images; None where the file does not state them.
-
-        PS3.3, C.11.1.1.2 (rescaling) and C.11.2.1.2.1 (linear window), solved for the stored level.
-        """
-        fields = self.fields
-        is_grey = str(fields.get("PhotometricInterpretation", "")).startswith("MONOCHROME")
-        if not is_grey or str(fields.get("VOILUTFunction") or "LINEAR") != "LINEAR":
-            return None
+    def is_windowed(self) -> bool:
+        """Whether grey levels are displayed by a window that the file states (PS3.3, C.11.2.1.2)."""
         with _reporting(self.path):
-            centre, width = (np.ravel(fields.get(f"Window{name}") or np.nan)[0] for name in ("Center", "Width"))
-            slope, intercept = float(fields.get("RescaleSlope") or 1), float(fields.get("RescaleIntercept") or 0)
-            low, high = ((float(centre) - 0.5 + side * (float(width) - 1) / 2 - intercept) / slope for side in (-1, 1))
-        return (low, high) if low < high and np.isfinite((low, high)).all() else None
+            is_grey = str(self.fields.get("PhotometricInterpretation", "")).startswith("MONOCHROME")
+            width = np.ravel(self.fields.get("WindowWidth") or 0)[0]
+            return is_grey and width >= 1 and self.fields.get("WindowCenter") is not None
 
-    def clock(self) -> tuple[np.ndarray | None, float | None, str]:
-        """Return times (frames,), s from the first, or None; images per second, or None; and a note of their tag."""
+    def clock(self) -> tuple[dict[int, float], float | None, str]:
+        """Return times, s from the first, by image, or {}; images per second, or None; and a note of their tag."""
         with _reporting(self.path):
             steps_ms = np.ravel(self.fields.get("FrameTimeVector") or []).astype(float)[: self.frames]
             if len(steps_ms) == self.frames > 1 and np.isfinite(steps_ms).all() and (steps_ms[1:] > 0).all():
-                return np.cumsum([0.0, *steps_ms[1:]]) / 1000, None, "FrameTimeVector"
+                times_s = np.cumsum([0.0, *steps_ms[1:]]) / 1000
+                return dict(enumerate(times_s.tolist())), None, "FrameTimeVector"
             period_ms = float(self.fields.get("FrameTime") or 0)
             rates_hz = {"FrameTime": 1000 / period_ms if period_ms > 0 else 0.0}
             rates_hz |= {name: float(self.fields.get(name) or 0) for name in _RATES}
         for name, rate_hz in rates_hz.items():
             if _SLOWEST_HZ < rate_hz < _FASTEST_HZ:
-                return None, rate_hz, f"frame number / {rate_hz:g} s ({name})"
-        return None, None, ""
+                return {}, rate_hz, f"frame number / {rate_hz:g} s ({name})"
+        return {}, None, ""
 
 
 def read_header(file: Path) -> Header:
@@ -123,23 +113,25 @@ def read_header(file: Path) -> Header:
         syntax = str(fields.file_meta.get("TransferSyntaxUID", ""))
         syntax = syntax or (_IMPLICIT if fields.original_encoding[0] else _EXPLICIT)
         rows, columns = int(fields.get("Rows") or 0), int(fields.get("Columns") or 0)
-        length = _pixel_length(stream, syntax)
-        if min(rows, columns) < 1 or length is None:
+        element = stream.read(8)
+        if min(rows, columns) < 1 or element[:4] != _PIXEL_DATA or len(element) < 8:
             raise InputError(f"reading {file}: the DICOM file holds no images")
+        # PS3.5, 7.1: an explicit VR is followed by two empty bytes and the length.
+        length = int(struct.unpack("<L", element[4:] if syntax == _IMPLICIT else stream.read(4))[0])
         check_pixels(float(rows) * columns)
         start, claimed = stream.tell(), max(int(fields.get("NumberOfFrames") or 1), 1)
         fields.NumberOfFrames = claimed
         fragments = _fragments(stream) if length == _UNDEFINED else [(start, length)]
-        frames = claimed
-        if not _is_mpeg(syntax):
-            _check_decoder(file, syntax)
-            room = min(stream.seek(0, io.SEEK_END) - start, length)
-            found = room // max(_native_bytes(fields), 1)
-            if length == _UNDEFINED:
-                found = len(fragments)
-                check_bytes(f"{file}, one image", max((size for _, size in fragments), default=0), _MOST_IMAGE_BYTES)
-            frames = min(claimed, found)
-    return Header(file, syntax, frames, claimed - frames, start, fragments, fields)
+        header = Header(file, syntax, claimed, 0, start, fragments, fields)
+        if header.is_video:
+            return header
+        _check_decoder(file, syntax)
+        found = len(fragments)
+        if length == _UNDEFINED:
+            check_bytes(f"{file}, one image", max((size for _, size in fragments), default=0), _MOST_IMAGE_BYTES)
+        else:
+            found = min(stream.seek(0, io.SEEK_END) - start, length) // max(_native_bytes(fields), 1)
+    return replace(header, frames=min(claimed, found), missing=max(claimed - found, 0))
 
 
 def images(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | None]]:
@@ -147,16 +139,12 @@ def images(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | No
 
     Grey images show the window that the file states, else all stored levels. One decoded image is held at a time.
     """
-    for number, content in enumerate(_packed(header)):
-        if number >= min(wanted.stop, header.frames):
-            return
+    for number, content in enumerate(islice(_packed(header), min(wanted.stop, header.frames))):
         if number in wanted:
-            try:
-                with _reporting(header.path):
-                    yielded = _rgb(header, content)
-            except InputError:
-                yielded = None
-            yield number, yielded
+            rgb = None
+            with suppress(InputError), _reporting(header.path):
+                rgb = _rgb(header, content)
+            yield number, rgb
 
 
 class EncapsulatedVideo(VideoFile):
@@ -166,36 +154,22 @@ class EncapsulatedVideo(VideoFile):
     """
 
     def __init__(self, header: Header, stated_hz: float | None) -> None:
-        self._fragments = [(start, start + length) for start, length in header.fragments if length]
-        if not self._fragments:
+        filled = [(start, start + length) for start, length in header.fragments if length]
+        if not filled:
             raise InputError(f"reading {header.path}: the video in the DICOM file is empty")
+        self._fragments = "|".join(f"subfile,,start,{start},end,{end},,:{header.path}" for start, end in filled)
         super().__init__(header.path)
         if not self.stamped and stated_hz:
             self.rate_hz = stated_hz
 
     def media(self) -> str:
         """Return FFmpeg's name of the fragments, joined."""
-        return "concat:" + "|".join(f"subfile,,start,{a},end,{b},,:{self.path}" for a, b in self._fragments)
+        return f"concat:{self._fragments}"
 
 
 def _reporting(path: Path) -> AbstractContextManager[None]:
     """Turn the exceptions of `pydicom` into an `InputError` that quotes nothing of the file."""
     return reporting(f"reading {path}: the DICOM file is damaged or incomplete", quoting=False)
-
-
-def _is_mpeg(syntax: str) -> bool:
-    """Whether a UID is one of MPEG-2, MPEG-4 or HEVC (PS3.5, A.4.5 to A.4.8)."""
-    part = syntax.removeprefix("1.2.840.10008.1.2.4.").removesuffix(".1")
-    return syntax.startswith("1.2.840.10008.1.2.4.") and part.isdecimal() and 100 <= int(part) <= 108
-
-
-def _pixel_length(stream: BinaryIO, syntax: str) -> int | None:
-    """Read on to the first byte of the pixel data; return its length, None where there is none."""
-    start = stream.read(8)
-    if start[:4] != _PIXEL_DATA or len(start) < 8:
-        return None
-    # PS3.5, 7.1: an explicit VR is followed by two empty bytes and the length.
-    return int(struct.unpack("<L", start[4:] if syntax == _IMPLICIT else stream.read(4))[0])
 
 
 def _fragments(stream: BinaryIO) -> list[tuple[int, int]]:
@@ -221,11 +195,9 @@ def _check_decoder(file: Path, syntax: str) -> None:
     from pydicom.pixels import get_decoder
     from pydicom.uid import UID, UID_dictionary
 
-    try:
+    with suppress(RuntimeError):  # it is unknown
         if get_decoder(UID(syntax)).is_available:
             return
-    except RuntimeError:  # it is unknown
-        pass
     # A UID that is unknown is not quoted: it may hold anything.
     name = UID(syntax).name if syntax in UID_dictionary else "an unknown transfer syntax"
     raise InputError(
@@ -256,7 +228,7 @@ def _packed(header: Header) -> Iterator[bytes]:
 def _rgb(header: Header, content: bytes) -> np.ndarray:
     """Return the image (rows, columns, 3) uint8 in the bytes of one frame."""
     from pydicom.encaps import encapsulate
-    from pydicom.pixels import apply_color_lut, get_decoder
+    from pydicom.pixels import apply_color_lut, apply_rescale, apply_windowing, get_decoder
     from pydicom.pixels.utils import as_pixel_options
     from pydicom.uid import UID
 
@@ -271,10 +243,13 @@ def _rgb(header: Header, content: bytes) -> np.ndarray:
     if colours == "PALETTE COLOR":
         values = apply_color_lut(values, header.fields)
         stored = 8 * values.dtype.itemsize
-    lowest = -(1 << (stored - 1)) if values.dtype.kind == "i" else 0
-    low, high = header.window or (lowest, lowest + (1 << stored) - 1)
-    if (low, high) != (0, 255):
-        values = np.rint(255 * np.clip((values.astype(np.float32) - low) / (high - low), 0, 1))
+    low = -(1 << (stored - 1)) if values.dtype.kind == "i" else 0
+    levels = np.array([low, low + (1 << stored) - 1])
+    if header.is_windowed:
+        values = apply_windowing(apply_rescale(values, header.fields), header.fields)
+        levels = apply_rescale(levels, header.fields)
+    if values.dtype != np.uint8 or levels[1] != 255:
+        values = np.rint(255 * np.clip((values.astype(np.float32) - levels[0]) / np.ptp(levels), 0, 1))
     values = values.astype(np.uint8)
     values = 255 - values if colours == "MONOCHROME1" else values
     return np.ascontiguousarray(np.broadcast_to(values.reshape(*values.shape[:2], -1), (*values.shape[:2], 3)))

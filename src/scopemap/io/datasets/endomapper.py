@@ -14,9 +14,8 @@ from pathlib import Path
 
 from scopemap.cameras.formats.colmap import read_largest_model
 from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.errors import InputError
-from scopemap.frame import TruthQuality
-from scopemap.io.datasets.posed_video import PosedVideo, only_video, videos_in
+from scopemap.errors import InputError, reporting
+from scopemap.io.datasets.posed_video import PosedVideo, videos_in
 from scopemap.trajectory.formats.colmap import camera_poses
 
 _PROCEDURE = re.compile(r"Seq_\d+")
@@ -31,13 +30,13 @@ class EndoMapperSequence(PosedVideo):
     """The video of one procedure. COLMAP's image `outN.png` is frame N - 1 of the video."""
 
     name = "endomapper"
-    quality: TruthQuality = "sfm"
+    quality = "sfm"
 
     def __init__(self, path: Path) -> None:
         videos = videos_in(path, ".mov")
-        named = [file for file in videos if _PROCEDURE.fullmatch(file.stem)] or videos
-        video = only_video(path, named, "an EndoMapper procedure holds one Seq_NNN.mov")
-        super().__init__(path, video)
+        videos = [file for file in videos if _PROCEDURE.fullmatch(file.stem)] or videos
+        super().__init__(path, videos)
+        video = videos[0]
         self._use_endoscope(path / f"{video.stem}_info.json")
         self._take_poses(path / "meta-data" / "colmap" / f"{video.stem}.zip")
 
@@ -51,7 +50,8 @@ class EndoMapperSequence(PosedVideo):
         """Take the calibration of the endoscope that the info file names, unless the folder has its own camera."""
         file = self._calibration_file(info) if self.camera is None else None
         if file is not None:
-            self._set_camera(stated_calibration(file, (self.width, self.height)).camera, file)
+            camera = stated_calibration(file, (self.width, self.height)).camera
+            self._set_camera(camera, f"calibration of the data set, {file.name}", str(file))
 
     def _calibration_file(self, info: Path) -> Path | None:
         number = read_endoscope(info) if info.is_file() else None
@@ -59,9 +59,8 @@ class EndoMapperSequence(PosedVideo):
             beside = sorted(self.path.glob(f"*{_GEOMETRICAL}"))
             if len(beside) == 1:
                 return beside[0]
-            self.notes.append(
-                f"no calibration: {info.name} " + ("names no endoscope" if info.is_file() else "is missing")
-            )
+            fault = "names no endoscope" if info.is_file() else "is missing"
+            self.notes.append(f"no calibration: {info.name} {fault}")
             return None
         name = f"Endoscope_{number:02d}"
         above = [self.path, *self.path.absolute().parents[:_LEVELS_UP]]
@@ -82,18 +81,13 @@ class EndoMapperSequence(PosedVideo):
             match = _FRAME.fullmatch(name)
             number = int(match[1]) - 1 if match else -1
             if number < 0 or number in self.poses:
-                raise InputError(
-                    f"reading {archive}: the image name {name!r} is not that of a frame, outN.png, or N repeats"
-                )
+                raise InputError(f"reading {archive}: the image name {name!r} is none of a frame, outN.png, or repeats")
             self.poses[number] = pose
         self.notes.append(
             f"truth: COLMAP sub-model {chosen}, the largest of {count}: {len(self.poses)} frames; its "
             "scale is arbitrary (its unit is taken as mm); image outN.png is taken as frame N - 1; no depth is known"
         )
-        if self._beyond():
-            self.warnings.append(
-                f"{archive.name}: {self._beyond()} poses are of frames beyond the {self.count} of the video"
-            )
+        self._warn_of_poses_beyond(archive)
 
 
 def read_endoscope(info: Path) -> int | None:
@@ -101,11 +95,8 @@ def read_endoscope(info: Path) -> int | None:
 
     Raises `InputError` for anything else.
     """
-    try:
-        content = json.loads(info.read_text(encoding="utf-8-sig"))
-        stated = content.get("endoscope_number")
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"reading {info}: it is no JSON object ({error})") from None
+    with reporting(f"reading {info}: it is no JSON object"):
+        stated = json.loads(info.read_text(encoding="utf-8-sig")).get("endoscope_number")
     text = "" if stated is None else str(stated).strip()
     if text.lower() in _UNKNOWN:
         return None

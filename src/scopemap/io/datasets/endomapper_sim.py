@@ -8,16 +8,17 @@ The depth buffer v runs from 1 at 1 mm to 0 at 400 mm: the depth is 1 dm / (0.25
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.errors import InputError
-from scopemap.io.datasets.exr import can_read_exr, read_exr_red
-from scopemap.io.datasets.unity import read_unity_table
-from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, by_number
+from scopemap.errors import InputError, reporting
+from scopemap.io.datasets.unity import UnityFolder
+from scopemap.io.decoding import check_pixels
+from scopemap.io.images import by_number
 
 CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)
 """As published with the simulated sequences."""
@@ -28,7 +29,7 @@ _NEAR_DM, _FAR_DM = 0.01, 4.0
 _ASPECT_TOLERANCE = 0.01
 
 
-class EndoMapperSimFolder(ImageFolder):
+class EndoMapperSimFolder(UnityFolder):
     """One simulated sequence; `camera.yaml` beside it is preferred, its `depth_scale` is the mm of a unit (dm)."""
 
     name = "endomapper-sim"
@@ -37,12 +38,7 @@ class EndoMapperSimFolder(ImageFolder):
     def __init__(self, path: Path) -> None:
         super().__init__(path, list(by_number((path / "rgb").glob("image_*.png")).values()))
         self.depth_files = by_number((path / "depth").glob("aov_image_*.exr"))
-        table = read_unity_table(path / _TRAJECTORY, _MM_PER_DM)
-        self.poses, self.times_s = table.poses, table.times_of(self.numbers, FOLDER_RATE_HZ)
-        self.warnings += table.warnings
-        if self.times_s:
-            self.stamped = True
-            self.notes[0] = f"time stamps: those of {_TRAJECTORY}"
+        self._read_table(path / _TRAJECTORY, _MM_PER_DM)
         self.notes += [
             f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "
             "the data set does not state which they are, and others use them unconverted",
@@ -51,7 +47,7 @@ class EndoMapperSimFolder(ImageFolder):
         without = sum(number not in self.poses for number in self.numbers)
         if without:
             self._warn(f"{path / _TRAJECTORY}: {without} of {self.count} images have no pose in it")
-        if self.depth_files and not can_read_exr():
+        if self.depth_files and find_spec("OpenEXR") is None:
             self.depth_files = {}
             self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install 'scopemap[datasets]'")
         file = path / _CALIBRATION
@@ -81,3 +77,19 @@ class EndoMapperSimFolder(ImageFolder):
         v = np.where((v >= 0) & (v <= 1), v, np.float32(np.nan))
         depth_dm = 1 / (1 / _FAR_DM + (1 / _NEAR_DM - 1 / _FAR_DM) * v)
         return (depth_dm * (self.depth_scale_mm or _MM_PER_DM)).astype(np.float32)
+
+
+def read_exr_red(file: Path) -> np.ndarray:
+    """Return the channel R, or Y of a file without R, as (h, w) float32.
+
+    Raises `InputError` for a file that is damaged, has neither channel, or claims more pixels than `decoding` allows.
+    """
+    import OpenEXR
+
+    with reporting(f"reading {file}: no OpenEXR image with a channel R or Y, or damaged"):
+        # Header first: the file's claim is checked before its pixels are decoded.
+        corners = OpenEXR.File(str(file), header_only=True).header()["dataWindow"]
+        width, height = (np.subtract(*reversed(corners), dtype=np.int64) + 1).tolist()
+        check_pixels(width * height, f"reading {file}")
+        channels = OpenEXR.File(str(file), separate_channels=True).channels()
+        return np.array(channels["R" if "R" in channels else "Y"].pixels, dtype=np.float32)

@@ -9,12 +9,11 @@ Deformable Tissues in Robotic Surgery", arXiv 2206.15255.
 from __future__ import annotations
 
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.images import ImageFolder, image_files, numbered_images
 from scopemap.trajectory.formats.poses import rigid
 
@@ -23,8 +22,6 @@ _DEPTHS, _MASKS, _MASKS_WITH_HOLES = "depth", "gt_masks", "masks"
 _COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
 _IDENTITY_TOLERANCE = 1e-2
 _REST_TOLERANCE = 1e-6
-# A damaged header is read as Python, and ends in whatever that can end in.
-_DAMAGE = (OSError, ValueError, TypeError, SyntaxError, TokenError, EOFError, MemoryError, OverflowError)
 
 
 class EndoNerfFolder(ImageFolder):
@@ -78,12 +75,11 @@ class EndoNerfFolder(ImageFolder):
             self.notes.append(f"poses in {file.name} are taken as LLFF's (columns down, right, back), in mm")
         else:
             self.notes.append(f"poses in {file.name} start at the identity: taken as they are, camera to world, in mm")
-        at_rest = np.abs(poses - poses[0]).max() < _REST_TOLERANCE
-        if at_rest:
+        if np.abs(poses - poses[0]).max() < _REST_TOLERANCE:
             self.notes.append("the camera is at rest while the tissue moves: errors of the path say little here")
         if len(rows) != len(self.numbers):
             raise InputError(
-                f"reading {file}: it holds {len(rows)} rows for {len(self.numbers)} images, in whose order they are"
+                f"reading {file}: it holds {len(rows)} rows for {len(self.numbers)} images, in their order"
             )
         return dict(zip(np.array(self.numbers)[known].tolist(), poses, strict=True))
 
@@ -93,13 +89,11 @@ def _poses_file(path: Path) -> Path | None:
 
 
 def _read_rows(file: Path) -> np.ndarray:
-    try:
+    with reporting(f"reading {file}: no NumPy array of numbers"):
         # Mapped, a header that claims more than the file holds is refused before any memory is taken.
         array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except _DAMAGE as error:
-        raise InputError(f"reading {file}: no NumPy array of numbers ({error})") from None
-    if not isinstance(array, np.ndarray):
-        raise InputError(f"reading {file}: no NumPy array of numbers (it is an archive)")
+        if not isinstance(array, np.ndarray):
+            raise ValueError("it is an archive")
     if array.ndim != 2 or array.shape[1] != _COLUMNS or array.dtype.kind not in "fiu":
         found = f"{array.dtype} of shape {array.shape}"
         raise InputError(f"reading {file}: expected LLFF's numbers of shape (images, {_COLUMNS}), found {found}")
@@ -109,11 +103,10 @@ def _read_rows(file: Path) -> np.ndarray:
 def _camera(rows: np.ndarray, file: Path) -> PinholeCamera:
     """Return the camera that all rows agree on, at the size that they state."""
     stated = rows[:, [4, 9, 14]]
-    stated = stated[np.isfinite(stated).all(axis=1)]
-    if not len(stated) or not np.allclose(stated, stated[0]):
-        found = "several cameras" if len(stated) else "none"
-    else:
-        height, width, focal_px = (float(value) for value in stated[0])
+    stated = np.unique(np.round(stated[np.isfinite(stated).all(axis=1)], 6), axis=0)
+    found = "several cameras" if len(stated) else "none"
+    if len(stated) == 1:
+        height, width, focal_px = stated[0].tolist()
         if min(height, width) >= 1 and 0.3 * width < focal_px < 5 * width:
             return PinholeCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, round(width), round(height))
         found = f"height {height:g}, width {width:g}, focal length {focal_px:g}"

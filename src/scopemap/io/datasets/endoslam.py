@@ -13,18 +13,19 @@ odometry and depth estimation approach for endoscopic videos", arXiv 2006.16670.
 from __future__ import annotations
 
 import re
+import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import InputError
+from scopemap.errors import InputError, check_bytes, reporting
 from scopemap.frame import TruthQuality
-from scopemap.io.datasets.spreadsheet import read_sheet
-from scopemap.io.datasets.unity import read_unity_table
+from scopemap.io.datasets.unity import UnityFolder
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, image_files, numbered_images
+from scopemap.io.images import image_files, numbered_images
 from scopemap.trajectory.formats.poses import poses_by_row
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
@@ -44,9 +45,11 @@ _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
 _COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
 _MM_PER_METRE = 1000.0
 _SAME = 1e-6
+# Some hundred thousand cells; in memory they take many times as much.
+_MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
 
 
-class EndoSlamFolder(ImageFolder):
+class EndoSlamFolder(UnityFolder):
     """The frames of one trajectory; `camera.yaml` beside `Frames` replaces `cam.txt`.
 
     Raises `InputError` where images and poses do not fit together.
@@ -60,16 +63,21 @@ class EndoSlamFolder(ImageFolder):
         super().__init__(path, _frame_files(path))
         self._check_numbers()
         self.depth_files = next((depths for name in _DEPTHS if (depths := numbered_images(path / name))), {})
-        file = next((found for name in _POSES if (found := _find_poses(path / name)) is not None), None)
+        found = (file for name in _POSES for pattern in _POSE_FILES for file in sorted((path / name).glob(pattern)))
+        # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
+        file = next((file for file in found if file.is_file() and not file.name.startswith((".", "~"))), None)
         rendered = bool(self.depth_files) or (file is not None and file.suffix.lower() == ".csv")
-        self.rate_hz, rate_source = _rate_hz(path, "UnityCam" if rendered else "HighCam" if file else "")
+        usual = "UnityCam" if rendered else "HighCam" if file else ""
+        camera = next((part for part in reversed(path.absolute().parts) if part in RATES_HZ), usual)
+        self.rate_hz = RATES_HZ.get(camera, self.rate_hz)
+        rate_source = f"published rate of {camera}" if camera else "assumed"
         self.notes = [f"time stamps: image number / {self.rate_hz:g} s ({rate_source})"]
         if self.depth_files:
             self.notes.append("depth: 8 bit, unit not documented, read as cm; compare after aligning scale")
         if file is None:
             self.warnings.append(f"no pose is known: looked for {' and '.join(_POSE_FILES)} in Poses")
         elif file.suffix.lower() == ".csv":
-            self._check_poses(file, self._read_table(file))
+            self._check_poses(file, self._read_rendered(file))
         else:
             self._check_poses(file, self._read_robot(file))
         if self.camera is None:
@@ -82,15 +90,10 @@ class EndoSlamFolder(ImageFolder):
         known = named or any((path / name).is_dir() for name in (_POSES[0], *_DEPTHS))
         return known and bool(_frame_files(path))
 
-    def _read_table(self, file: Path) -> int:
+    def _read_rendered(self, file: Path) -> int:
         """Read Unity's table and return the number of its rows."""
-        table = read_unity_table(file, _MM_PER_METRE)
-        self.poses, self.times_s = table.poses, table.times_of(self.numbers, self.rate_hz)
-        if self.times_s:
-            self.stamped = True
-            self.notes[0] = "time stamps: those of the poses"
-        self.warnings += table.warnings
-        rotations = np.array([T[:3, :3] for T in table.poses.values()])
+        count = self._read_table(file, _MM_PER_METRE)
+        rotations = np.array([T[:3, :3] for T in self.poses.values()])
         if len(rotations) > 1 and np.ptp(rotations, axis=0).max() < _SAME:
             self.warnings.append(f"{file.name}: all rotations are the same; errors of rotation against it mislead")
         self.notes += [
@@ -98,7 +101,7 @@ class EndoSlamFolder(ImageFolder):
             "poses: Unity's left-handed axes, y mirrored to OpenCV's (EndoGSLAM mirrors z; neither is documented)",
             f"poses: row of {file.name} = image number, from 0 (it does not state it)",
         ]
-        return table.count
+        return count
 
     def _read_robot(self, file: Path) -> int:
         """Read the robot's spreadsheet and return the number of its rows."""
@@ -148,18 +151,6 @@ def _frame_files(path: Path) -> list[Path]:
     return next((files for name in _FRAMES if (files := image_files(path / name))), [])
 
 
-def _find_poses(folder: Path) -> Path | None:
-    # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
-    files = [file for pattern in _POSE_FILES for file in sorted(folder.glob(pattern))]
-    return next((file for file in files if file.is_file() and not file.name.startswith((".", "~"))), None)
-
-
-def _rate_hz(path: Path, camera: str) -> tuple[float, str]:
-    """Return the rate of the camera that the path names, else that of `camera`, and where it is from."""
-    named = next((part for part in reversed(path.absolute().parts) if part in RATES_HZ), camera)
-    return (RATES_HZ[named], f"published rate of {named}") if named in RATES_HZ else (FOLDER_RATE_HZ, "assumed")
-
-
 def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:
     """Return the columns `_COLUMNS` of the first sheet, (N, 8), NaN for empty cells, and the place of each row."""
     sheet = read_sheet(file)
@@ -172,10 +163,27 @@ def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:
     filled = [(f"{file}, row {number}", cells) for number, cells in sheet[1:] if any(cells[c] for c in wanted)]
     rows = []
     for place, cells in filled:
-        try:
+        with reporting(f"{place}: expected {len(wanted)} numbers"):
             rows.append([float(cells[column] or "nan") for column in wanted])
-        except ValueError as error:
-            raise InputError(f"{place}: expected {len(wanted)} numbers ({error})") from None
     if not rows:
         raise InputError(f"reading {file}: it holds no pose")
     return np.array(rows), [place for place, _ in filled]
+
+
+def read_sheet(file: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of the first sheet that hold anything: row number from 1, and the text of each cell, "" if empty.
+
+    Raises `InputError` for any other file, for one that unpacks to more than 32 MB, and without `openpyxl`.
+    """
+    if find_spec("openpyxl") is None:
+        raise InputError(f"reading {file}: it is a spreadsheet; install its reader: pip install 'scopemap[datasets]'")
+    import openpyxl
+
+    with reporting(f"reading {file}: no Excel workbook, or damaged; download it again"):
+        with zipfile.ZipFile(file) as archive:
+            check_bytes(str(file), sum(member.file_size for member in archive.infolist()), _MOST_BYTES)
+        sheet = openpyxl.load_workbook(file, data_only=True).worksheets[0]
+        if sheet.max_row * sheet.max_column > _MOST_CELLS:
+            raise InputError(f"reading {file}: its first sheet claims {sheet.max_row}x{sheet.max_column} cells")
+        rows = [["" if cell is None else str(cell).strip() for cell in row] for row in sheet.values]
+    return [(number, row) for number, row in enumerate(rows, start=1) if any(row)]

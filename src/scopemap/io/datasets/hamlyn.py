@@ -32,7 +32,10 @@ class HamlynFolder(ImageFolder):
         depths = {number: path / self._depths / f"{file.stem}.png" for number, file in self.file_of.items()}
         self.depth_files = {number: file for number, file in depths.items() if file.is_file()}
         self.notes += [f"depth beside the images: {self._origin}", "no pose is known: the data set has none"]
-        file = _intrinsics_file(path.absolute())
+        path, places = path.absolute(), [path / _INTRINSICS]
+        for parent in path.parents[:3]:  # zips repeat a folder
+            places += [parent / "calibration" / path.name / _INTRINSICS, parent / f"intrinsics_{path.name}.txt"]
+        file = next((file for file in places if file.is_file()), None)
         if self.camera is None and file is not None:
             self.camera = read_calibration(file, (self.width, self.height)).camera
             self.camera_source = f"published intrinsics ({file})"
@@ -48,7 +51,7 @@ class HamlynTrackingFolder(HamlynFolder):
 
     name = "hamlyn-tracking"
     _images, _depths = "color", "depth"
-    quality: TruthQuality = "predicted"
+    quality = "predicted"
     _origin = "predicted by Endo-Depth, cut at 300 mm"
 
     @staticmethod
@@ -57,14 +60,3 @@ class HamlynTrackingFolder(HamlynFolder):
         files = image_files(path / "color")
         named = bool(files) and _FRAME_NAME.fullmatch(files[0].stem) is not None
         return named and (path / "depth").is_dir() and (path / _INTRINSICS).is_file()
-
-
-def _intrinsics_file(sequence: Path) -> Path | None:
-    parent, name = sequence.parent, sequence.name
-    places = (
-        sequence / _INTRINSICS,
-        parent / "calibration" / name / _INTRINSICS,
-        parent.parent / "calibration" / name / _INTRINSICS,
-        parent / f"intrinsics_{name}.txt",
-    )
-    return next((file for file in places if file.is_file()), None)

@@ -9,6 +9,7 @@ Teufel et al., "OneSLAM to map them all", IJCARS 2024.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.parsing import calibration_bytes
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.datasets.tum import read_stamped
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import FOLDER_RATE_HZ, ImageFolder, by_number, image_files
+from scopemap.io.images import ImageFolder, by_number, image_files
 from scopemap.trajectory.formats.poses import are_frame_numbers
 from scopemap.trajectory.formats.text import tum_poses
 
@@ -48,15 +49,20 @@ class OneSlamFolder(ImageFolder):
                 self.camera = read_calibration(path / _CALIBRATION, (self.width, self.height)).camera
                 straight = ", taken as of images without distortion" * isinstance(self.camera, PinholeCamera)
                 self.camera_source = f"{_CALIBRATION} beside the frames{straight}"
-        self.rate_hz = _rate_of(stated, path / _CALIBRATION)
+        if stated.get("FPS") is not None:
+            found = f"found {stated['FPS']!r:.80}"
+            with reporting(f"reading {path / _CALIBRATION}: FPS must be a positive number, {found}"):
+                self.rate_hz = float(stated["FPS"])
+                if not 0 < self.rate_hz < float("inf"):
+                    raise ValueError("out of range")
         given = "FPS of calibration.json" if stated.get("FPS") is not None else "assumed: calibration.json has no FPS"
         self.notes = [f"time stamps: frame number / {self.rate_hz:g} s ({given})"]
         self._tissue = self._read_mask()
         mm_per_unit = self._read_poses()
         self.depth_files = by_number(image_files(path / "depths"))
-        self.depth_code = ((16, mm_per_unit / _DEPTHS_PER_UNIT, 65535),)
+        step_mm = mm_per_unit / _DEPTHS_PER_UNIT
+        self.depth_code = ((16, step_mm, 65535),)
         if self.depth_files and self.depth_scale_mm is None:
-            step_mm = mm_per_unit / _DEPTHS_PER_UNIT
             self.notes.append(f"depth: {step_mm:g} mm per unit of the files, 1000 to a unit of the scene")
         if self.depth_files or self.poses:
             self.notes.append("the layout does not state how poses and depth came about: taken as registered")
@@ -66,20 +72,17 @@ class OneSlamFolder(ImageFolder):
         """Return whether `path` holds `images` with images, and calibration.json with `intrinsics`."""
         if not ((path / _CALIBRATION).is_file() and image_files(path / "images")):
             return False
-        try:
+        with suppress(CalibrationError):
             return "intrinsics" in _read_json(path / _CALIBRATION)
-        except CalibrationError:
-            return False
+        return False
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         depth_mm = super()._depth_mm(index)
         if depth_mm is None or self._tissue is None:
             return depth_mm
         if depth_mm.shape != self._tissue.shape:
-            raise InputError(
-                f"reading {self.depth_files[index]}: depth of {depth_mm.shape[1]}x{depth_mm.shape[0]} px beside a "
-                f"{_MASK} of {self._tissue.shape[1]}x{self._tissue.shape[0]} px; they must be of one size"
-            )
+            sizes = f"{depth_mm.shape[1]}x{depth_mm.shape[0]} px, {_MASK} {self.width}x{self.height} px"
+            raise InputError(f"reading {self.depth_files[index]}: depth is {sizes}; they must be of one size")
         return np.where(self._tissue, depth_mm, np.float32(np.nan))
 
     def _read_poses(self) -> float:
@@ -112,22 +115,8 @@ class OneSlamFolder(ImageFolder):
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    try:
+    with reporting(f"cannot read the calibration in {file}", kind=CalibrationError):
         stated = json.loads(calibration_bytes(file))
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
-    if not isinstance(stated, dict):
-        raise CalibrationError(f'the calibration {file} is no object with "intrinsics"')
-    return stated
-
-
-def _rate_of(stated: dict[str, Any], file: Path) -> float:
-    if stated.get("FPS") is None:
-        return FOLDER_RATE_HZ
-    try:
-        rate_hz = float(stated["FPS"])
-    except (TypeError, ValueError, OverflowError):
-        rate_hz = float("nan")
-    if not 0 < rate_hz < float("inf"):
-        raise InputError(f"reading {file}: FPS must be a positive number, found {stated['FPS']!r:.80}")
-    return rate_hz
+        if not isinstance(stated, dict):
+            raise ValueError('it is no object with "intrinsics"')
+        return stated

@@ -42,18 +42,14 @@ def _motion(T_world_a: np.ndarray, T_world_b: np.ndarray, factor: float = 1.0) -
     return T_b_a
 
 
+def _in_axes(axes: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    return lambda T_world_a, T_world_b: axes @ _motion(T_world_a, T_world_b) @ axes
+
+
 OTHERS = (
     Convention("poses-inverted", "world-to-camera", lambda a, b: b @ inverse(a)),
-    Convention(
-        "poses-opengl",
-        "those of a camera with y up and z to the back (OpenGL)",
-        lambda a, b: _OPENGL @ _motion(a, b) @ _OPENGL,
-    ),
-    Convention(
-        "poses-mirrored",
-        "left-handed (y up, as in Unity)",
-        lambda a, b: _LEFT_HANDED @ _motion(a, b) @ _LEFT_HANDED,
-    ),
+    Convention("poses-opengl", "those of a camera with y up and z to the back (OpenGL)", _in_axes(_OPENGL)),
+    Convention("poses-mirrored", "left-handed (y up, as in Unity)", _in_axes(_LEFT_HANDED)),
     Convention("pose-depth-unit", "metres (or the depth like micrometres)", lambda a, b: _motion(a, b, 1e3)),
     Convention("pose-depth-unit", "micrometres (or the depth like metres)", lambda a, b: _motion(a, b, 1e-3)),
 )

@@ -13,7 +13,7 @@ import threading
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from functools import cached_property
 from importlib.util import find_spec
 from itertools import islice
@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scopemap.errors import CalibrationError, InputError
-from scopemap.frame import TruthQuality
+from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.datasets.rosbag_messages import (
     bit_depth,
     calibration_of,
@@ -35,9 +34,9 @@ from scopemap.io.datasets.rosbag_messages import (
     is_depth,
     is_grey,
 )
-from scopemap.io.decoding import first_bytes, reporting
+from scopemap.io.decoding import first_bytes
 from scopemap.io.images import image_files, numeric_order
-from scopemap.io.source import SourceDefaults, SourceFrame, SourceTruth
+from scopemap.io.source import Source, SourceFrame
 
 _IMAGE, _COMPRESSED, _CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
@@ -49,20 +48,12 @@ _LARGEST_GAP_S = 0.02
 _NS_PER_S = 10**9
 
 
-class _Topic(NamedTuple):
-    """A topic: its name, the type and number of its messages, and the encoding of its first image, else ""."""
-
-    name: str
-    kind: str
-    total: int
-    encoding: str
-
-
 class _Message(NamedTuple):
-    """One message: its topic, when it was recorded, and its deserialized fields, None where it is damaged."""
+    """One message: its topic, when it was recorded, the stamp in its header or 0, and its fields, None if damaged."""
 
     topic: str
     bag_ns: int
+    header_ns: int
     fields: Any
 
     @property
@@ -72,14 +63,18 @@ class _Message(NamedTuple):
             raise InputError("the message is damaged")
         return self.fields
 
-    @property
-    def header_ns(self) -> int:
-        """The stamp in its header, 0 where it has none."""
-        stamp = None if self.fields is None else self.fields.header.stamp
-        return 0 if stamp is None else int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
+
+class _Topic(NamedTuple):
+    """A topic: its name, the type and number of its messages, the encoding of images or "", and its first message."""
+
+    name: str
+    kind: str
+    total: int
+    encoding: str
+    first: _Message
 
 
-class RosBag(SourceDefaults):
+class RosBag(Source):
     """The images of one topic of a recording.
 
     path : the bag. topic : the topic of the images; None: one with a `camera_info`, in colour, of the left camera and
@@ -91,14 +86,11 @@ class RosBag(SourceDefaults):
 
     name = "rosbag"
     stamped = True
-    quality: TruthQuality = "registered"
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
-        if not self.is_installed():
+        if find_spec("rosbags") is None:
             raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'")
-        self.path = path
-        self.notes: list[str] = []
-        self.warnings = []
+        super().__init__(path)
         self._storage = _storage_of(path)
         self._lock = threading.Lock()
         self._depth_reader: Any = None
@@ -107,21 +99,15 @@ class RosBag(SourceDefaults):
         with self._opened() as reader:
             self._topics = self._topics_in(reader)
             self._topic = self._chosen(topic)
-            first = next(self._messages(reader, [self._topic.name]), None)
-            self._stamped = first is not None and first.header_ns != 0
+            self._stamped = self._topic.first.header_ns != 0
             self.height, self.width = self._size(reader)
-            self._take_camera(reader)
+        self._take_camera()
         # A count that the files have no room for is the claim of a damaged bag.
         files = self._storage.iterdir() if self._storage.is_dir() else [self._storage]
-        self.count: int | None = min(self._topic.total, sum(file.stat().st_size for file in files if file.is_file()))
+        self.count = min(self._topic.total, sum(file.stat().st_size for file in files if file.is_file()))
         self._depth_topic = self._aligned()
         clock = "stamps in the headers" if self._stamped else "when they were recorded, as headers hold no stamp"
         self.notes += [f"time stamps: {clock}", "poses in a bag (odometry, tf) are not used"]
-
-    @staticmethod
-    def is_installed() -> bool:
-        """Whether the package `rosbags` is there."""
-        return find_spec("rosbags") is not None
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -145,7 +131,7 @@ class RosBag(SourceDefaults):
                     self._warn(f"image {number} of {self._topic.name} was left out: {error}")
                     continue
                 self._check_size(rgb, f"{self.path}: image {number} of {self._topic.name}")
-                time_s = self._time_s(message)
+                time_s = self._time_of(message)
                 if time_s <= last_s:
                     self._warn(f"the stamps of {self._topic.name} do not increase: images stay as they were recorded")
                 last_s = time_s
@@ -155,28 +141,22 @@ class RosBag(SourceDefaults):
         """Return number and time of the selected frames, also of unreadable images; decodes none."""
         return list(enumerate(time_s for time_s, _ in self._clock[self._topic.name]))[selection]
 
-    def truth(self, index: int) -> SourceTruth | None:
+    def _depth_mm(self, index: int) -> np.ndarray | None:
         """Return the aligned depth nearest in time, at most 0.02 s away; None where there is none."""
         times = self._clock[self._topic.name]
         if self._depth_topic is None or not 0 <= index < len(times):
             return None
-        depths = self._clock[self._depth_topic.name]
-        after = bisect_left(depths, (times[index][0],))
-        around = depths[max(after - 1, 0) : after + 1]
-        nearest = min(around, key=lambda depth: abs(depth[0] - times[index][0]), default=None)
-        if nearest is None or abs(nearest[0] - times[index][0]) > _LARGEST_GAP_S:
+        topic, time_s = self._depth_topic.name, times[index][0]
+        after = bisect_left(self._clock[topic], (time_s,))
+        around = self._clock[topic][max(after - 1, 0) : after + 1]
+        nearest_s, bag_ns = min(around, key=lambda depth: abs(depth[0] - time_s), default=(np.inf, 0))
+        if abs(nearest_s - time_s) > _LARGEST_GAP_S:
             return None
-        return SourceTruth(None, self._depth_mm(self._depth_topic.name, nearest[1]), self.quality)
-
-    def _depth_mm(self, topic: str, bag_ns: int) -> np.ndarray:
         # Frames are read ahead in a thread of their own; one reader of depth stays open for all others.
         with self._lock:
-            if self._depth_reader is None:
-                self._depth_reader = self._open_readers.enter_context(self._opened())
-            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1), None)
+            self._depth_reader = self._depth_reader or self._open_readers.enter_context(self._opened())
+            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1))
         try:
-            if message is None:
-                raise InputError("it is not found again")
             return depth_of(message.content)
         except InputError as error:
             raise InputError(f"reading {self.path}: depth recorded at {bag_ns} ns in {topic}: {error}") from None
@@ -184,16 +164,15 @@ class RosBag(SourceDefaults):
     @cached_property
     def _clock(self) -> dict[str, list[tuple[float, int]]]:
         """Time, s, and time of recording, ns, of all messages, by topic; depth sorted. No image is decoded."""
-        names = [self._topic.name, *([self._depth_topic.name] if self._depth_topic else [])]
-        clock: dict[str, list[tuple[float, int]]] = {name: [] for name in names}
+        clock: dict[str, list[tuple[float, int]]] = {t.name: [] for t in (self._topic, self._depth_topic) if t}
         with self._opened() as reader:
-            for message in self._as_far_as_read(reader, names):
-                clock[message.topic].append((self._time_s(message), message.bag_ns))
-        for name in names[1:]:
-            clock[name].sort()
+            for message in self._as_far_as_read(reader, list(clock)):
+                clock[message.topic].append((self._time_of(message), message.bag_ns))
+        if self._depth_topic:
+            clock[self._depth_topic.name].sort()
         return clock
 
-    def _time_s(self, message: _Message) -> float:
+    def _time_of(self, message: _Message) -> float:
         stamp_ns = message.header_ns if self._stamped else 0
         if self._stamped and not stamp_ns:
             self._warn(f"some messages of {message.topic} hold no stamp: the time of recording is used for them")
@@ -207,10 +186,8 @@ class RosBag(SourceDefaults):
         with self._reporting():
             reader = (rosbag1 if self._storage.suffix == ".bag" else rosbag2).Reader(self._storage)
             reader.open()
-        try:
+        with closing(reader):
             yield reader
-        finally:
-            reader.close()
 
     def _messages(
         self, reader: Any, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
@@ -229,10 +206,12 @@ class RosBag(SourceDefaults):
             if item is None:
                 return
             connection, bag_ns, raw = item
-            fields = None
+            fields: Any = None
+            header_ns = 0
             with suppress(Exception):  # damaged bytes end in exceptions of any kind
                 fields = deserialize(raw, connection.msgtype)
-            yield _Message(connection.topic, bag_ns, fields)
+                header_ns = fields.header.stamp.sec * _NS_PER_S + fields.header.stamp.nanosec
+            yield _Message(connection.topic, bag_ns, header_ns, fields)
 
     def _as_far_as_read(self, reader: Any, topics: list[str]) -> Iterator[_Message]:
         """Yield messages up to where the bag breaks off; a warning says so."""
@@ -265,11 +244,10 @@ class RosBag(SourceDefaults):
         fault = f"{self._topic.name} holds no message"
         for message in self._as_far_as_read(reader, [self._topic.name]):
             try:
-                height, width = self._picture(message).shape[:2]
+                height, width, _ = self._picture(message).shape
+                return height, width
             except InputError as error:
                 fault = str(error)
-                continue
-            return height, width
         raise InputError(f"reading {self.path}: no image of {self._topic.name} can be read ({fault})")
 
     def _topics_in(self, reader: Any) -> dict[str, _Topic]:
@@ -281,10 +259,9 @@ class RosBag(SourceDefaults):
         topics: dict[str, _Topic] = {}
         for (name, kind), count in counts.items():
             try:
-                message = next(self._messages(reader, [name]), None) if count > 0 else None
-                if message is not None:
-                    encoding = "" if kind == _CAMERA_INFO else encoding_of(message.content)
-                    topics[name] = _Topic(name, kind, count, encoding)
+                for first in islice(self._messages(reader, [name]), min(count, 1)):
+                    encoding = "" if kind == _CAMERA_INFO else encoding_of(first.content)
+                    topics[name] = _Topic(name, kind, count, encoding, first)
             except InputError as error:
                 self._warn(f"{name} cannot be read: {error}")
         return topics
@@ -293,25 +270,26 @@ class RosBag(SourceDefaults):
         images = [topic for topic in self._topics.values() if topic.encoding and not is_depth(topic.encoding)]
         names = ", ".join(topic.name for topic in images) or "none"
         if name is not None:
-            found = next((topic for topic in images if topic.name.strip("/") == name.strip("/")), None)
-            if found is None:
-                raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
-            return found
+            for topic in images:
+                if topic.name.strip("/") == name.strip("/"):
+                    return topic
+            raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
         if not images:
             fault = "".join(f"; {warning}" for warning in self.warnings[:1])
             raise InputError(
                 f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage; topics of "
                 f"these kinds and camera_info are {', '.join(self._topics) or 'none'}){fault}"
             )
-        chosen = max(images, key=self._preference)
+
+        def preference(topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
+            left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
+            colour = not is_grey(topic.encoding)
+            return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == _IMAGE
+
+        chosen = max(images, key=preference)
         if len(images) > 1:
             self.notes.append(f"images of {chosen.name}, one of {names} (--dataset {self.name}:TOPIC takes another)")
         return chosen
-
-    def _preference(self, topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
-        left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))
-        colour = not is_grey(topic.encoding)
-        return self._own_info(topic) is not None, colour, left, not right, topic.total, topic.kind == _IMAGE
 
     def _own_info(self, topic: _Topic) -> str | None:
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
@@ -321,20 +299,19 @@ class RosBag(SourceDefaults):
         topics = (self._topics.get(name) for name in names)
         return next((found.name for found in topics if found and found.kind == _CAMERA_INFO), None)
 
-    def _take_camera(self, reader: Any) -> None:
+    def _take_camera(self) -> None:
         infos = [topic.name for topic in self._topics.values() if topic.kind == _CAMERA_INFO]
         name = self._own_info(self._topic)
         if name is None and len(infos) == 1:
             name = infos[0]
             self.notes.append(f"the only camera_info, {name}, is taken as that of {self._topic.name}")
         if name is None:
-            self.notes += [f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}"] if infos else []
+            self.notes += [f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}"] * bool(infos)
             return
         rectified = bool(_RECTIFIED.search(self._topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]))
         try:
-            for message in islice(self._messages(reader, [name]), 1):
-                info = message.content
-                self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
+            info = self._topics[name].first.content
+            self.calibration = calibration_of(info, (self.width, self.height), rectified, name, self.path.name)
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
             return
@@ -346,14 +323,11 @@ class RosBag(SourceDefaults):
     def _aligned(self) -> _Topic | None:
         """Return the depth topic that is aligned to the images, by its name."""
         depths = [topic for topic in self._topics.values() if is_depth(topic.encoding)]
-        aligned = [
-            topic
-            for topic in depths
-            if (match := _ALIGNED.search(topic.name)) and (match[2] is None or match[2] in self._topic.name)
-        ]
+        matches = [(topic, _ALIGNED.search(topic.name)) for topic in depths]
+        aligned = [topic for topic, match in matches if match and (match[2] or "") in self._topic.name]
         # Of several cameras' depth, that of the same camera has the most of its name in common.
-        common = {topic.name: len(commonpath([f"/{topic.name}", f"/{self._topic.name}"])) for topic in aligned}
-        chosen = max(aligned, key=lambda topic: (common[topic.name], topic.total), default=None)
+        own = f"/{self._topic.name}"
+        chosen = max(aligned, key=lambda t: (len(commonpath([f"/{t.name}", own])), t.total), default=None)
         others = [topic.name for topic in depths if topic is not chosen]
         if chosen is not None:
             self.notes.append(f"depth: {chosen.name}, taken as aligned to {self._topic.name}; whole numbers mm, else m")
@@ -380,6 +354,5 @@ def _storage_of(path: Path) -> Path:
 
 def _readable(reader: Any) -> list[Any]:
     """Return the connections of the types that are read; `rosbags` deserializes ROS 1 and CDR."""
-    wanted = (_IMAGE, _COMPRESSED, _CAMERA_INFO)
-    found = [connection for connection in reader.connections if connection.msgtype in wanted]
-    return [connection for connection in found if getattr(connection.ext, "serialization_format", "cdr") == "cdr"]
+    found = [one for one in reader.connections if one.msgtype in (_IMAGE, _COMPRESSED, _CAMERA_INFO)]
+    return [one for one in found if getattr(one.ext, "serialization_format", "cdr") == "cdr"]

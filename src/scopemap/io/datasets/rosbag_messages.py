@@ -23,12 +23,8 @@ from scopemap.io.decoding import check_pixels, decoded
 _PLAIN = re.compile(r"(rgb|bgr|mono)(a?)(8|16)")
 # OpenCV's names of the same; colours are in its order.
 _OPENCV = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8"}
-_YUV = {
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUYV,
-    "yuyv": cv2.COLOR_YUV2RGB_YUYV,
-}
+_YUV = dict.fromkeys(("yuv422", "uyvy"), cv2.COLOR_YUV2RGB_UYVY)
+_YUV |= dict.fromkeys(("yuv422_yuy2", "yuyv"), cv2.COLOR_YUV2RGB_YUYV)
 _BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_DEPTH = "compressedDepth"
@@ -45,12 +41,12 @@ def encoding_of(message: Any) -> str:
 
 def is_depth(encoding: str) -> bool:
     """Whether an encoding or format, as "16UC1; png compressed", is one of depth."""
-    return _bare(encoding) in ("16UC1", "32FC1") or _COMPRESSED_DEPTH in encoding
+    return encoding.split(";")[0].strip() in ("16UC1", "32FC1") or _COMPRESSED_DEPTH in encoding
 
 
 def is_grey(encoding: str) -> bool:
     """Whether an encoding or format is one of grey images."""
-    return _bare(encoding) in ("mono8", "mono16", "8UC1")
+    return encoding.split(";")[0].strip() in ("mono8", "mono16", "8UC1")
 
 
 def bit_depth(wide: np.ndarray) -> int:
@@ -81,7 +77,7 @@ def image_of(message: Any) -> np.ndarray:
     elif encoding in _YUV:
         values = _converted(_samples(message, "u1", 2), _YUV[encoding])
     elif bayer := _BAYER.fullmatch(encoding):
-        values = _demosaiced(_samples(message, f"u{int(bayer[2]) // 8}", 1)[..., 0], bayer[1])
+        values = _converted(_samples(message, f"u{int(bayer[2]) // 8}", 1)[..., 0], _bayer_code(bayer))
     else:
         known = "rgb8, bgr8, rgba8, bgra8, mono8, the same with 16, " + ", ".join([*_OPENCV, *_YUV, "bayer_*"])
         raise InputError(f"the encoding '{encoding}' of its images is not known (known are {known})")
@@ -135,11 +131,6 @@ def calibration_of(info: Any, size: tuple[int, int], rectified: bool, topic: str
     return replace(calibration, source=f"{topic} of the bag{note}{calibration.source}")
 
 
-def _bare(encoding: str) -> str:
-    """Return an encoding without the compression that a format adds."""
-    return encoding.split(";")[0].strip()
-
-
 def _samples(message: Any, sample: str, channels: int) -> np.ndarray:
     """Return the samples (h, w, channels) of an uncompressed image without the padding of its rows."""
     height, width, data = int(message.height), int(message.width), message.data
@@ -162,8 +153,8 @@ def _converted(values: np.ndarray, code: int) -> np.ndarray:
         raise InputError(f"its colours cannot be converted at {values.shape[1]}x{values.shape[0]} px") from None
 
 
-def _demosaiced(values: np.ndarray, order: str) -> np.ndarray:
-    return _converted(values, getattr(cv2, f"COLOR_Bayer{order.upper()}2RGB"))
+def _bayer_code(match: re.Match[str]) -> int:
+    return int(getattr(cv2, f"COLOR_Bayer{match[1].upper()}2RGB"))
 
 
 def _compressed_image(message: Any) -> np.ndarray:
@@ -172,22 +163,21 @@ def _compressed_image(message: Any) -> np.ndarray:
     values = decoded(message.data.tobytes(), (0 if bayer else cv2.IMREAD_COLOR) | cv2.IMREAD_ANYDEPTH)
     if values is None or values.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its compressed image ('{message.format[:40]}') cannot be decoded")
-    return _demosaiced(values, bayer[1]) if bayer else _converted(values, cv2.COLOR_BGR2RGB)
+    return _converted(values, _bayer_code(bayer) if bayer else cv2.COLOR_BGR2RGB)
 
 
 def _compressed_depth(message: Any) -> np.ndarray:
     """Return depth, mm, of a 16-bit PNG, which `compressed_depth_image_transport` puts behind a header of 12 bytes."""
-    content, quantization = message.data.tobytes(), b""
-    if _COMPRESSED_DEPTH in message.format:
-        quantization, content = content[: _DEPTH_HEADER.size], content[_DEPTH_HEADER.size :]
-    values = decoded(content)
+    content = message.data.tobytes()
+    header = _DEPTH_HEADER.size if _COMPRESSED_DEPTH in message.format else 0
+    values = decoded(content[header:])
     if values is None or values.ndim != 2 or values.dtype != np.uint16:
         raise InputError(f"its compressed depth ('{message.format[:40]}') cannot be decoded: PNG of 16 bit is read")
     if not message.format.startswith("32FC1"):
         return values.astype(np.float32)
-    if not quantization:
+    if not header:
         raise InputError(f"its compressed depth ('{message.format[:40]}') has no header of its quantization")
-    _, a, b = _DEPTH_HEADER.unpack(quantization)
+    _, a, b = _DEPTH_HEADER.unpack(content[:header])
     # Inverse depth in equal steps.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.where(values > 0, _MM_PER_METRE * a / (values.astype(np.float32) - b), np.nan)

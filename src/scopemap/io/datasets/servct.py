@@ -18,7 +18,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.rectification import Rectifier
-from scopemap.errors import CalibrationError, InputError
+from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.images import ImageFolder, image_files, read_image
 from scopemap.io.source import SourceFrame
 
@@ -69,8 +69,13 @@ class ServCtFolder(ImageFolder):
         depth_mm = super()._depth_mm(index)
         if depth_mm is None:
             return None
-        file = self.depth_files[index]
-        depth_mm[_outside_scan(file.parents[1] / "OcclusionL" / file.name, depth_mm.shape)] = np.nan
+        file = self.depth_files[index].parents[1] / "OcclusionL" / self.depth_files[index].name
+        if file.is_file():
+            image = read_image(file)
+            if image is None or image.shape[:2] != depth_mm.shape:
+                raise InputError(f"reading {file}: expected an image of the size of the depth")
+            # What the scan does not hold is painted blue.
+            depth_mm[(image == _BLUE).all(axis=-1)] = np.nan
         rectifier = self._rectifiers.get(index)
         return depth_mm if rectifier is None else rectifier.nearest(depth_mm)
 
@@ -81,7 +86,11 @@ class ServCtFolder(ImageFolder):
             return
         first = next(iter(cameras))
         self.camera, self.camera_source = cameras[first], f"P1 in {files[first].name}"
-        self._rectifiers = {n: Rectifier(c, self.camera) for n, c in cameras.items() if not _same(c, self.camera)}
+        self._rectifiers = {
+            n: Rectifier(c, self.camera)
+            for n, c in cameras.items()
+            if not np.allclose(c.matrix, self.camera.matrix, rtol=0, atol=_SAME_CAMERA_PX)
+        }
         if self._rectifiers:
             self.notes.append(f"{len(self._rectifiers)} pictures of other cameras are brought to that of the first")
         missing = [number for number in files if number not in cameras]
@@ -91,30 +100,12 @@ class ServCtFolder(ImageFolder):
 
 def _read_camera(file: Path, size: tuple[int, int]) -> PinholeCamera:
     """Return the left camera: P1 is [K | 0], as a map with `data` or as rows."""
-    try:
-        entry = json.loads(file.read_text(encoding="utf-8"))["P1"]
+    with reporting(f"cannot read the calibration in {file}: no matrix P1 of 3x4 numbers", kind=CalibrationError):
+        entry = json.loads(file.read_bytes())["P1"]
         P1 = np.array(entry["data"] if isinstance(entry, dict) else entry, dtype=np.float64).reshape(3, 4)
-    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        raise CalibrationError(
-            f"cannot read the calibration in {file}: no matrix P1 of 3x4 numbers ({error})"
-        ) from None
     (fx, skew, cx, _), (zero, fy, cy, _) = P1[:2].tolist()
     if not np.allclose([skew, zero, *P1[2]], [0, 0, 0, 0, 1, 0]):
         raise CalibrationError(f"the calibration {file} has a matrix P1 that is not [K | 0]")
     camera = PinholeCamera(fx, fy, cx, cy, *size)
     check_plausible(camera, f"the calibration {file}")
     return camera
-
-
-def _same(a: PinholeCamera, b: PinholeCamera) -> bool:
-    return bool(np.abs(a.matrix - b.matrix).max() < _SAME_CAMERA_PX)
-
-
-def _outside_scan(file: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where the scan holds nothing, which the data set paints blue, (h, w) bool; nowhere without a file."""
-    if not file.is_file():
-        return np.zeros(shape, dtype=bool)
-    image = read_image(file)
-    if image is None or image.shape[:2] != shape:
-        raise InputError(f"reading {file}: expected an image of {shape[1]}x{shape[0]} px, the size of the depth")
-    return (image == _BLUE).all(axis=-1)

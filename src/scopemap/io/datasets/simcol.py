@@ -59,9 +59,6 @@ class SimColFolder(ImageFolder):
         if files is None:
             self.warnings.append(f"no pose is known: SavedPosition_*.txt of these frames is not beside {self.path}")
             return
-        for file in files:
-            if not file.is_file():
-                raise InputError(f"reading {self.path}: {file} is missing, poses need {' and '.join(_POSE_NAMES)}")
         positions = read_numbers(files[0], missing=True).with_columns(3, files[0].name)
         quaternions = read_numbers(files[1], missing=True).with_columns(4, files[1].name)
         same_lines = np.array_equal(positions.line_numbers, quaternions.line_numbers)

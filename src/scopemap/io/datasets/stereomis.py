@@ -11,7 +11,7 @@ from pathlib import Path
 
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
-from scopemap.io.datasets.posed_video import PosedVideo, only_video, videos_in
+from scopemap.io.datasets.posed_video import PosedVideo, videos_in
 from scopemap.trajectory.formats.poses import are_frame_numbers, poses_by_row
 from scopemap.trajectory.formats.text import read_numbers
 
@@ -30,10 +30,11 @@ class StereoMisFolder(PosedVideo):
         file = path / _CALIBRATION
         # The file states its own size.
         camera = stated_calibration(file, (1, 1)).camera if file.is_file() else None
-        video = only_video(path, videos_in(path, ".mp4"), "a StereoMIS recording holds one .mp4")
-        super().__init__(path, video, _PUBLISHED_ASPECT if camera is None else camera.width / camera.height)
+        super().__init__(
+            path, videos_in(path, ".mp4"), _PUBLISHED_ASPECT if camera is None else camera.width / camera.height
+        )
         if self.camera is None and camera is not None:
-            self._set_camera(camera, file)
+            self._set_camera(camera, f"calibration of the data set, {file.name}", str(file))
         if (path / _POSES).is_file():
             self._read_poses(path / _POSES)
         else:
@@ -66,8 +67,4 @@ class StereoMisFolder(PosedVideo):
             f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; row {offset} is the video's first "
             "frame; no depth is known"
         )
-        if self._beyond():
-            self.warnings.append(
-                f"{file}: {self._beyond()} of its {len(numbers)} rows are beyond the {self.count} frames of the video; "
-                "poses may belong to other frames"
-            )
+        self._warn_of_poses_beyond(file)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeVar
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from scopemap.errors import ScopemapError
 from scopemap.io.datasets.pose_depth import Agreement, PoseDepthTest
+from scopemap.io.frame_choice import is_repeat
 from scopemap.io.sequence import Sequence
-from scopemap.io.video_format.redundant_frames import is_repeat
 from scopemap.trajectory.trajectory import path_length_mm
 
 RIGID_TOLERANCE = 1e-2
 _MOST_PIXELS = 200_000
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ class Survey:
     sequence: Sequence
     frames: tuple[FrameFigures, ...]
     agreements: tuple[Agreement, ...] = ()
-    depth_errors: dict[int, float] | None = None
+    depth_errors: dict[int, float] = field(default_factory=dict)
     stopped: str = ""
     truth_faults: tuple[str, ...] = ()
 
@@ -97,14 +96,13 @@ class Survey:
     @property
     def figures(self) -> dict[str, Any]:
         """Figures of the whole, lengths in mm; those of what is not there are left out."""
-        numbers = [frame.index for frame in self.frames]
-        times_s = [frame.time_s for frame in self.frames]
+        numbers, times_s = [frame.index for frame in self.frames], [frame.time_s for frame in self.frames]
         camera = self.sequence.rectifier.source.central
         found: dict[str, Any] = {"dataset": self.sequence.source.name, "frames": len(numbers)}
         if numbers:
             found |= {"first_number": min(numbers), "last_number": max(numbers), "span_s": max(times_s) - min(times_s)}
-        found |= {"width": camera.width, "height": camera.height, "camera": self.sequence.camera_source}
-        found |= {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
+        found |= {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        found |= {"camera": self.sequence.camera_source}
         found |= {"with_pose": sum(frame.T_world_camera is not None for frame in self.frames)}
         found |= {"with_depth": sum(frame.depth is not None for frame in self.frames)}
         if self.rigid:
@@ -145,10 +143,8 @@ def survey(sequence: Sequence, listener: Callable[[int, int | None], None] | Non
 
     No `ScopemapError` is raised: what cannot be read is part of the result.
     """
-    faults: dict[str, int] = {}
-    frames: list[FrameFigures] = []
-    test, compared = PoseDepthTest(sequence.camera), list[int]()
-    stopped = ""
+    faults, compared, frames, stopped = dict[str, int](), list[int](), list[FrameFigures](), ""
+    test = PoseDepthTest(sequence.camera)
     try:
         for frame in _figures(sequence, test, compared, faults):
             frames.append(frame)
@@ -165,20 +161,22 @@ def _figures(
     sequence: Sequence, test: PoseDepthTest, compared: list[int], faults: dict[str, int]
 ) -> Iterator[FrameFigures]:
     before: np.ndarray | None = None
-    for frame in sequence.source.frames(sequence.selection):
-        T_world_camera, depth_mm = _truth(sequence, frame.index, faults)
-        depth = None if depth_mm is None else _depth_figures(depth_mm)
-        if (
-            depth_mm is not None
-            and depth is not None
-            and depth.known_count
-            and not depth.is_constant
-            and is_rigid(T_world_camera)
-        ):
-            working_mm = _attempt(partial(sequence.depth_rectifier.nearest, depth_mm), frame.index, faults)
-            if working_mm is not None and T_world_camera is not None:
-                test.add(working_mm, T_world_camera)
-                compared.append(frame.index)
+    source = sequence.source
+    for frame in source.frames(sequence.selection):
+        T_world_camera, depth = None, None
+        try:
+            truth = source.truth(frame.index)
+            T_world_camera = None if truth is None else truth.T_world_camera
+            if truth is not None and truth.depth_mm is not None:
+                depth = _depth_figures(truth.depth_mm)
+                varied = depth.known_count > 0 and not depth.is_constant
+                if varied and T_world_camera is not None and is_rigid(T_world_camera):
+                    test.add(sequence.depth_rectifier.nearest(truth.depth_mm), T_world_camera)
+                    compared.append(frame.index)
+        except ScopemapError as error:
+            faults.setdefault(str(error), frame.index)
+            with suppress(ScopemapError):  # the pose is known where only the depth cannot be read
+                T_world_camera = source.pose(frame.index)
         sample = _subsampled(frame.rgb)
         yield FrameFigures(
             frame.index,
@@ -191,22 +189,6 @@ def _figures(
             depth=depth,
         )
         before = sample
-
-
-def _truth(sequence: Sequence, index: int, faults: dict[str, int]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    truth = _attempt(partial(sequence.source.truth, index), index, faults)
-    if truth is not None:
-        return truth.T_world_camera, truth.depth_mm
-    # The pose is known where only the depth cannot be read.
-    return _attempt(partial(sequence.source.pose, index), index, faults), None
-
-
-def _attempt(read: Callable[[], _T], index: int, faults: dict[str, int]) -> _T | None:
-    try:
-        return read()
-    except ScopemapError as error:
-        faults.setdefault(str(error), index)
-    return None
 
 
 def _depth_figures(depth_mm: np.ndarray) -> DepthFigures:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.io.images import ImageFolder
 from scopemap.trajectory.formats.poses import are_frame_numbers
 from scopemap.trajectory.formats.text import NumberTable, read_numbers, text_lines, tum_poses
@@ -63,10 +64,9 @@ class TumRgbdFolder(ImageFolder):
         self._warn_of_missing(_IMAGES, len(ordered), len(there))
         room = _NAMED.search("/".join(path.absolute().parts[-2:]))
         if room is not None and self.camera is None:
-            number = room[1] or room[2]
+            name = f"freiburg{room[1] or room[2]}"
             with self._making_camera():
-                known = f"published calibration of freiburg{number}"
-                self._set_camera(CAMERAS[number], known, f"shipped for freiburg{number}")
+                self._set_camera(CAMERAS[name[-1]], f"published calibration of {name}", f"shipped for {name}")
         self._associate_depth({name: number for number, (_, name) in there.items()})
         self._associate_poses()
 
@@ -153,23 +153,24 @@ def associated(stamps_s: list[float], others_s: list[float]) -> dict[int, int]:
     return pairs
 
 
-def _fields_by_line(file: Path, columns: int, form: str) -> dict[str, list[str]]:
-    """Return place -> fields of each line that is no comment; `InputError` where their number is another."""
-    lines = {f"{file}, line {number}": line.split() for number, line in enumerate(text_lines(file), start=1)}
-    rows = {where: fields for where, fields in lines.items() if fields and not fields[0].startswith("#")}
-    wrong = next((where for where, fields in rows.items() if len(fields) != columns), None)
-    if wrong is not None:
-        raise InputError(f"{wrong}: expected `{form}`, found '{' '.join(rows[wrong])[:80]}'")
-    return rows
+def _fields_by_line(file: Path, form: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield place and fields of each line that is no comment; `InputError` for one that is not `timestamp name ...`."""
+    for number, line in enumerate(text_lines(file), start=1):
+        fields = line.split()
+        if fields and not fields[0].startswith("#"):
+            with reporting(f"{file}, line {number}: expected `{form}`, found '{line.strip()[:80]}'"):
+                if len(fields) != len(form.split()) or not np.isfinite([float(text) for text in fields[::2]]).all():
+                    raise ValueError("not such a line")
+            yield f"{file}, line {number}", fields
 
 
 def _read_list(file: Path) -> list[tuple[float, str]]:
     """Return (time stamp, name) of each image in a list, in its order."""
     listed: dict[float, str] = {}
-    for where, (stamp, name) in _fields_by_line(file, 2, "timestamp filename").items():
-        if _stamp(stamp, where) in listed:
+    for where, (stamp, name) in _fields_by_line(file, "timestamp filename"):
+        if float(stamp) in listed:
             raise InputError(f"{where}: the time stamp of an earlier line comes again; leave one out")
-        listed[_stamp(stamp, where)] = name
+        listed[float(stamp)] = name
     if not listed:
         raise InputError(f"reading {file}: it names no image")
     return list(listed.items())
@@ -178,27 +179,14 @@ def _read_list(file: Path) -> list[tuple[float, str]]:
 def _read_pairs(file: Path, number_of: dict[str, int]) -> dict[int, str]:
     """Return the depth file of each frame that associations.txt names, colour or depth first."""
     pairs: dict[int, str] = {}
-    form = "timestamp rgb_file timestamp depth_file"
-    for where, (stamp, one, other_stamp, other) in _fields_by_line(file, 4, form).items():
-        _stamp(stamp, where, form), _stamp(other_stamp, where, form)
+    for where, (_, one, _, other) in _fields_by_line(file, "timestamp rgb_file timestamp depth_file"):
         colour, depth = (one, other) if one in number_of else (other, one)
         if colour in number_of and pairs.setdefault(number_of[colour], depth) != depth:
             raise InputError(f"{where}: {colour} has another depth image in an earlier line")
     return pairs
 
 
-def _stamp(text: str, where: str, form: str = "timestamp filename") -> float:
-    try:
-        stamp = float(text)
-    except ValueError:
-        stamp = float("nan")
-    if not np.isfinite(stamp):
-        raise InputError(f"{where}: expected `{form}`, found the time stamp '{text[:40]}'")
-    return stamp
-
-
 def _is_there(folder: Path, name: str) -> bool:
     """Return whether `name`, which a stranger may have written, is that of a file below `folder`."""
-    inside = not os.path.isabs(name) and not os.path.normpath(name).startswith("..")
     # Path.is_file raises for names that no file system allows.
-    return inside and os.path.isfile(folder / name)
+    return not os.path.isabs(name) and not os.path.normpath(name).startswith("..") and os.path.isfile(folder / name)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -106,12 +106,10 @@ def packing(pictures: Sequence[np.ndarray], pixel_aspect: float = 1.0) -> Packin
     if not pictures:
         return None
     height, width = pictures[0].shape[:2]
-    layouts: tuple[Layout, Layout] = ("left-right", "top-bottom")
     found = []
-    for layout in layouts:
-        least = LEAST_CORRELATION
-        if suspected(width, height, pixel_aspect) != layout:
-            least = LEAST_CORRELATION_USUAL_SHAPE
+    for layout in get_args(Layout):
+        is_suspected = suspected(width, height, pixel_aspect) == layout
+        least = LEAST_CORRELATION if is_suspected else LEAST_CORRELATION_USUAL_SHAPE
         values = _correlations(pictures, layout)
         enough = len(values) >= max(1, _LEAST_PICTURES_SHARE * len(pictures))
         if enough and np.median(values) > least:
@@ -122,42 +120,38 @@ def packing(pictures: Sequence[np.ndarray], pixel_aspect: float = 1.0) -> Packin
 
 def _correlations(pictures: Sequence[np.ndarray], layout: Layout) -> list[float]:
     """Return the correlation of the halves of the pictures in which there is something to compare."""
-    views = [halves(picture, layout) for picture in pictures]
-    if min(views[0][0].shape[:2]) < 16:
+    firsts, seconds = zip(*(halves(picture, layout) for picture in pictures), strict=True)
+    if min(firsts[0].shape[:2]) < 16:
         return []
-    firsts, seconds = [_comparable([pair[side] for pair in views]) for side in (0, 1)]
-    values = [_alike(one, other) for one, other in zip(firsts, seconds, strict=True)]
+    values = [_alike(one, other) for one, other in zip(_comparable(firsts), _comparable(seconds), strict=True)]
     return [value for value in values if value is not None]
 
 
-def _comparable(views: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+def _comparable(views: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return each view as a small grey picture (h, w) and which of its pixels are compared (h, w), 0 or 1, float32.
 
     Left out are those that are black or saturated, and what stays the same while most of the view changes.
     """
     size = (_WIDTH_PX, max(16, round(_WIDTH_PX * views[0].shape[0] / views[0].shape[1])))
-    small = [_small(view, size) for view in views]
-    greys = np.stack([grey for grey, _ in small])
-    used = np.stack([_eroded(one) for _, one in small])
+    full = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in views]
+    greys = np.stack([_reduced(grey, size) for grey in full]).astype(np.float32)
+    saturated = np.stack([_reduced((grey >= _SATURATED_LEVEL).astype(np.float32), size) for grey in full])
+    used = np.stack([_eroded(one) for one in (greys > _BLACK_LEVEL) & (saturated < _MOST_SATURATED_SHARE)])
     if len(views) >= _LEAST_STILL_PICTURES:
         still = np.ptp(greys, axis=0) < _STILL_LEVELS
         lit = used.any(axis=0)
         # In a video at rest, text over the picture cannot be distinguished from the scene.
         if lit.any() and still[lit].mean() < _MOST_STILL_SHARE:
-            used *= _eroded((~still | ~lit).astype(np.float32))
+            used *= _eroded(~still | ~lit)
     return list(zip(greys, used, strict=True))
 
 
-def _small(view: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a view in grey at a small size, and which pixels are neither black nor touched by saturated ones."""
-    grey = cv2.cvtColor(view, cv2.COLOR_RGB2GRAY)
-    saturated = cv2.resize((grey >= _SATURATED_LEVEL).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    return small, ((small > _BLACK_LEVEL) & (saturated < _MOST_SATURATED_SHARE)).astype(np.float32)
+def _reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _eroded(mask: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.erode(mask, np.ones((3, 3))))
+    return np.asarray(cv2.erode(mask.astype(np.float32), np.ones((3, 3))))
 
 
 def _alike(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.trajectory.formats.colmap import read_colmap
 from scopemap.trajectory.formats.poses import from_quaternions, stamped
 from scopemap.trajectory.formats.text import text_lines
@@ -61,11 +61,9 @@ def _scale_mm(sequence: Path) -> float | None:
     file = sequence.parent / SCALES_FILE
     if not file.is_file():
         return None
-    try:
+    with reporting(f"reading {file}: every row needs sequence and scale_to_target"):
         scales = {row["sequence"].strip(): float(row["scale_to_target"]) for row in csv.DictReader(text_lines(file))}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"reading {file}: every row needs sequence and scale_to_target ({error})") from None
-    return scales.get(sequence.name)
+        return scales.get(sequence.name)
 
 
 def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
@@ -102,10 +100,8 @@ def _row(line: str, where: str) -> tuple[int, list[float]]:
     name = _IMAGE_NAME.fullmatch(fields[1])
     if name is None or int(name[1]) < 1:
         raise InputError(f"{where}: the image name {fields[1]!r} must begin with its only number, the frame's, from 1")
-    try:
+    with reporting(f"{where}: expected numbers"):
         return int(name[1]), [float(field) for field in (fields[0], *fields[2:9])]
-    except ValueError as error:
-        raise InputError(f"{where}: expected numbers ({error})") from None
 
 
 def write_submap(file: Path, trajectory: Trajectory) -> None:

@@ -28,7 +28,11 @@ def read_colmap(path: Path, unit: Unit) -> Trajectory:
     """Read the registered images of a text model, in the order of their numbers; others have no pose and no row."""
     file = file_of(path, COLMAP_FILES)
     images = read_images(file)
-    frames = np.array([_frame_of(image) for image in images])
+    numbers = [[int(digits) for digits in re.findall(r"\d+", image.path.stem)[-1:]] for image in images]
+    for image, found in zip(images, numbers, strict=True):
+        if not found or found[0] > np.iinfo(np.int64).max:
+            raise InputError(f"{image.where}: the image name {image.name!r} holds no number that could be the frame's")
+    frames = np.ravel(numbers)
     order = np.argsort(frames, kind="stable")
     repeated = np.flatnonzero(np.diff(frames[order]) == 0)
     if repeated.size:
@@ -37,10 +41,3 @@ def read_colmap(path: Path, unit: Unit) -> Trajectory:
     T_world_camera = camera_poses([images[row] for row in order], MM_PER_UNIT[unit])
     source = f"COLMAP {file.name}, world-to-camera inverted, scale arbitrary, {unit} (assumed)"
     return stamped(T_world_camera, frames[order], None, source)
-
-
-def _frame_of(image: ModelImage) -> int:
-    digits = re.findall(r"\d+", image.path.stem)
-    if not digits or int(digits[-1]) > np.iinfo(np.int64).max:
-        raise InputError(f"{image.where}: the image name {image.name!r} holds no number that could be the frame's")
-    return int(digits[-1])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.trajectory.formats.poses import rigid, stamped
 from scopemap.trajectory.formats.text import read_numbers, tum_poses
 from scopemap.trajectory.trajectory import MM_PER_UNIT, SKIPPED, STATUSES, Trajectory, Unit
@@ -37,7 +37,15 @@ def read_run(folder: Path, unit: Unit) -> Trajectory:
 
 def _read_run_submap(folder: Path) -> Trajectory:
     table = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
-    indices, times_s, status = _read_frames(folder / "frames.csv")
+    path = folder / "frames.csv"
+    with reporting(f"cannot read {path}: every row needs index, time_s and status"):
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        rows = [row for row in rows if row["status"] != SKIPPED]
+        indices = np.array([int(row["index"]) for row in rows], dtype=np.int64)
+        times_s = np.array([float(row["time_s"]) for row in rows])
+        status = np.array([row["status"] for row in rows])
+    if np.any(np.diff(indices) <= 0) or not set(status.tolist()) <= set(STATUSES):
+        raise InputError(f"cannot read {path}: index must ascend and status be one of {', '.join(STATUSES)}")
     same_run = len(indices) == len(table.values) and np.abs(times_s - table.values[:, 0]).max() <= _SAME_TIME_S
     if not same_run:
         raise InputError(
@@ -46,20 +54,6 @@ def _read_run_submap(folder: Path) -> Trajectory:
         )
     T, words = tum_poses(table, "mm")
     return replace(stamped(T, indices, times_s, f"run of scopemap, camera-to-world, {words}"), status=status)
-
-
-def _read_frames(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    try:
-        read = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
-        rows = [row for row in read if row["status"] != SKIPPED]
-        indices = np.array([int(row["index"]) for row in rows], dtype=np.int64)
-        times_s = np.array([float(row["time_s"]) for row in rows])
-        status = np.array([row["status"] for row in rows])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"cannot read {path}: every row needs index, time_s and status ({error})") from None
-    if np.any(np.diff(indices) <= 0) or not set(status.tolist()) <= set(STATUSES):
-        raise InputError(f"cannot read {path}: index must ascend and status be one of {', '.join(STATUSES)}")
-    return indices, times_s, status
 
 
 def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from scopemap.cameras.formats.colmap import is_image_line
 from scopemap.errors import InputError, SettingsError
-from scopemap.trajectory.formats import climb, colmap, folders, open3d_log, scared, splatam, text
+from scopemap.trajectory.formats import climb, colmap, folders, scared, splatam, text
 from scopemap.trajectory.trajectory import Trajectory, Unit
 
 Reader = Callable[[Path, Unit], Trajectory]
@@ -23,10 +24,10 @@ READERS: dict[str, Reader] = {
     "scared": scared.read_scared,
     "oneslam": text.read_oneslam,
     "bodyslam": text.read_kitti,
-    "endogslam": splatam.read_endogslam,
-    "splatam": splatam.read_splatam,
-    "open3d": open3d_log.read_open3d,
-    "endo-depth": open3d_log.read_endo_depth,
+    "endogslam": partial(splatam.read_params, split="train"),
+    "splatam": partial(splatam.read_params, split="all"),
+    "open3d": text.read_open3d,
+    "endo-depth": text.read_endo_depth,
     "colmap": colmap.read_colmap,
     "climb": climb.read_climb,
 }
@@ -42,7 +43,6 @@ def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Tra
     neither states nor fixes one. Raises `InputError` with the line or frame at fault, and where content fits two kinds;
     `SettingsError` for an unknown `kind`.
     """
-    path = Path(path)
     if kind not in KINDS:
         raise SettingsError(f"unknown kind of trajectory '{kind}'; known are {', '.join(KINDS)}")
     # Path.exists raises for names that no file system allows.
@@ -59,7 +59,7 @@ def holds_trajectory(folder: Path) -> bool:
 
 
 def _refuse_log(path: Path, unit: Unit) -> Trajectory:
-    path = path / open3d_log.LOG_FILE if path.is_dir() else path
+    path = path / text.LOG_FILE if path.is_dir() else path
     raise InputError(
         f"cannot tell which way the poses of {path} point: name the kind, 'open3d' (camera-to-world, as Open3D writes "
         "them) or 'endo-depth' (world-to-camera in metres, as Endo-Depth-and-Motion does)"
@@ -74,7 +74,7 @@ _FOLDERS: tuple[tuple[str, tuple[str, ...], Reader], ...] = (
     ("scared", scared.SCARED_FILES, scared.read_scared),
     ("oneslam", text.ONESLAM_FILES, text.read_oneslam),
     ("endogslam, splatam", (splatam.PARAMS_FILE,), splatam.read_params),
-    ("open3d, endo-depth", (open3d_log.LOG_FILE,), _refuse_log),
+    ("open3d, endo-depth", (text.LOG_FILE,), _refuse_log),
     ("colmap", colmap.COLMAP_FILES, colmap.read_colmap),
     ("climb", climb.CLIMB_FILES, climb.read_climb),
 )
@@ -97,7 +97,7 @@ def _reader_of_folder(folder: Path) -> Reader:
 def _reader_of_file(path: Path) -> Reader:
     if zipfile.is_zipfile(path):
         return splatam.read_params
-    if scared.find_scared(path) is not None:
+    if scared.find_frame_data(path) is not None:
         return scared.read_scared
     lines = text.text_lines(path)
     first = [line for line in lines if text.fields_of(line)][:2]

@@ -11,12 +11,8 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tarfile
-import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +20,16 @@ import numpy as np
 
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse
+from scopemap.trajectory.formats.numbered import ARCHIVES, ArchiveFiles, NumberedFiles, find_numbered
 from scopemap.trajectory.formats.poses import rigid, stamped
 from scopemap.trajectory.trajectory import Trajectory, Unit
 
-# In the order of preference: unpacked files before the tar beside them. AF-SfMLearner unpacks to image_02/data.
-SCARED_FILES = tuple(
-    f"{folder}{name}"
-    for folder in ("", "data/", "image_02/data/")
-    for name in ("frame_data/frame_data*.json", "frame_data*.json", "frame_data.tar.gz", "frame_data.tar")
-)
-"""Where the poses of a keyframe's folder are."""
+_PREFIX, _SUFFIXES = "frame_data", (".json",)
+# AF-SfMLearner unpacks to image_02/data. A place that ends in a dot has loose files.
+_PLACES = ("frame_data", ".", "data/frame_data", "data/.", "image_02/data/frame_data", "image_02/data/.")
+SCARED_FILES = tuple(f"{place}{end}" for place in _PLACES for end in (f"/{_PREFIX}*.json", *ARCHIVES))
+"""Where the poses of a keyframe's folder are: a file of any of these names holds some."""
 
-_TAR_ENDINGS = (".tar", ".tar.gz", ".tgz")
-_MEMBER = re.compile(r"frame_data\D*(\d{1,18})\.json")
-_LARGEST_BYTES = 1 << 20
 _SHORTEST_STEP_POWER = -2
 _LARGEST_STAMP = 1e30
 
@@ -46,32 +38,27 @@ _LARGEST_STAMP = 1e30
 class FrameData:
     """The content of one `frame_data` file.
 
-    where : file. index : number of the frame. T_world_camera : (4, 4), mm, None where it cannot be used, which `fault`
-    explains. stamp : `timestamp`.
+    index : number of the frame. T_world_camera : (4, 4), mm, None where it cannot be used, which `fault` explains.
+    stamp : `timestamp`.
     """
 
-    where: str
     index: int
     T_world_camera: np.ndarray | None = None
     stamp: Any = None
     fault: str = ""
 
 
-def parse_frame_data(where: str, index: int, content: bytes) -> FrameData:
-    """Return what a `frame_data` file holds; a file that cannot be used is not an error but has a `fault`."""
-    T_world_camera, stamp, fault = None, None, ""
-    try:
-        document = json.loads(content)
-        stamp = document.get("timestamp")
-        pose = np.array(document["camera-pose"], dtype=np.float64)
-        if pose.shape != (4, 4):
-            raise ValueError(f"found the shape {pose.shape}")
-        T_world_camera = inverse(rigid(pose[None], [where])[0])
-    except InputError as error:
-        fault = str(error)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        fault = f"{where}: expected a JSON object with a 4x4 'camera-pose' ({error!r})"
-    return FrameData(where, index, T_world_camera, stamp, fault)
+def find_frame_data(path: Path) -> NumberedFiles | None:
+    """Return the `frame_data` files of a keyframe's folder, of the folder that holds them, or of their tar; or None."""
+    if not path.is_file():
+        return find_numbered(path, _PLACES, _PREFIX, _SUFFIXES)
+    is_tar = path.name.endswith(ARCHIVES) or tarfile.is_tarfile(path)
+    return ArchiveFiles(path, _PREFIX, _SUFFIXES) if is_tar else None
+
+
+def read_frame_data(files: NumberedFiles) -> list[FrameData]:
+    """Return the content of all files, ascending; one that cannot be used is not an error but has a `fault`."""
+    return [_parsed(f"{files.path}, {_PREFIX}{n:06d}.json", n, files.read(n) or b"") for n in files.numbers()]
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
@@ -96,33 +83,18 @@ def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
     return dict(zip(indices.tolist(), times_s.tolist(), strict=True)), f"time stamps of 1e{exponent} s (assumed)"
 
 
-def find_scared(path: Path) -> Path | None:
-    """Return the tar or the folder of JSON files with the poses in `path`, a file or folder; or None."""
-    if path.is_file():
-        return path if path.name.endswith(_TAR_ENDINGS) or tarfile.is_tarfile(path) else None
-    found = (file for pattern in SCARED_FILES for file in path.glob(pattern) if file.is_file())
-    first = next(found, None)
-    return first.parent if first is not None and first.suffix == ".json" else first
-
-
 def read_scared(path: Path, unit: Unit) -> Trajectory:
     """Read the poses of a keyframe, always mm: its folder, the folder of its JSON files, or their tar."""
-    place = find_scared(path)
-    if place is None:
+    files = find_frame_data(path)
+    if files is None:
         raise InputError(
             f"cannot read SCARED poses from {path}: looked for frame_data*.json and frame_data.tar.gz, here, in data "
             "and in data/frame_data"
         )
-    documents = _from_folder(place) if place.is_dir() else _from_tar(place)
-    frames = sorted((parse_frame_data(*document) for document in documents), key=lambda frame: frame.index)
-    if not frames:
-        raise InputError(f"cannot read SCARED poses from {place}: it holds no frame_data*.json")
-    for earlier, later in pairwise(frames):
-        if earlier.index == later.index:
-            raise InputError(f"{later.where}: frame {later.index} comes a second time, it is in {earlier.where} too")
+    frames = read_frame_data(files)
     fault = next((frame.fault for frame in frames if frame.fault), "")
-    if fault:
-        raise InputError(fault)
+    if fault or not frames:
+        raise InputError(fault or f"cannot read SCARED poses from {files.path}: it holds no frame_data*.json")
     poses = [frame.T_world_camera for frame in frames if frame.T_world_camera is not None]
     times_s, words = times_of(frames)
     indices = np.array([frame.index for frame in frames])
@@ -130,20 +102,17 @@ def read_scared(path: Path, unit: Unit) -> Trajectory:
     return stamped(np.stack(poses), indices, np.array(list(times_s.values())) if times_s else None, source)
 
 
-def _from_folder(folder: Path) -> Iterator[tuple[str, int, bytes]]:
-    for path in folder.glob("frame_data*.json"):
-        if match := _MEMBER.fullmatch(path.name):
-            yield str(path), int(match[1]), path.read_bytes()
-
-
-def _from_tar(path: Path) -> Iterator[tuple[str, int, bytes]]:
+def _parsed(where: str, index: int, content: bytes) -> FrameData:
+    T_world_camera, stamp, fault = None, None, ""
     try:
-        # Read as a stream and never unpacked: names in a tar may point anywhere.
-        with tarfile.open(path, "r:*") as archive:
-            for member in archive:
-                match = _MEMBER.fullmatch(member.name.rpartition("/")[2])
-                file = archive.extractfile(member) if match and member.isfile() else None
-                if match and file:
-                    yield f"{path}, {member.name}", int(match[1]), file.read(_LARGEST_BYTES)
-    except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
-        raise InputError(f"cannot read SCARED poses from {path}: the tar is damaged ({error})") from None
+        document = json.loads(content)
+        stamp = document.get("timestamp")
+        pose = np.array(document["camera-pose"], dtype=np.float64)
+        if pose.shape != (4, 4):
+            raise ValueError(f"found the shape {pose.shape}")
+        T_world_camera = inverse(rigid(pose[None], [where])[0])
+    except InputError as error:
+        fault = str(error)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        fault = f"{where}: expected a JSON object with a 4x4 'camera-pose' ({error!r})"
+    return FrameData(index, T_world_camera, stamp, fault)

@@ -10,14 +10,12 @@ c3vd.py), so that column 7 is frame 8. Their settings are in `config.py` beside 
 from __future__ import annotations
 
 import ast
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.formats.poses import file_of, from_quaternions, rigid, stamped
 from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
@@ -26,20 +24,13 @@ PARAMS_FILE = "params.npz"
 _TRAINED_PER_HELD_OUT = 7
 
 
-def read_endogslam(path: Path, unit: Unit) -> Trajectory:
-    """Read `params.npz` of a run that held out every eighth frame, as EndoGSLAM and Endo-2DTAM do on C3VD."""
-    return _read(file_of(path, (PARAMS_FILE,)), unit, "train")
+def read_params(path: Path, unit: Unit, split: str = "") -> Trajectory:
+    """Read `params.npz` of a run over every frame (`split` "all"), or over all but every eighth ("train").
 
-
-def read_splatam(path: Path, unit: Unit) -> Trajectory:
-    """Read `params.npz` of a run over every frame from the first."""
-    return _read(file_of(path, (PARAMS_FILE,)), unit, "all")
-
-
-def read_params(path: Path, unit: Unit) -> Trajectory:
-    """Read `params.npz`, its frames numbered by the `config.py` beside it; `InputError` where there is none."""
+    "" numbers the frames by the `config.py` beside the file; `InputError` where there is none.
+    """
     file = file_of(path, (PARAMS_FILE,))
-    settings = _settings_of(file.with_name("config.py"))
+    settings = (split, 0, 1) if split else _settings_of(file.with_name("config.py"))
     if settings is None:
         raise InputError(
             f"cannot number the frames of {file}: it has no config.py of its run beside it with plain values of "
@@ -63,7 +54,7 @@ def _settings_of(config: Path) -> tuple[str, int, int] | None:
     return (split, start, stride) if usable and start >= 0 and stride > 0 else None
 
 
-def _read(path: Path, unit: Unit, split: str, start: int = 0, stride: int = 1) -> Trajectory:
+def _read(path: Path, unit: Unit, split: str, start: int, stride: int) -> Trajectory:
     """Read the poses of the frames from `start` (first of those not held out) in steps of `stride`."""
     quaternions, translations = _columns(path)
     # Columns start at the identity; a checkpoint of an unfinished run still has its tail there.
@@ -83,17 +74,11 @@ def _read(path: Path, unit: Unit, split: str, start: int = 0, stride: int = 1) -
 
 def _columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions (N, 4), scalar first, and translations (N, 3) as stored."""
-    try:
-        # Pickled objects in the file stay unread: loading them could run any code.
-        with np.load(path, allow_pickle=False) as arrays:
-            rotations = np.asarray(arrays["cam_unnorm_rots"], dtype=np.float64)
-            translations = np.asarray(arrays["cam_trans"], dtype=np.float64)
+    wanted = "expected the arrays cam_unnorm_rots (1, 4, N) and cam_trans (1, 3, N), and no pickled objects"
+    # Pickled objects in the file stay unread: loading them could run any code.
+    with reporting(f"cannot read a trajectory from {path}: {wanted}"), np.load(path, allow_pickle=False) as arrays:
+        rotations, translations = (np.asarray(arrays[name], np.float64) for name in ("cam_unnorm_rots", "cam_trans"))
         count = rotations.shape[-1] if rotations.ndim else 0
         if not count or rotations.shape != (1, 4, count) or translations.shape != (1, 3, count):
             raise ValueError(f"found {rotations.shape} and {translations.shape}")
-    except (OSError, ValueError, EOFError, TypeError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"cannot read a trajectory from {path}: expected the arrays cam_unnorm_rots (1, 4, N) and cam_trans "
-            f"(1, 3, N), and no pickled objects, which are never loaded ({error})"
-        ) from None
-    return rotations[0].T, translations[0].T
+        return rotations[0].T, translations[0].T

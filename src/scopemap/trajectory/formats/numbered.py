@@ -13,10 +13,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-from scopemap.io.decoding import check_bytes, reporting
+from scopemap.errors import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
-_ARCHIVES = (".tar.gz", ".tar")
+ARCHIVES = (".tar.gz", ".tgz", ".tar")
+"""Endings of the archives that are read, the preferred first."""
 
 
 class FolderFiles:
@@ -53,41 +54,39 @@ class ArchiveFiles:
 
     def read(self, number: int) -> bytes | None:
         """Return the content of the file with this number, None where there is none."""
-        with self._lock:
+        with self._lock, self._reporting():
             while number not in self._found and not self._complete:
                 self._advance()
-            return self._content(self._found[number]) if number in self._found else None
+            member = self._found.get(number)
+            if member is None or self._tar is None:
+                return None
+            check_bytes(f"{self.path}, {member.name}", member.size, LARGEST_FILE_BYTES)
+            stream = self._tar.extractfile(member)
+            content = b"" if stream is None else stream.read()
+            if len(content) < member.size:
+                raise EOFError(f"{member.name} breaks off")
+            return content
 
     def numbers(self) -> list[int]:
         """Return all numbers, ascending; the archive is read to its end for it."""
-        with self._lock:
+        with self._lock, self._reporting():
             while not self._complete:
                 self._advance()
             return sorted(self._found)
 
     def _advance(self) -> None:
-        with self._reporting():
-            self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115
-            member = self._tar.next()
-            if member is None:
-                self._complete = True
-                return
-            # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
-            if member.size < 0 or member.offset <= self._last_offset:
-                raise EOFError(f"{member.name} has no valid size")
+        self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115
+        member = self._tar.next()
+        if member is None:
+            self._complete = True
+            return
+        # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
+        if member.size < 0 or member.offset <= self._last_offset:
+            raise EOFError(f"{member.name} has no valid size")
         self._last_offset = member.offset
-        number = _number_of(PurePosixPath(member.name).name, self._prefix, self._suffixes)
+        number = _number_of(member.name, self._prefix, self._suffixes)
         if number is not None and member.isreg():
             self._found.setdefault(number, member)
-
-    def _content(self, member: tarfile.TarInfo) -> bytes:
-        check_bytes(f"{self.path}, {member.name}", member.size, LARGEST_FILE_BYTES)
-        with self._reporting():
-            stream = self._tar.extractfile(member) if self._tar is not None else None
-            content = b"" if stream is None else stream.read()
-            if len(content) < member.size:
-                raise EOFError(f"{member.name} breaks off")
-            return content
 
     def _reporting(self) -> AbstractContextManager[None]:
         return reporting(f"reading {self.path}: the archive is damaged or incomplete; download it again")
@@ -101,7 +100,7 @@ def find_numbered(
 ) -> NumberedFiles | None:
     """Return the files PREFIX<number>SUFFIX in the first of `places` below `folder` that has them, or None.
 
-    A place is a folder, or an archive of the same name with `.tar.gz` or `.tar`; the folder is preferred.
+    A place is a folder, or an archive of the same name with an ending of `ARCHIVES`; the folder is preferred.
     """
     for place in places:
         inside = folder / place
@@ -109,10 +108,9 @@ def find_numbered(
         numbered = {number: file for file in files if (number := _number_of(file.name, prefix, suffixes)) is not None}
         if numbered:
             return FolderFiles(inside, numbered)
-        for ending in _ARCHIVES:
-            archive = folder / (place + ending)
-            if archive.is_file():
-                return ArchiveFiles(archive, prefix, suffixes)
+        archive = next((file for end in ARCHIVES if (file := folder / (place + end)).is_file()), None)
+        if archive is not None:
+            return ArchiveFiles(archive, prefix, suffixes)
     return None
 
 
