@@ -30,7 +30,7 @@ PAPERS_DEPTH = "depth-anything, anchor depth-pro"
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """SCARED, SCARED-C and Hamlyn in the spellings in use, a clip of C3VD, OneSLAM's poses of a keyframe, weights."""
     root = tmp_path_factory.mktemp("data")
-    frames = seen(write_tiny(root / "c3vd" / "cecum_t1_a_under_review", frames=4))
+    frames = seen(write_tiny(root / "c3vd" / "cecum_t1_a_under_review", frames=3))
     as_scared(frames, root / "scared" / "dataset_1" / "keyframe_1")
     as_scared(frames, root / "scared" / "dataset_2" / "dataset_2" / "keyframe_3")
     as_scared(frames, root / "train" / "dataset3" / "keyframe4")
@@ -140,9 +140,9 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
     lines = capfd.readouterr().out.splitlines()
     assert lines[:3] == [
-        "SCARED: 2 sequences, 8 frames, 18 methods",
-        "  dataset_1/keyframe_1: 4 frames",
-        "  dataset_2/keyframe_3: 4 frames",
+        "SCARED: 2 sequences, 6 frames, 18 methods",
+        "  dataset_1/keyframe_1: 3 frames",
+        "  dataset_2/keyframe_3: 3 frames",
     ]
     rows = dict(line.strip().split(": ", 1) for line in lines[3:] if line.startswith("  "))
     assert set(rows) == {method.name for method in read_plan("scared").method}

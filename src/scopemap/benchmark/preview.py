@@ -16,13 +16,12 @@ from scopemap.estimators import missing_weights
 from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
 from scopemap.io import weights
 
-# Seconds per frame at 400x320 px on two CPU cores, measured with networks of full size; start-up is a run's.
-_FLOW_S = {"dis": 0.03, "raft-small": 1.0, "raft-large": 12.0}
-_DEPTH_S = {"scopenet": 0.1, "depth-anything": 1.0, "depth-pro": 60.0}
-_PERCEPTUAL_S = {"lpips": 0.15, "auto": 0.15, "structure": 0.02}
-_TRACKING_S = 0.35
-_SCORING_S = 0.1
-_START_S = 20.0
+# Seconds per frame at 400x320 px on two CPU cores: half the CPU time of random networks of full size, flow both ways.
+_FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
+_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 60.0}
+_PERCEPTUAL_S = {"lpips": 0.05, "auto": 0.05, "structure": 0.01}
+_TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
+_START_S = 20.0  # of a run: imports and kernels
 
 
 def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:

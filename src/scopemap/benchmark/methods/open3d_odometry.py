@@ -53,58 +53,6 @@ class _Prepared(NamedTuple):
     data: Any
 
 
-class _RgbdAligner:
-    """Aligns colour and depth images."""
-
-    def __init__(self, open3d: Any, term: str) -> None:
-        self._open3d, self._odometry = open3d, open3d.pipelines.odometry
-        self._term = getattr(self._odometry, term)()
-
-    def prepare(self, frame: Frame) -> Any:
-        image, depth = self._open3d.geometry.Image(np.ascontiguousarray(frame.rgb)), _depth_image(self._open3d, frame)
-        return self._open3d.geometry.RGBDImage.create_from_color_and_depth(
-            image, depth, depth_scale=UNIT_MM, depth_trunc=_DEPTH_MAX_UNITS, convert_rgb_to_intensity=True
-        )
-
-    def align(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
-        camera, option = _intrinsics(self._open3d, current.frame), self._odometry.OdometryOption
-        success, T, information = self._odometry.compute_rgbd_odometry(
-            current.data, reference.data, camera, np.eye(4), self._term, option(depth_max=_DEPTH_MAX_UNITS)
-        )
-        if not success or not np.trace(information) > 0:
-            raise _NoMotion("Open3D found no pixels that correspond")
-        if np.array_equal(T, np.eye(4)) and not np.array_equal(current.frame.rgb, reference.frame.rgb):
-            raise _NoMotion(_SINGULAR)
-        return np.array(T)
-
-
-class _IcpAligner:
-    """Aligns point clouds."""
-
-    def __init__(self, open3d: Any, estimation: str) -> None:
-        self._open3d, self._registration = open3d, open3d.pipelines.registration
-        self._estimation, self._normals = getattr(self._registration, estimation)(), estimation.endswith("PointToPlane")
-
-    def prepare(self, frame: Frame) -> Any:
-        depth, camera = _depth_image(self._open3d, frame), _intrinsics(self._open3d, frame)
-        create = self._open3d.geometry.PointCloud.create_from_depth_image
-        cloud = create(depth, camera, depth_scale=UNIT_MM, depth_trunc=_DEPTH_MAX_UNITS)
-        cloud = cloud.voxel_down_sample(_VOXEL_MM / UNIT_MM)
-        if self._normals:
-            cloud.estimate_normals()
-        return cloud
-
-    def align(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
-        found = self._registration.registration_icp(
-            current.data, reference.data, _ICP_MAX_DISTANCE_MM / UNIT_MM, np.eye(4), self._estimation
-        )
-        if not found.fitness > 0:
-            raise _NoMotion(f"no points of the two clouds are within {_ICP_MAX_DISTANCE_MM:g} mm of each other")
-        if np.array_equal(found.transformation, np.eye(4)) and found.inlier_rmse > 0:
-            raise _NoMotion(_SINGULAR)
-        return np.array(found.transformation)
-
-
 class Open3dTracker:
     """A `FrameTracker` that aligns each frame to the last tracked one by an odometry of Open3D.
 
@@ -115,12 +63,7 @@ class Open3dTracker:
     """
 
     def __init__(self, method: str) -> None:
-        self._open3d = load_open3d()
-        self._aligner: _RgbdAligner | _IcpAligner
-        if method in RGBD_METHODS:
-            self._aligner = _RgbdAligner(self._open3d, RGBD_METHODS[method])
-        else:
-            self._aligner = _IcpAligner(self._open3d, ICP_METHODS[method])
+        self._open3d, self._method = load_open3d(), method
         self._reference: _Prepared | None = None
         self._current: _Prepared | None = None
         self._T_world_last = np.eye(4)
@@ -129,7 +72,7 @@ class Open3dTracker:
         """Return the pose of a frame with depth, or why it is lost; the first frame with enough depth is "initial"."""
         reference = self._reference
         index = reference.frame.index if reference else frame.index
-        known = float(_known(frame).mean())
+        known = float((_known_depth_mm(frame) > 0).mean())
         if known < _MIN_KNOWN_SHARE:
             return Track(frame.index, "lost", f"only {known:.0%} of the image is usable", self._T_world_last, index)
         self._current = self._prepared(frame)
@@ -154,31 +97,72 @@ class Open3dTracker:
         """
         if frame.T_world_camera is None:
             raise ValueError("a reference needs a pose")
-        if _known(frame).mean() < _MIN_KNOWN_SHARE:
+        if (_known_depth_mm(frame) > 0).mean() < _MIN_KNOWN_SHARE:
             return False
-        current = self._current
-        # Depth that was not refined is not prepared a second time.
-        if current is not None and current.frame.index == frame.index and _same_depth(current.frame, frame):
-            self._reference = _Prepared(frame, current.data)
-        else:
-            self._reference = self._prepared(frame)
+        self._reference = self._prepared(frame)
         return True
 
     def _prepared(self, frame: Frame) -> _Prepared:
+        """Return the frame as Open3D takes it, in its units; pixels of depth 0 are left out."""
+        current, depth_mm = self._current, _known_depth_mm(frame)
+        # Depth that was not refined is not prepared a second time.
+        same = current is not None and current.frame.index == frame.index
+        if current is not None and same and np.array_equal(depth_mm, _known_depth_mm(current.frame)):
+            return _Prepared(frame, current.data)
+        geometry, limits = self._open3d.geometry, {"depth_scale": UNIT_MM, "depth_trunc": _DEPTH_MAX_UNITS}
         with self._silent():
-            return _Prepared(frame, self._aligner.prepare(frame))
+            depth = geometry.Image(depth_mm)
+            if self._method in RGBD_METHODS:
+                image, create = geometry.Image(np.ascontiguousarray(frame.rgb)), geometry.RGBDImage
+                return _Prepared(frame, create.create_from_color_and_depth(image, depth, **limits))
+            cloud = geometry.PointCloud.create_from_depth_image(depth, self._intrinsics(frame), **limits)
+            cloud = cloud.voxel_down_sample(_VOXEL_MM / UNIT_MM)
+            if self._method == "point-to-plane":
+                cloud.estimate_normals()
+            return _Prepared(frame, cloud)
 
     def _motion(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
         """Return `T_reference_current` (4, 4) in mm; raises `_NoMotion`."""
         try:
             with self._silent():
-                T = self._aligner.align(current, reference)
+                T = (self._rgbd_motion if self._method in RGBD_METHODS else self._icp_motion)(current, reference)
         except RuntimeError as error:
             raise _NoMotion(f"Open3D failed: {_last_line(str(error))}") from None
         if not np.isfinite(T).all():
             raise _NoMotion("the alignment diverged")
         T[:3, 3] *= UNIT_MM
         return T
+
+    def _rgbd_motion(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
+        odometry = self._open3d.pipelines.odometry
+        term, option = (
+            getattr(odometry, RGBD_METHODS[self._method])(),
+            odometry.OdometryOption(depth_max=_DEPTH_MAX_UNITS),
+        )
+        success, T, information = odometry.compute_rgbd_odometry(
+            current.data, reference.data, self._intrinsics(current.frame), np.eye(4), term, option
+        )
+        if not success or not np.trace(information) > 0:
+            raise _NoMotion("Open3D found no pixels that correspond")
+        if np.array_equal(T, np.eye(4)) and not np.array_equal(current.frame.rgb, reference.frame.rgb):
+            raise _NoMotion(_SINGULAR)
+        return np.array(T)
+
+    def _icp_motion(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
+        registration = self._open3d.pipelines.registration
+        estimation = getattr(registration, ICP_METHODS[self._method])()
+        found = registration.registration_icp(
+            current.data, reference.data, _ICP_MAX_DISTANCE_MM / UNIT_MM, np.eye(4), estimation
+        )
+        if not found.fitness > 0:
+            raise _NoMotion(f"no points of the two clouds are within {_ICP_MAX_DISTANCE_MM:g} mm of each other")
+        if np.array_equal(found.transformation, np.eye(4)) and found.inlier_rmse > 0:
+            raise _NoMotion(_SINGULAR)
+        return np.array(found.transformation)
+
+    def _intrinsics(self, frame: Frame) -> Any:
+        c = frame.camera
+        return self._open3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
 
     def _silent(self) -> Any:
         """Context in which Open3D prints nothing."""
@@ -197,28 +181,11 @@ def load_open3d() -> Any:
         ) from None
 
 
-def _known(frame: Frame) -> np.ndarray:
-    """Return usable pixels of known depth, (H, W) bool."""
+def _known_depth_mm(frame: Frame) -> np.ndarray:
+    """Return depth (H, W) float32, mm, 0 where it is unknown or the pixel is not usable."""
     if frame.depth_mm is None:
         raise ValueError("an RGB-D odometry needs frames with depth")
-    return frame.valid & np.isfinite(frame.depth_mm)
-
-
-def _same_depth(one: Frame, other: Frame) -> bool:
-    assert one.depth_mm is not None
-    assert other.depth_mm is not None
-    return np.array_equal(one.depth_mm, other.depth_mm, equal_nan=True)
-
-
-def _depth_image(open3d: Any, frame: Frame) -> Any:
-    """Depth in mm; Open3D leaves out pixels of depth 0."""
-    assert frame.depth_mm is not None
-    return open3d.geometry.Image(np.where(_known(frame), frame.depth_mm, 0).astype(np.float32))
-
-
-def _intrinsics(open3d: Any, frame: Frame) -> Any:
-    camera = frame.camera
-    return open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return np.where(frame.valid & np.isfinite(frame.depth_mm), frame.depth_mm, 0).astype(np.float32)
 
 
 def _last_line(message: str) -> str:
