@@ -146,12 +146,12 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     ]
     rows = dict(line.strip().split(": ", 1) for line in lines[3:] if line.startswith("  "))
     assert set(rows) == {method.name for method in read_plan("scared").method}
-    assert rows["scopemap"].endswith(" h")
+    assert rows["scopemap"] == "1 min"
     assert rows["MDE (per-frame Depth Pro)"] == "needs weights: depth-pro (scopemap models pull NAME)"
     assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large, alexnet (")
-    assert rows["OneSLAM"].count(" h; not supplied: ") == 1
+    assert rows["OneSLAM"].count(" min; not supplied: ") == 1
     assert "weights that are missing: alexnet, depth-anything, depth-pro, raft-large" in lines
-    assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about 0.")
+    assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
     assert not list(tmp_path.iterdir())
 
 

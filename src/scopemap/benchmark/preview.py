@@ -18,7 +18,7 @@ from scopemap.io import weights
 
 # Seconds per frame at 400x320 px on two CPU cores: half the CPU time of random networks of full size, flow both ways.
 _FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
-_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 60.0}
+_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
 _PERCEPTUAL_S = {"lpips": 0.05, "auto": 0.05, "structure": 0.01}
 _TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
 _START_S = 20.0  # of a run: imports and kernels
@@ -43,16 +43,21 @@ def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
     yield f"{plan.title}: {len(lengths)} sequences, {sum(lengths.values())} frames, {len(plan.method)} methods"
     yield from (f"  {label}: {count} frames" for label, count in lengths.items())
     yield from (f"note: {note}" for note in notes)
+    yield "rows:"
     for method in dict.fromkeys(entry.method.name for entry in entries):
         reasons = dict.fromkeys(rows[method])
-        expected = [f"{hours[method]:.1f} h"] if method in hours else []
+        expected = [_duration(hours[method])] if method in hours else []
         yield f"  {method}: {'; '.join([*expected, *reasons]) or 'done'}"
     yield f"weights that are missing: {', '.join(sorted(lacking)) or 'none'}"
     waiting = sum(map(len, rows.values()))
     yield (
         f"{len(entries)} runs: {done} done, {waiting} missing, {len(entries) - done - waiting} to run in about "
-        f"{sum(hours.values()):.1f} h on two CPU cores; networks take less on a GPU"
+        f"{_duration(sum(hours.values()))} on two CPU cores; networks take less on a GPU"
     )
+
+
+def _duration(hours: float) -> str:
+    return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
 
 
 def _frames(entry: Entry) -> int:
@@ -76,10 +81,12 @@ def _seconds(entry: Entry, frames: int) -> float:
     config = _config(entry)
     if config is None:
         return 0.0
-    needed = {config.networks.flow, config.networks.keyframe_flow}
-    if "auto" in needed:
-        needed.add("raft-small" if weights.is_present(*RAFT_CHECKPOINTS["small"]) else "dis")
+    flow, networks, mapis = config.networks.flow, config.networks, config.mapis
+    if flow == "auto":
+        flow = "raft-small" if weights.is_present(*RAFT_CHECKPOINTS["small"]) else "dis"
     per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
-    per_frame += sum(_FLOW_S.get(name, 0.0) for name in needed) + _PERCEPTUAL_S[config.networks.perceptual]
+    per_frame += _FLOW_S.get(networks.keyframe_flow, 0.0)
+    if (mapis.paper.blend, mapis.advanced.frame_scale) != ("none", "none"):
+        per_frame += _FLOW_S.get(flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
     once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
     return once + frames * per_frame

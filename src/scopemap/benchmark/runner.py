@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from scopemap.benchmark.entry import Entry, entries_of
 from scopemap.benchmark.methods.method import Method, PipelineMethod, create_method
@@ -73,7 +73,12 @@ def run_plan(
     results = []
     for entry in entries:
         kept = kept_result(entry, retry=retry)
-        results.append(kept or _missing(entry) or _run_in_process(entry, timeout_s))
+        if kept is not None:
+            results.append(kept)
+        elif reason := what_is_missing(entry):
+            results.append(_without_figures(entry, "missing", reason))
+        else:
+            results.append(_run_in_process(entry, timeout_s))
         if listener:
             listener(entry, results[-1], kept is not None)
     return Benchmark(plan, entries, results, notes + _commits_note(results))
@@ -109,7 +114,7 @@ def run_entry(entry: Entry) -> RunResult:
         memory_mb = _peak_memory_mb()
         figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
     except ScopemapError as error:
-        return _failed(entry, str(error))
+        return _without_figures(entry, "failed", str(error))
     return RunResult(
         entry.label,
         entry.method.name,
@@ -155,12 +160,6 @@ def what_is_missing(entry: Entry) -> str:
         return ""
 
 
-def _missing(entry: Entry) -> RunResult | None:
-    reason = what_is_missing(entry)
-    facts = _facts(entry)
-    return RunResult(entry.label, entry.method.name, entry.seed, "missing", reason, facts=facts) if reason else None
-
-
 def method_of(entry: Entry) -> Method:
     """Return the method of an entry."""
     return create_method(entry.method, entry.data, entry.sequence.name, entry.seed)
@@ -181,7 +180,7 @@ def _run_in_process(entry: Entry, timeout_s: float | None) -> RunResult:
             error = f"took longer than {timeout_s:g} s"
     # A saved row is valid even if foreign code crashed at the end of the process.
     if not (entry.folder / FILE_NAME).is_file():
-        _failed(entry, error).save(entry.folder)
+        _without_figures(entry, "failed", error).save(entry.folder)
     return RunResult.load(entry.folder)
 
 
@@ -192,8 +191,8 @@ def _cause(code: int, log: Path) -> str:
     return lines[-1][:300] if lines else f"ended with exit code {code}"
 
 
-def _failed(entry: Entry, error: str) -> RunResult:
-    return RunResult(entry.label, entry.method.name, entry.seed, "failed", error, facts=_facts(entry))
+def _without_figures(entry: Entry, status: Literal["failed", "missing"], reason: str) -> RunResult:
+    return RunResult(entry.label, entry.method.name, entry.seed, status, reason, facts=_facts(entry))
 
 
 def _facts(entry: Entry) -> dict[str, Any]:
