@@ -105,7 +105,7 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
     drawn = {file.name for file in (out / "figures").iterdir()}
     assert drawn == {
         *("ate.png", "frames_until_loss.png", "orb_bars.png", "orb_pairs_phantom.png", "orb_points_phantom.png"),
-        *("depth_change_phantom.png", "mesh_phantom_one.png", "mesh_phantom_two.png"),
+        *("depth_change_phantom.png", "clouds_phantom.png", "mesh_phantom_one.png", "mesh_phantom_two.png"),
     }
     consistency = list(csv.DictReader((out / "tables/consistency.csv").read_text().splitlines()))
     assert [row["method"] for row in consistency] == ["one", "two"]
