@@ -25,15 +25,16 @@ class ImportedTrajectory:
     """
 
     def __init__(self, plan: MethodPlan, data: Path | None, name: str, seed: int) -> None:
-        self._plan, self._file = plan, (data or Path("DATA")) / plan.files.format(sequence=name, seed=seed)
+        self._plan, self._name = plan, plan.files.format(sequence=name, seed=seed)
+        self._file = None if data is None else data / self._name
 
     def missing(self, settings: Mapping[str, Any]) -> str:
-        """Return the file that is not there."""
-        return "" if self._file.exists() else f"not supplied: {self._file}"
+        """Return the file that is not in the data folder."""
+        return "" if self._file is not None and self._file.exists() else f"not supplied: {self._name}"
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Write the trajectory as a run's folder; its time is unknown."""
-        file = self._file
+        file = self._file or Path(self._name)
         read = read_trajectory(file, unit=self._plan.unit, kind=self._plan.kind)
         frames = [(frame.index, frame.time_s, frame.name) for frame in sequence.frames()]
         indices, times_s = np.array([f[0] for f in frames]), np.array([f[1] for f in frames])
