@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from scopemap.benchmark.entry import is_rendered
+from scopemap.benchmark.entry import render_once
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.evaluation.depth import evaluate_depth, mean_depth_report
@@ -25,7 +25,6 @@ from scopemap.evaluation.surface import compare_surfaces
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Step
 from scopemap.reconstruction import Reconstruction, prepare_folder
 from scopemap.report.depth_figures import draw_depths
@@ -84,10 +83,7 @@ def prepare_out(out: Path, *, overwrite: bool) -> None:
 
 def render(out: Path, spec: PhantomSpec = PHANTOM, progress: Callable[[int, int], None] | None = None) -> bool:
     """Render the phantom into OUT/phantom, unless it is there already; return whether it had to be rendered."""
-    if is_rendered(out / "phantom", spec):
-        return False
-    write_phantom(spec, out / "phantom", progress)
-    return True
+    return render_once(spec, out / "phantom", progress)
 
 
 def run_on_phantom(out: Path, config: Config, observers: tuple[Observer, ...] = ()) -> Demonstration:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -117,9 +117,7 @@ class Entry(BaseModel):
     def render_phantom(self) -> None:
         """Render the sequence's phantom, if it is one, unless an earlier entry did."""
         if self.sequence.phantom is not None:
-            spec = spec_of(self.sequence.phantom, self.seed, self.data)
-            if not is_rendered(self.source, spec):
-                write_phantom(spec, self.source)
+            render_once(spec_of(self.sequence.phantom, self.seed, self.data), self.source)
 
     def save(self) -> Path:
         """Write the entry into its folder and return the file."""
@@ -151,15 +149,18 @@ def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out
                     )
 
 
-def is_rendered(folder: Path, spec: PhantomSpec) -> bool:
-    """Whether `folder` holds the phantom of `spec`, complete; its mesh is written last."""
+def render_once(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> bool:
+    """Render a phantom, unless `folder` holds it, complete (its mesh is written last); return whether it was needed."""
     try:
         description = json.loads((folder / "phantom.json").read_text())
     except (OSError, ValueError):
-        return False
+        description = {}
     wanted = json.loads(json.dumps(asdict(spec), default=str))
     same = description.get("spec") == wanted and description.get("made_by") == f"scopemap {version('scopemap')}"
-    return same and (folder / "mesh_truth.ply").is_file()
+    if same and (folder / "mesh_truth.ply").is_file():
+        return False
+    write_phantom(spec, folder, progress)
+    return True
 
 
 def _stamp(path: Path) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from scopemap.benchmark.entry import Entry
@@ -71,9 +72,11 @@ def _frames(entry: Entry) -> int:
 
 
 def _config(entry: Entry) -> Config | None:
-    """Return the settings of an entry's run; None for an imported trajectory."""
+    """Return the settings of an entry's run; None for an imported trajectory, and for a run that will fail."""
     method = method_of(entry)
-    return method.config(entry.shared_settings()) if isinstance(method, PipelineMethod) else None
+    with suppress(ScopemapError):
+        return method.config(entry.shared_settings()) if isinstance(method, PipelineMethod) else None
+    return None
 
 
 def _seconds(entry: Entry, frames: int) -> float:
