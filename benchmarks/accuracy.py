@@ -1,6 +1,6 @@
 """Errors against the truth, one row per run, as Markdown: real frames, phantoms, ablations.
 
-    python benchmarks/accuracy.py --data FOLDER [--only real|phantom|backend|ablation] [--keep FOLDER]
+    python benchmarks/accuracy.py --data FOLDER [--only real|phantom|backend|ablation|photometric] [--keep FOLDER]
 
 FOLDER is the real data's (README, "Real data"); its `weights` are used for RAFT and LPIPS. Phantoms are rendered first.
 ATE in mm after the stated alignment; rotation in degrees since the first frame, unaligned; "10" is the RPE over 10
@@ -173,6 +173,16 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
         yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
 
 
+def photometric_runs(data: Path) -> Iterator[Run]:
+    """Yield the ablations of photometric alignment where it gives every pose: predicted depth, no corners, fast motion."""
+    cecum = data / "endoscopy/c3vd/cecum_t1_a"
+    alone = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
+    alone |= NO_SURFACE | LIGHT | TRACKED | {"tracking.advanced.corner_depth_sigma": 0.0}
+    for name, changes in ({"photometric alignment alone": {}} | PHOTOMETRIC).items():
+        where = "cecum_t1_a, every third frame, Depth Anything"
+        yield Run(f"{name}: {where}", cecum, "sim3", alone | changes, slice(None, None, 3))
+
+
 def row(run: Run, out: Path | None) -> str:
     """Reconstruct, measure, and return the table row."""
     started = time.perf_counter()
@@ -203,7 +213,7 @@ def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--only", choices=("real", "phantom", "backend", "ablation"))
+    parser.add_argument("--only", choices=("real", "phantom", "backend", "ablation", "photometric"))
     parser.add_argument("--keep", type=Path, help="keep the runs' folders here")
     options = parser.parse_args()
     os.environ.setdefault("SCOPEMAP_WEIGHTS_DIR", str(options.data / "weights"))
@@ -213,6 +223,7 @@ def main() -> None:
             "phantom": lambda: phantom_runs(Path(scratch), options.data),
             "backend": lambda: backend_runs(Path(scratch), options.data),
             "ablation": lambda: ablation_runs(Path(scratch), options.data),
+            "photometric": lambda: photometric_runs(options.data),
         }
         number = 0
         for group in [options.only] if options.only else groups:
