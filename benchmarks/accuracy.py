@@ -174,7 +174,7 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
 
 
 def photometric_runs(data: Path) -> Iterator[Run]:
-    """Yield the ablations of photometric alignment where it gives every pose: predicted depth, no corners, fast motion."""
+    """Yield the ablations of photometric alignment where it gives every pose: fast motion, predicted depth."""
     cecum = data / "endoscopy/c3vd/cecum_t1_a"
     alone = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
     alone |= NO_SURFACE | LIGHT | TRACKED | {"tracking.advanced.corner_depth_sigma": 0.0}
