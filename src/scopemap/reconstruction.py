@@ -44,7 +44,7 @@ _OWN_FILES = (
     *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
     *("config.toml", "provenance.json"),
 )
-_OWN_FOLDERS = ("depth", "pictures", "maps")
+_OWN_FOLDERS = ("depth", "pictures", "maps", "against_video")
 # Files by which a run's folder is recognised: the first is written last, the second first.
 _MARKS = ("provenance.json", "depth/depth.json")
 

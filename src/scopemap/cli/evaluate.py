@@ -34,12 +34,20 @@ def evaluate(
         ),
     ],
     truth: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             help="True poses: the folder of any data set's sequence, or a trajectory file. With a run's mesh.ply and a "
             "true surface there, the mesh is measured too, moved by the same alignment."
         ),
-    ],
+    ] = None,
+    against_video: Annotated[
+        bool,
+        typer.Option(
+            "--against-video",
+            help="A run's surface against its own video, no truth needed: every 10th frame is kept out of fusion and "
+            "compared with the mesh of the others; DIR/against_video holds a row per frame and a picture.",
+        ),
+    ] = False,
     align: Annotated[
         Align,
         typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone."),
@@ -87,6 +95,12 @@ def evaluate(
     from scopemap.trajectory.formats.opening import read_trajectory
 
     form: OutputForm = "json" if as_json else "csv" if as_csv else "line" if quiet else "table"
+    own = _against_video(trajectory) if against_video else {}
+    if truth is None:
+        if not against_video:
+            raise typer.BadParameter("give the true poses, or --against-video", param_hint="--truth")
+        show(own, form)
+        return
     estimate = read_trajectory(trajectory, unit=unit, kind=kind)
     reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:
@@ -101,6 +115,7 @@ def evaluate(
     figures |= _protocols(estimate, reference, protocol or [])
     if depth or consistency:
         figures |= depth_groups(trajectory, truth, depth, consistency=consistency)
+    figures |= own
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
         _warn(matched)
@@ -128,6 +143,14 @@ def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp
     short = {"mesh_accuracy_mm": "accuracy_mean_mm", "mesh_accuracy_p90_mm": "accuracy_p90_mm"}
     short |= {"mesh_completeness_mm": "completeness_mean_mm"}
     return {name: found[long] for name, long in short.items()} | {"surface": found}
+
+
+def _against_video(run: Path) -> dict[str, Any]:
+    from scopemap.benchmark.held_out import held_out_agreement
+
+    agreement = held_out_agreement(run)
+    agreement.save(run / "against_video")
+    return {"against_video": agreement.figures()}
 
 
 def _protocols(estimate: Trajectory, reference: Trajectory, names: list[str]) -> dict[str, Any]:

@@ -71,6 +71,18 @@ def draw_depths(images: Sequence[np.ndarray], depths_mm: Mapping[str, Sequence[n
     figure.savefig(file)
 
 
+def draw_renderings(pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], file: Path) -> None:
+    """Draw a row per frame number as a PNG: the frame (H, W, 3) uint8, a rendering of it, their absolute difference."""
+    figure = new_figure(9.0, 2.5 * max(len(pairs), 1))
+    for row, (number, (rgb, rendered)) in enumerate(pairs.items()):
+        titles = {f"frame {number}": rgb, "surface, rendered": rendered, "difference": cv2.absdiff(rgb, rendered)}
+        for column, (title, picture) in enumerate(titles.items(), start=1):
+            axes = figure.add_subplot(len(pairs), 3, 3 * row + column, title=title)
+            axes.imshow(picture)
+            axes.set_axis_off()
+    figure.savefig(file)
+
+
 def draw_depth_change(scene: DepthScene, file: Path) -> None:
     """Draw a row per method as a PNG: frame, previous depth, current depth, their absolute difference.
 

@@ -1,0 +1,109 @@
+"""A run's surface against its own video: figures of a made-up frame, and `scopemap evaluate --against-video`."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+from tiny_phantom import with_true_depth, write_tiny
+from typer.testing import CliRunner
+
+from scopemap import open_sequence, reconstruct
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cli import app
+from scopemap.frame import Frame
+from scopemap.fusion.agreement import agreement_figures, compare_with_frame
+
+CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
+
+
+def _wall() -> trimesh.Trimesh:
+    """A coloured wall at 50 mm that fills the view: one vertex per pixel and a margin."""
+    u, v = np.meshgrid(np.arange(-2, 82), np.arange(-2, 66))
+    vertices = np.stack([(u - CAMERA.cx) / 60, (v - CAMERA.cy) / 60, np.ones(u.shape)], -1).reshape(-1, 3) * 50
+    corner = (np.arange(67)[:, None] * 84 + np.arange(83)).ravel()
+    below, right = corner + 84, corner + 1
+    faces = np.concatenate([np.stack([corner, right, below], 1), np.stack([right, below + 1, below], 1)])
+    rng = np.random.default_rng(1)
+    colours = cv2.resize(rng.integers(0, 255, (17, 21, 3)).astype(np.uint8), (84, 68)).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+
+
+def _frame(rgb: np.ndarray, depth: float = 50.0) -> Frame:
+    shape = (CAMERA.height, CAMERA.width)
+    return Frame(7, 0.2, rgb, CAMERA, np.ones(shape, bool), np.full(shape, depth, np.float32), np.eye(4))
+
+
+def test_figures_of_a_wall_are_those_in_closed_form() -> None:
+    wall = _wall()
+    _, view = compare_with_frame(wall, _frame(np.zeros((64, 80, 3), np.uint8)))
+    frame = _frame(view.rgb)
+    same, _ = compare_with_frame(wall, frame)
+    assert (same.index, same.coverage) == (7, 1.0)
+    assert same.ssim == pytest.approx(1.0)
+    assert same.depth_error == pytest.approx(0.0, abs=1e-6)
+    farther, _ = compare_with_frame(wall, replace(frame, depth_mm=np.full((64, 80), 55.0, np.float32)))
+    assert farther.depth_error == pytest.approx(math.log(1.1), abs=1e-6)
+    torn = wall.copy()
+    torn.update_faces(torn.triangles_center[:, 0] < 0)
+    half, _ = compare_with_frame(torn, frame)
+    assert half.coverage == pytest.approx(0.5, abs=0.02)
+    assert half.ssim < 0.7
+    figures = agreement_figures([same, half])
+    assert (figures["frames"], figures["coverage_least"]) == (2, half.coverage)
+    assert figures["coverage_mean"] == pytest.approx((1 + half.coverage) / 2)
+
+
+def test_without_depth_or_usable_pixels_there_is_no_figure() -> None:
+    frame = _frame(np.zeros((64, 80, 3), np.uint8))
+    with pytest.raises(ValueError, match="no depth or no pose"):
+        compare_with_frame(_wall(), replace(frame, depth_mm=None))
+    blind, _ = compare_with_frame(_wall(), replace(frame, valid=np.zeros((64, 80), bool)))
+    assert blind.coverage == 0
+    assert math.isnan(blind.depth_error)
+    assert math.isnan(agreement_figures([])["coverage_mean"])
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("held_out")
+    source = write_tiny(folder / "phantom", frames=12)
+    config = with_true_depth(source, fusion__voxel_mm=1.0)
+    reconstruct(open_sequence(source), config, out=folder / "run")
+    return folder / "run"
+
+
+def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(run_folder: Path) -> None:
+    result = CliRunner().invoke(app, ["evaluate", str(run_folder), "--against-video", "--json"])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)["against_video"]
+    assert (figures["held_out"]["frames"], figures["fused"]["frames"]) == (1, 11)
+    # True depth and true enough poses: the surface is where the frame sees it.
+    assert figures["held_out"]["coverage_mean"] > 0.75
+    assert figures["held_out"]["depth_error"] < 0.02
+    assert figures["held_out"]["ssim"] > 0.4
+    rows = pd.read_csv(run_folder / "against_video" / "frames.csv")
+    assert rows["index"].tolist() == list(range(12))
+    assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]
+    assert cv2.imread(str(run_folder / "against_video" / "worst.png")) is not None
+
+
+def test_a_run_whose_video_is_gone_and_no_truth_are_refused(run_folder: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "run"
+    shutil.copytree(run_folder, moved)
+    provenance = json.loads((moved / "provenance.json").read_text())
+    (moved / "provenance.json").write_text(json.dumps(provenance | {"input": str(tmp_path / "gone.mp4")}))
+    gone = CliRunner().invoke(app, ["evaluate", str(moved), "--against-video"])
+    assert gone.exit_code != 0
+    assert "is not there any more" in gone.output + str(gone.exception)
+    neither = CliRunner().invoke(app, ["evaluate", str(run_folder)])
+    assert neither.exit_code == 2
+    assert "--against-video" in neither.output
