@@ -76,10 +76,10 @@ BINARY = {
 
 
 def refused(file: Path) -> str:
-    started = time.monotonic()
+    started = time.process_time()
     with pytest.raises(ScopemapError) as caught:
         read_calibration(file, (640, 480))
-    assert time.monotonic() - started < 5
+    assert time.process_time() - started < 5
     message = str(caught.value)
     assert len(message) < 1000
     assert "\n" not in message
