@@ -15,7 +15,6 @@ from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
 from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Pipeline
@@ -93,8 +92,8 @@ def test_facts_of_the_parts_do_not_overwrite_each_other(folder: Path, monkeypatc
 
 def test_frames_are_read_without_their_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(Sequence, "_truth", lambda self, index: asked.append(index))
     sequence = open_sequence(folder)
+    monkeypatch.setattr(sequence.source, "truth", asked.append)
     assert [frame.index for frame in sequence.frames()] == list(range(FRAMES))
     assert asked == []
     assert len(list(sequence)) == FRAMES

@@ -120,7 +120,7 @@ def test_a_check_reads_as_it_is_told(
 
 def test_the_published_method_takes_every_frame() -> None:
     assert not Config.load("paper").input.skip_duplicates
-    assert Config.load("paper").input.focal == "assume"
+    assert Config.load("paper").input.focal == "auto"  # Depth Pro's
     assert Config.load().input.skip_duplicates
 
 
