@@ -46,7 +46,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def in_this_process(entry: Entry, timeout_s: float | None) -> RunResult:
-    """What a worker does, without a process that imports the networks anew."""
+    """What a worker does, without a process that imports the networks again."""
     entry.save()
     return run_entry(entry)
 

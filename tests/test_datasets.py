@@ -214,7 +214,7 @@ def test_videos(suffix: str, tmp_path: Path) -> None:
     assert [number_in(f.rgb) for f in frames] == list(range(8))
     np.testing.assert_allclose(np.diff([f.time_s for f in frames]), 0.04, atol=2e-3)
     assert (sequence.name, sequence.count, sequence.warnings) == ("scope", 8, [])
-    assert len(frames_of(sequence)) == 8  # a second walk starts anew
+    assert len(frames_of(sequence)) == 8  # a second walk starts again
 
 
 @pytest.mark.parametrize(("suffix", "options"), [("avi", {}), ("mkv", {}), ("mp4", {"movflags": "faststart"})])

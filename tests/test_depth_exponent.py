@@ -336,7 +336,7 @@ def test_a_run_fits_the_exponent_and_says_so(phantom: Path, tmp_path: Path) -> N
     assert f"{result.config.depth.exponent:.2f} +- " in note
     assert f"note: {note}" in summary_lines(result)
     assert result.provenance["seconds"]["depth exponent"] > 0
-    # The file of the run repeats it to the last bit, without fitting anew.
+    # The file of the run repeats it to the last bit, without fitting again.
     again = reconstruct(open_sequence(phantom), Config.load(file=tmp_path / "out" / "config.toml"))
     np.testing.assert_array_equal(again.trajectory.T_world_camera, result.trajectory.T_world_camera)
     assert not any(note.startswith("depth exponent") for note in again.provenance["notes"])

@@ -118,7 +118,7 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
 
 
 def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
-    """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to views drawn anew, 20 of them.
+    """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to resampled views, 20 of them.
 
     OpenCV's own standard deviations follow from the noise of single corners and are too small by a factor of 2.3 where
     the board bends, which moves all corners of a view together; for the fisheye it has none.
@@ -172,7 +172,7 @@ def without_outliers(
     """Return the views that agree on a camera of `form`, without stray corners, and those that do not: a third at most.
 
     As long as half of the corners of a view or more are far from their projections, the worst view is left out and the
-    others are fitted anew.
+    others are fitted again.
     """
     kept, out = list(views), list[LeftOut]()
     while True:

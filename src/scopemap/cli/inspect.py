@@ -90,4 +90,4 @@ def _print(source: Path, found: Inspection) -> None:
         if finding.advice:
             typer.echo(f"advice: {finding.code}: {finding.advice}")
     if not found.findings:
-        typer.echo("nothing peculiar was found")
+        typer.echo("no problem was found")

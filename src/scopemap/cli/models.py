@@ -47,7 +47,7 @@ def verify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Hash weights anew and compare them with the pinned or recorded hashes."""
+    """Hash weights again and compare them with the pinned or recorded hashes."""
     states = {row.name: row.state for row in weights.overview() if row.state != "missing"}
     names, faults = [name] if name else list(states), dict[str, str]()
     for each in names:

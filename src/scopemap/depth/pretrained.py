@@ -39,11 +39,11 @@ def load_pretrained(model_class: type[PreTrainedModel], model: str) -> tuple[Any
         )
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise WeightsError(
-            f"cannot load '{model}' from {folder}: {error}. Pull it anew or name another folder"
+            f"cannot load '{model}' from {folder}: {error}. Pull it again or name another folder"
         ) from error
     amiss = {kind: sorted(map(str, report[kind])) for kind in ("missing_keys", "mismatched_keys") if report[kind]}
     if amiss:
-        raise WeightsError(f"the weights in {folder} do not fit the network: {amiss}. Pull them anew")
+        raise WeightsError(f"the weights in {folder} do not fit the network: {amiss}. Pull them again")
     return network, processor, {"model": model, **_origin(folder, model)}
 
 

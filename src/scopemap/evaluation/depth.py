@@ -33,7 +33,7 @@ _LEAST_DISPARITY_PER_MM = 1e-6
 # A variance below this share of the squared mean is rounding of the sums.
 _LEAST_VARIATION = 1e-12
 DepthPairs = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
-"""Gives the frames, in order, anew at every call: (predicted, true), (H, W) each, mm, NaN = unknown."""
+"""Gives the frames, in order, again at every call: (predicted, true), (H, W) each, mm, NaN = unknown."""
 
 _FIGURES = (
     *("pixels", "coverage", "scale", "shift_per_mm", "abs_rel", "sq_rel_mm", "rmse_mm", "rmse_log", "mae_mm"),

@@ -54,7 +54,7 @@ def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
         read_s = float(times_s[-1] - times_s[0]) + usual_s
         if abs(read_s - claimed_s) > max(_LENGTH_S, _LENGTH_SHARE * claimed_s):
             message = f"the file's header claims {claimed_s:.1f} s, its pictures last {read_s:.1f} s"
-            advice = "what can be read is used; copy the file anew if it is cut off"
+            advice = "what can be read is used; copy the file again if it is cut off"
             yield VideoFinding("warning", "length-claimed", message, advice)
     # A hole is no variable rate.
     rest = np.abs(steps_s[steps_s < _HOLE * usual_s] / usual_s - 1)

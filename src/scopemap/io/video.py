@@ -29,7 +29,7 @@ _SAMPLED_EVERY = 10
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 # A recording may pause, a time lapse be slow; a stamp that runs ahead by more is of another clock.
 _LONGEST_GAP_S, _LONGEST_GAP_FRAMES = 60.0, 10
-# AVI and WMV keep the stamps of reordered frames slightly out of order; a clock that goes back by more began anew.
+# AVI and WMV keep the stamps of reordered frames slightly out of order; a clock that goes back by more began again.
 _DISORDER_S = 1.0
 
 

@@ -112,7 +112,7 @@ def locate(*names: str) -> Path:
 
 
 def verify(name: str) -> Path:
-    """Hash every file of `name` anew and return its place; raises `WeightsError` if one is missing or damaged."""
+    """Hash every file of `name` again and return its place; raises `WeightsError` if one is missing or damaged."""
     _hash.cache_clear()
     return locate(name)
 

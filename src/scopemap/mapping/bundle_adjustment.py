@@ -55,7 +55,7 @@ class BundleSolution:
 def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
     """Return the solution that the search finds from the start; without observations everything stays as tracked.
 
-    The scale of the reprojection errors is estimated anew after every accepted step: which are outliers is judged as
+    The scale of the reprojection errors is estimated again after every accepted step: which are outliers is judged as
     the fit gets better.
     """
     start = problem.tracked if problem.start is None else problem.start

@@ -31,7 +31,7 @@ def pose_from_correspondences(
     """Return T_current_reference (4, 4) of the least robust reprojection error, or None below 50 points in view.
 
     T_start : (4, 4), first guess. depth_sigma_share : relative standard deviation of the points' depth.
-    Cauchy's kernel, whose scale is the robust deviation of the errors, estimated anew until it stays.
+    Cauchy's kernel, whose scale is the robust deviation of the errors, estimated again until it stays.
     """
     points_mm, pixels = correspondences.points_mm, correspondences.pixels
     if len(points_mm) < _MIN_POINTS:

@@ -279,7 +279,7 @@ def _taken(stream: IO[bytes], form: Struct) -> tuple:
     """Return the next values, of the types in `form`."""
     content = stream.read(form.size)
     if len(content) < form.size:
-        raise ValueError("it is cut off; write the model anew")
+        raise ValueError("it is cut off; write the model again")
     return form.unpack(content)
 
 
@@ -288,7 +288,7 @@ def _skip(stream: IO[bytes], size: int) -> None:
     while size > 0:
         piece = len(stream.read(min(size, _PIECE_BYTES)))
         if not piece:
-            raise ValueError("it is cut off; write the model anew")
+            raise ValueError("it is cut off; write the model again")
         size -= piece
 
 

@@ -123,7 +123,7 @@ def folded(network: ScopeNet) -> ScopeNet:
 def _missing(file: Path) -> str:
     if file.name == WEIGHTS_NAME and file.parent == Path(__file__).parent:
         return (
-            f"loading ScopeNet: this installation lacks {file}, which the package comes with; install it anew, name a "
+            f"loading ScopeNet: this installation lacks {file}, which the package comes with; install it again, name a "
             ".safetensors file in depth.model, or choose depth.backend=shading"
         )
     return f"loading ScopeNet: depth.model names {file}, which is no file; it must be a .safetensors file"

@@ -37,7 +37,7 @@ _COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, 16: text.r
 
 
 def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory:
-    """Read a trajectory of any format, which its content tells; its `source` states what was assumed.
+    """Read a trajectory of any format, recognised by its content; its `source` states what was assumed.
 
     The kinds, their conventions and units are listed in docs/formats.md, "Trajectories". `unit` is that of a file that
     neither states nor fixes one. Raises `InputError` with the line or frame at fault, and where content fits two kinds;
