@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,10 +18,11 @@ from typer.testing import CliRunner
 from scopemap import open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli import app
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import agreement_figures, compare_with_frame
+from scopemap.cli.run import summary_lines
+from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
+BLACK = np.zeros((64, 80, 3), np.uint8)
 
 
 def _wall() -> trimesh.Trimesh:
@@ -37,24 +37,25 @@ def _wall() -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
 
 
-def _frame(rgb: np.ndarray, depth: float = 50.0) -> Frame:
-    shape = (CAMERA.height, CAMERA.width)
-    return Frame(7, 0.2, rgb, CAMERA, np.ones(shape, bool), np.full(shape, depth, np.float32), np.eye(4))
+def _depth(depth_mm: float = 50.0) -> np.ndarray:
+    return np.full((CAMERA.height, CAMERA.width), depth_mm, np.float32)
+
+
+def _compared(mesh: trimesh.Trimesh, rgb: np.ndarray, depth_mm: np.ndarray) -> FrameAgreement:
+    return compare_with_frame(mesh, CAMERA, np.eye(4), rgb, depth_mm)[0]
 
 
 def test_figures_of_a_wall_are_those_in_closed_form() -> None:
     wall = _wall()
-    _, view = compare_with_frame(wall, _frame(np.zeros((64, 80, 3), np.uint8)))
-    frame = _frame(view.rgb)
-    same, _ = compare_with_frame(wall, frame)
-    assert (same.index, same.coverage) == (7, 1.0)
+    rgb = compare_with_frame(wall, CAMERA, np.eye(4), BLACK, _depth())[1].rgb
+    same = _compared(wall, rgb, _depth())
+    assert same.coverage == 1.0
     assert same.ssim == pytest.approx(1.0)
     assert same.depth_error == pytest.approx(0.0, abs=1e-6)
-    farther, _ = compare_with_frame(wall, replace(frame, depth_mm=np.full((64, 80), 55.0, np.float32)))
-    assert farther.depth_error == pytest.approx(math.log(1.1), abs=1e-6)
+    assert _compared(wall, rgb, _depth(55.0)).depth_error == pytest.approx(math.log(1.1), abs=1e-6)
     torn = wall.copy()
     torn.update_faces(torn.triangles_center[:, 0] < 0)
-    half, _ = compare_with_frame(torn, frame)
+    half = _compared(torn, rgb, _depth())
     assert half.coverage == pytest.approx(0.5, abs=0.02)
     assert half.ssim < 0.7
     figures = agreement_figures([same, half])
@@ -62,14 +63,12 @@ def test_figures_of_a_wall_are_those_in_closed_form() -> None:
     assert figures["coverage_mean"] == pytest.approx((1 + half.coverage) / 2)
 
 
-def test_without_depth_or_usable_pixels_there_is_no_figure() -> None:
-    frame = _frame(np.zeros((64, 80, 3), np.uint8))
-    with pytest.raises(ValueError, match="no depth or no pose"):
-        compare_with_frame(_wall(), replace(frame, depth_mm=None))
-    blind, _ = compare_with_frame(_wall(), replace(frame, valid=np.zeros((64, 80), bool)))
+def test_without_usable_pixels_there_is_no_figure() -> None:
+    blind = _compared(_wall(), BLACK, _depth(np.nan))
     assert blind.coverage == 0
     assert math.isnan(blind.depth_error)
-    assert math.isnan(agreement_figures([])["coverage_mean"])
+    assert agreement_figures([]) == {"frames": 0}
+    assert agreement_figures([blind]) == {"frames": 1, "coverage_mean": 0, "coverage_least": 0}
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +76,11 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("held_out")
     source = write_tiny(folder / "phantom", frames=12)
     config = with_true_depth(source, fusion__voxel_mm=1.0)
-    reconstruct(open_sequence(source), config, out=folder / "run")
+    result = reconstruct(open_sequence(source), config, out=folder / "run")
+    # Every run says how its surface agrees with some of its frames.
+    assert result.provenance["surface"]["frames"] == 12
+    assert result.provenance["surface"]["coverage_mean"] > 0.75
+    assert "covers" in next(line for line in summary_lines(result) if line.startswith("mesh: "))
     return folder / "run"
 
 

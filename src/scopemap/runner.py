@@ -25,6 +25,7 @@ from scopemap.depth.power_law import fit_exponent
 from scopemap.errors import InputError
 from scopemap.estimators import create_estimators, estimators_provenance, largest_depth_mm
 from scopemap.frame import Frame, is_constant
+from scopemap.fusion.agreement import agreement_figures, compare_with_frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
@@ -34,6 +35,7 @@ from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, pr
 from scopemap.tracking.track import FrameTracker
 
 Observer = Callable[[Step], None]
+_CHECKED_FRAMES = 16  # of a submap, at which its surface is rendered again
 _VERSIONS = (
     *("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "torch", "torchvision", "transformers", "lpips"),
 )
@@ -129,6 +131,7 @@ class _Run:
         stored = pipeline.fusion.store.frames(submap.frames)
         frames = (self._write_depth(corrected_frame(frame, submap.correction)) for frame in stored)
         fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
+        agreement = self.clock.timed("check surface", self._surface_agreement, submap, fused)
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
         correction = [] if submap.correction is None else [submap.correction.description]
@@ -136,11 +139,25 @@ class _Run:
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
         provenance["warnings"] += _depth_warnings(self.median_depths_mm, fused.settings)
+        provenance["surface"] = agreement
         config = self.config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
         return Reconstruction(
             sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
         )
+
+    def _surface_agreement(self, submap: Submap, fused: FusedSurface) -> dict[str, float]:
+        """Return the agreement of a submap's surface with some of its frames; {} without a surface or stored frames."""
+        tracked = [record.index for record in self.records if record.index in submap.frames]
+        some = tracked[:: -(-len(tracked) // _CHECKED_FRAMES)] if len(fused.mesh.faces) else []
+        stored = self.pipeline.fusion.store.frames(some)
+        agreements = []
+        for frame in (corrected_frame(frame, submap.correction) for frame in stored):
+            if frame.T_world_camera is not None and frame.depth_mm is not None:
+                depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
+                found, _ = compare_with_frame(fused.mesh, frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+                agreements.append(found)
+        return agreement_figures(agreements) if agreements else {}
 
     def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
         """Yield the stored frames that are in no submap, as tracked."""

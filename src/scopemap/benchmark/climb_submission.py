@@ -34,7 +34,7 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     try:
         facts = json.loads((run / "provenance.json").read_text(encoding="utf-8"))
         seconds, clip = facts["seconds"], clip or Path(facts["input"]).stem
-        prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0)
+        prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0) + seconds.get("check surface", 0.0)
         # The time up to the last pose, the back end included; the mesh comes after it.
         times = zip(RUNTIME_KEYS, (prepare_s, seconds["total"] - prepare_s - fuse_s), strict=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

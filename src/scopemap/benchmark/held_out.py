@@ -33,22 +33,29 @@ _WORST = 3  # frames that are drawn
 
 @dataclass(frozen=True)
 class SurfaceAgreement:
-    """Agreement with the frames kept out of fusion and with those fused, and the worst of the former, drawn."""
+    """Agreement with the frames kept out of fusion and with those fused, by number; the worst of the former, drawn."""
 
-    held_out: list[FrameAgreement]
-    fused: list[FrameAgreement]
+    held_out: dict[int, FrameAgreement]
+    fused: dict[int, FrameAgreement]
     worst: list[tuple[Frame, Rendering]]
 
     def figures(self) -> dict[str, dict[str, float]]:
         """Return the figures of `agreement_figures` for both kinds of frames."""
-        return {"held_out": agreement_figures(self.held_out), "fused": agreement_figures(self.fused)}
+        return {
+            "held_out": agreement_figures(self.held_out.values()),
+            "fused": agreement_figures(self.fused.values()),
+        }
 
     def save(self, folder: Path) -> None:
         """Write FOLDER/frames.csv, one row per frame, and FOLDER/worst.png: frame, rendering, difference."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
             kinds = ((self.held_out, False), (self.fused, True))
-            rows = [asdict(agreement) | {"fused": int(fused)} for kind, fused in kinds for agreement in kind]
+            rows = [
+                {"index": index, **asdict(agreement), "fused": int(fused)}
+                for kind, fused in kinds
+                for index, agreement in kind.items()
+            ]
             with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, rows[0])
                 writer.writeheader()
@@ -71,14 +78,16 @@ def held_out_agreement(run: Path, every: int = HELD_OUT_EVERY) -> SurfaceAgreeme
         if number % every != every // 2:
             volume.integrate(frame)
     mesh = volume.extract_mesh()
-    held_out, fused = [], []
+    held_out, fused = dict[int, FrameAgreement](), dict[int, FrameAgreement]()
     views: list[tuple[float, Frame, Rendering]] = []
     for number, frame in enumerate(_frames(run, config)):
-        agreement, view = compare_with_frame(mesh, frame)
+        assert frame.depth_mm is not None and frame.T_world_camera is not None  # noqa: PT018
+        depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
+        agreement, view = compare_with_frame(mesh, frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
         if number % every != every // 2:
-            fused.append(agreement)
+            fused[frame.index] = agreement
             continue
-        held_out.append(agreement)
+        held_out[frame.index] = agreement
         views = sorted([*views, (agreement.coverage, frame, view)], key=lambda seen: seen[0])[:_WORST]
     if not held_out:
         raise InputError(f"the run {run} has too few tracked frames to keep every {every}th out of fusion")

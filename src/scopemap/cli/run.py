@@ -150,7 +150,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         f"camera: {facts['camera']['source']}",
         f"size: {facts['camera']['size']}",
         f"depth: {facts['estimators']['depth']}; scale: {facts['estimators']['anchor']}",
-        f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces",
+        f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
         f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s",
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
@@ -158,3 +158,13 @@ def summary_lines(result: Reconstruction) -> list[str]:
     if len(result.lost) > 5:
         lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]
+
+
+def _surface(figures: dict[str, float]) -> str:
+    """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
+    if "depth_error" not in figures:
+        return ""
+    return (
+        f"; covers {figures['coverage_mean']:.0%} of what the frames see (least {figures['coverage_least']:.0%}), "
+        f"depth {figures['depth_error']:.1%} off theirs"
+    )
