@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drawn_inputs
 import numpy as np
 import pytest
 from sample_trajectories import write_c3vd
@@ -108,6 +109,14 @@ def test_a_phantoms_seed_is_moved(tmp_path: Path) -> None:
     assert tube.phantom is not None
     spec = spec_of(tube.phantom, 3)
     assert (spec.seed, spec.scene, spec.frames, len(spec.events)) == (7, "tube", 5, 1)
+
+
+def test_a_pattern_that_fits_two_levels_names_a_clip_once(tmp_path: Path) -> None:
+    drawn_inputs.write_c3vd(tmp_path / "C3VD" / "cecum_t1_a", count=2)
+    plan = read_plan(written(tmp_path))
+    anything = plan.sequence[0].model_copy(update={"path": "*", "dataset": "c3vd", "name": ""})
+    found, _ = found_sequences(plan.model_copy(update={"sequence": (anything,)}), tmp_path)
+    assert [sequence.name for sequence in found] == ["cecum_t1_a"]
 
 
 def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path) -> None:

@@ -151,7 +151,10 @@ def test_a_reference_is_in_mm_and_counts_from_1(tmp_path: Path) -> None:
     assert "scale unknown" in unscaled.source
 
 
-@pytest.mark.parametrize("text", ["a,b\n1,2\n", "sequence,scale_to_target\nSeq_001_a,big\n"])
+HEAD = "sequence,scale_to_target\nSeq_001_a,"
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", f"{HEAD}big\n", f"{HEAD}nan\n", f"{HEAD}-1\n", f"{HEAD}0\n"])
 def test_scales_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     folder = write_reference(tmp_path, path_of(5))
     (tmp_path / "scales.csv").write_text(text)

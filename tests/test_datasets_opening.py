@@ -195,3 +195,12 @@ def test_a_source_is_opened_whatever_its_camera(text: str, tmp_path: Path) -> No
     mine = tmp_path / "mine.txt"
     mine.write_text("60 60 67 53")
     assert open_sequence(tmp_path, camera=mine).calibrated
+
+
+def test_images_below_one_of_several_folders_are_not_taken_for_the_only_ones(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "frames")
+    write_pictures(tmp_path / "masks")
+    write_pictures(tmp_path / "frames" / "thumbs")
+    for name in (None, "images"):
+        with pytest.raises(InputError, match="no image"):
+            open_source(tmp_path, dataset=name)

@@ -110,3 +110,5 @@ def test_a_run_whose_video_is_gone_and_no_truth_are_refused(run_folder: Path, tm
     neither = CliRunner().invoke(app, ["evaluate", str(run_folder)])
     assert neither.exit_code == 2
     assert "--against-video" in neither.output
+    more = CliRunner().invoke(app, ["evaluate", str(run_folder), "--against-video", "--depth", "median"])
+    assert more.exit_code == 2

@@ -64,6 +64,8 @@ def test_an_archive_in_any_order_is_read_by_number(tmp_path: Path) -> None:
     found = find(tmp_path)
     assert [found.read(n) for n in range(9)] == list(files.values())
     assert found.numbers() == list(range(9))
+    # Read in its own order, an archive is decompressed once.
+    assert find(tmp_path).stored() == order
 
 
 def test_going_back_reads_the_same(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_properties(trajectory: Trajectory) -> None:
 
 def test_run_folder_gives_back_indices_and_lost_frames(tmp_path: Path, trajectory: Trajectory) -> None:
     write_run(tmp_path, trajectory)
-    found = read_trajectory(tmp_path)
+    found = read_trajectory(str(tmp_path))
     np.testing.assert_array_equal(found.indices, trajectory.indices)
     np.testing.assert_array_equal(found.status, trajectory.status)
     np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-7)

@@ -221,9 +221,10 @@ def _matches(sequence: SequencePlan, data: Path) -> dict[str, Path]:
     for path in _recognised(data, recognises, levels + _NESTING):
         parts = PurePosixPath(_usual_spelling(path.relative_to(data).as_posix())).parts
         # The frames may be in a folder within the one that the pattern names.
-        for name in ("/".join(parts[-levels:]), "/".join(parts[-levels - 1 : -1])):
-            if PurePosixPath(name).match(wanted):
-                found.setdefault(name, path)
+        names = ("/".join(parts[-levels:]), "/".join(parts[-levels - 1 : -1]))
+        name = next((name for name in names if PurePosixPath(name).match(wanted)), None)
+        if name is not None and path not in found.values():
+            found.setdefault(name, path)
     return found
 
 

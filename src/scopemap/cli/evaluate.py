@@ -95,18 +95,18 @@ def evaluate(
     from scopemap.trajectory.formats.opening import read_trajectory
 
     form: OutputForm = "json" if as_json else "csv" if as_csv else "line" if quiet else "table"
-    own = _against_video(trajectory) if against_video else {}
     if truth is None:
-        if not against_video:
-            raise typer.BadParameter("give the true poses, or --against-video", param_hint="--truth")
-        show(own, form)
+        if not against_video or depth or consistency or protocol or icp or paper_units:
+            raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
+        show(_against_video(trajectory), form)
         return
+    own = _against_video(trajectory) if against_video else {}
     estimate = read_trajectory(trajectory, unit=unit, kind=kind)
     reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:
         if not (depth or consistency):
             raise InputError(f"{truth} has no true poses; if it has depth: --depth median compares that alone")
-        show(depth_groups(trajectory, truth, depth, consistency=consistency), form)
+        show(depth_groups(trajectory, truth, depth, consistency=consistency) | own, form)
         return
     matched = match(estimate, reference, align, first=align_first)
     figures: dict[str, Any] = pose_report(matched) | _surface(trajectory, truth, matched, icp=icp)

@@ -186,10 +186,11 @@ def _recognised_below(path: Path, kinds: tuple[type[Source], ...]) -> Path | Non
     Images alone are found in a folder around them that holds nothing else, or in `images`. Raises `InputError` where
     there are several sequences of a data set.
     """
-    level = [path]
+    level, alone = [path], True
     for _ in range(_SEARCH_DEPTH):
-        sought = kinds if len(level) == 1 else [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
-        level = [folder for folder in level if _may_enter(folder)]
+        alone = alone and len(level) == 1
+        sought = kinds if alone else [kind for kind in kinds if kind not in (VideoFile, ImageFolder)]
+        level = [folder for folder in level[:_MOST_FOLDERS] if _may_enter(folder)]
         found = [folder for folder in level if any(kind.recognises(folder) for kind in sought)]
         if len(found) > 1:
             names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))

@@ -130,8 +130,8 @@ def stereo_ini_fields(text: str) -> Fields | None:
     parser = configparser.ConfigParser(interpolation=None)
     try:
         parser.read_string(text)
-    except configparser.Error as error:
+        left = parser[_STEREO_LEFT]
+    except (configparser.Error, KeyError) as error:
         raise ValueError(str(error).partition("\n")[0]) from None
-    left = parser[_STEREO_LEFT]
     lens = [left[key] for i in range(8) if (key := f"kc_{i}") in left]
     return Fields([*left.items(), ("distortion_coefficients", lens)])

@@ -155,7 +155,9 @@ class RosBag(Source):
         # Frames are read ahead in a thread of their own; one reader of depth stays open for all others.
         with self._lock:
             self._depth_reader = self._depth_reader or self._open_readers.enter_context(self._opened())
-            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1))
+            message = next(self._messages(self._depth_reader, [topic], bag_ns, bag_ns + 1), None)
+        if message is None:
+            raise InputError(f"reading {self.path}: depth recorded at {bag_ns} ns in {topic} is not found again")
         try:
             return depth_of(message.content)
         except InputError as error:

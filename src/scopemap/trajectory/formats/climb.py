@@ -63,7 +63,10 @@ def _scale_mm(sequence: Path) -> float | None:
         return None
     with reporting(f"reading {file}: every row needs sequence and scale_to_target"):
         scales = {row["sequence"].strip(): float(row["scale_to_target"]) for row in csv.DictReader(text_lines(file))}
-        return scales.get(sequence.name)
+        scale = scales.get(sequence.name)
+        if scale is not None and not 0 < scale < np.inf:
+            raise ValueError(f"the scale of {sequence.name} is {scale}")
+        return scale
 
 
 def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:

@@ -39,6 +39,10 @@ class FolderFiles:
         """Return all numbers, ascending."""
         return list(self._files)
 
+    def stored(self) -> list[int]:
+        """Return all numbers in the order in which reading all of them is fast."""
+        return self.numbers()
+
 
 class ArchiveFiles:
     """Numbered files of the tar archive `path`. Reading raises `InputError` where it is damaged or breaks off."""
@@ -69,10 +73,14 @@ class ArchiveFiles:
 
     def numbers(self) -> list[int]:
         """Return all numbers, ascending; the archive is read to its end for it."""
+        return sorted(self.stored())
+
+    def stored(self) -> list[int]:
+        """Return all numbers in the order of the archive: in another one it is decompressed again and again."""
         with self._lock, self._reporting():
             while not self._complete:
                 self._advance()
-            return sorted(self._found)
+            return list(self._found)
 
     def _advance(self) -> None:
         self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115

@@ -36,7 +36,7 @@ KINDS = ("auto", *READERS)
 _COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, 16: text.read_c3vd}
 
 
-def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory:
+def read_trajectory(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory:
     """Read a trajectory of any format, recognised by its content; its `source` states what was assumed.
 
     The kinds, their conventions and units are listed in docs/formats.md, "Trajectories". `unit` is that of a file that
@@ -45,6 +45,7 @@ def read_trajectory(path: Path, *, unit: Unit = "mm", kind: str = "auto") -> Tra
     """
     if kind not in KINDS:
         raise SettingsError(f"unknown kind of trajectory '{kind}'; known are {', '.join(KINDS)}")
+    path = Path(path)
     # Path.exists raises for names that no file system allows.
     if not os.path.exists(path):
         raise InputError(f"cannot read a trajectory: no file or folder {path}")

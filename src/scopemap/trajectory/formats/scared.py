@@ -58,7 +58,8 @@ def find_frame_data(path: Path) -> NumberedFiles | None:
 
 def read_frame_data(files: NumberedFiles) -> list[FrameData]:
     """Return the content of all files, ascending; one that cannot be used is not an error but has a `fault`."""
-    return [_parsed(f"{files.path}, {_PREFIX}{n:06d}.json", n, files.read(n) or b"") for n in files.numbers()]
+    found = [_parsed(f"{files.path}, {_PREFIX}{n:06d}.json", n, files.read(n) or b"") for n in files.stored()]
+    return sorted(found, key=lambda frame: frame.index)
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
