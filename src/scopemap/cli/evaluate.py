@@ -81,7 +81,7 @@ def evaluate(
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
 ) -> None:
-    """Compare a trajectory with the truth.
+    """Compare a trajectory with the truth, or a run's surface with its own video.
 
     Frames are matched by number where both sides have one (line of the pose file, index in frames.csv, whole numbers
     as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s.
