@@ -31,7 +31,7 @@ OPTIONS = {
     "models verify": "--json --quiet",
 }
 JSON_KEYS = ["input", "dataset", "frames", "tracked", "skipped", "camera", "estimators", "notes"]
-JSON_KEYS += ["warnings", "seconds", "versions", "machine", "out", "preset", "mesh_faces"]
+JSON_KEYS += ["warnings", "seconds", "versions", "machine", "surface", "out", "preset", "mesh_faces"]
 
 
 @dataclass(frozen=True)
