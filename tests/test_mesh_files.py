@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from scopemap.fusion.mesh import save_mesh
+from scopemap.fusion.mesh_files import save_mesh
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def test_glb_is_metres_y_up_with_linear_colours(tmp_path: Path, ball: trimesh.Tr
     assert read.volume == pytest.approx(ball.volume * 1e-9, rel=1e-3)
     upper = np.asarray(read.visual.vertex_attributes["color"])[expected[:, 1] > -0.009]
     # sRGB 128 is 0.2158 of full light.
-    assert np.allclose(upper[:, :3], (55, 55, 0), atol=1)
+    assert np.allclose(upper[:, :3] / 65535, (0.2158, 0.2158, 0), atol=1e-3)
 
 
 def test_glb_is_matt_and_seen_from_both_sides(tmp_path: Path, ball: trimesh.Trimesh) -> None:
@@ -50,6 +52,51 @@ def test_glb_is_matt_and_seen_from_both_sides(tmp_path: Path, ball: trimesh.Trim
     (read,) = trimesh.load(file, process=False).geometry.values()
     assert read.visual.material.doubleSided is True
     assert read.visual.material.metallicFactor == 0.0
+
+
+def _glb_tree(file: Path) -> tuple[dict, bytes]:
+    content = file.read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[20 : 20 + length]), content[28 + length :]
+
+
+def test_dark_shades_survive_the_glb(tmp_path: Path, ball: trimesh.Trimesh) -> None:
+    levels = np.arange(256)[np.arange(len(ball.vertices)) % 256].astype(np.uint8)
+    ball.visual.vertex_colors = np.repeat(levels[:, None], 3, axis=1)
+    save_mesh(ball, glb_file=tmp_path / "mesh.glb")
+    tree, buffer = _glb_tree(tmp_path / "mesh.glb")
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert sorted(primitive["attributes"]) == ["COLOR_0", "NORMAL", "POSITION"]
+    accessor = tree["accessors"][primitive["attributes"]["COLOR_0"]]
+    # 5123: 16 bits without sign; normalized: 65535 is full light.
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
+    start = tree["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+    linear = np.frombuffer(buffer, np.uint16, 4 * accessor["count"], start).reshape(-1, 4) / 65535
+    assert (linear[:, 3] == 1).all()
+    back = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert (np.round(255 * back[:, 0]) == levels).all()
+
+
+def test_both_files_have_normals_that_point_outwards(tmp_path: Path, ball: trimesh.Trimesh) -> None:
+    ply, glb = tmp_path / "mesh.ply", tmp_path / "mesh.glb"
+    save_mesh(ball, ply, glb)
+    assert b"property float nx" in ply.read_bytes()[:600]
+    outwards = (ball.vertices - [5.0, 10.0, 70.0]) / 20.0
+    read = trimesh.load(ply, process=False)
+    assert "vertex_normals" in read._cache
+    np.testing.assert_allclose(read.vertex_normals, outwards, atol=0.01)
+    (read,) = trimesh.load(glb, process=False).geometry.values()
+    assert "vertex_normals" in read._cache
+    np.testing.assert_allclose(read.vertex_normals, outwards * [1, -1, -1], atol=0.01)
+
+
+def test_ply_holds_the_confidence(tmp_path: Path, ball: trimesh.Trimesh) -> None:
+    confidence = np.linspace(0, 1, len(ball.vertices), dtype=np.float32)
+    ball.vertex_attributes["confidence"] = confidence
+    save_mesh(ball, tmp_path / "mesh.ply", tmp_path / "mesh.glb")
+    read = trimesh.load(tmp_path / "mesh.ply", process=False)
+    # trimesh keeps properties that it has no use for here.
+    assert (read.metadata["_ply_raw"]["vertex"]["data"]["confidence"] == confidence).all()
 
 
 def test_empty_mesh_gives_an_empty_ply_and_no_glb(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.fusion.mesh import save_mesh
+from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step

@@ -1,4 +1,4 @@
-"""The mesh: marching cubes on the distance field, chunk by chunk, welded, without floaters; PLY and GLB files.
+"""The mesh: marching cubes on the distance field, chunk by chunk, welded, without floaters.
 
 A chunk is 64^3 cells, so it needs one sample more on each side, which it shares with its neighbour; a vertex is on a
 grid edge, and the edge's address welds the chunks exactly.
@@ -7,8 +7,6 @@ grid edge, and the edge's address welds the chunks exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -27,8 +25,6 @@ _SMALLEST_DISTANCE_VOXELS = 1e-3
 # a surface. Without the limit, walls of the truncation's depth would grow behind every fold's silhouette.
 _LARGEST_SPREAD_VOXELS = 3.5
 _UNSEEN_GREY = 128.0
-# glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
-T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 
 
 @dataclass(frozen=True)
@@ -120,44 +116,3 @@ def _without_floaters(
     large = sizes >= min(min_share * len(faces), sizes.max())
     used, renumbered = np.unique(faces[large[component]], return_inverse=True)
     return vertices[used], renumbered.reshape(-1, 3), colours[used]
-
-
-def save_mesh(mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None) -> list[Path]:
-    """Write a mesh with vertex colours, world mm, as binary PLY and as GLB; return the files written.
-
-    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward), so a y-up viewer shows it upside
-    down. The GLB is glTF's: metres, y up, thus 0.001 of the trajectory's unit with y and z negated; matt and visible
-    from both sides, because a lumen is seen from inside and outside; linear colours (glTF 2.0, section 3.7.2.1).
-    A mesh without faces gives no GLB.
-    """
-    written: list[Path] = []
-    if ply_file is not None:
-        Path(ply_file).write_bytes(trimesh.exchange.ply.export_ply(mesh, encoding="binary"))
-        written.append(Path(ply_file))
-    if glb_file is not None and len(mesh.faces):
-        Path(glb_file).write_bytes(_glb(mesh))
-        written.append(Path(glb_file))
-    return written
-
-
-def _glb(mesh: trimesh.Trimesh) -> bytes:
-    visual = mesh.visual
-    if not isinstance(visual, trimesh.visual.ColorVisuals):
-        raise ValueError("writing a GLB: the mesh has a texture; give it vertex colours")
-    srgb = np.asarray(visual.vertex_colors)[:, :3] / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    rotated = trimesh.Trimesh(
-        mesh.vertices @ T_GLTF_WORLD[:3, :3].T,
-        mesh.faces,
-        vertex_colors=np.round(255 * linear).astype(np.uint8),
-        process=False,
-    )
-    return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), tree_postprocessor=_matt)
-
-
-def _matt(tree: dict[str, Any]) -> None:
-    """Give all meshes of a glTF tree a matt material seen from both sides; without one viewers show metal."""
-    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0

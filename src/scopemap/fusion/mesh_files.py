@@ -1,0 +1,72 @@
+"""Mesh files: PLY and GLB, with normals, colours and the confidence of each vertex."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+# glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
+T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
+# trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
+_WRITTEN_COLOURS, _COLOURS = "_COLOR_0", "COLOR_0"
+
+
+def save_mesh(mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None) -> list[Path]:
+    """Write a mesh with vertex colours, world mm, as binary PLY and as GLB; return the files written.
+
+    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward), so a y-up viewer shows it upside
+    down; vertex attributes such as `confidence` are properties there. The GLB is glTF's: metres, y up, thus 0.001 of
+    the trajectory's unit with y and z negated; matt and visible from both sides, because a lumen is seen from inside
+    and outside; linear colours of 16 bits (glTF 2.0, section 3.7.2.1), because 8 bits would hold dark sRGB levels 0 to
+    12 in two steps. Both have vertex normals. A mesh without faces gives no GLB.
+    """
+    written: list[Path] = []
+    if ply_file is not None:
+        content = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=bool(len(mesh.faces)))
+        Path(ply_file).write_bytes(content)
+        written.append(Path(ply_file))
+    if glb_file is not None and len(mesh.faces):
+        Path(glb_file).write_bytes(_glb(mesh))
+        written.append(Path(glb_file))
+    return written
+
+
+def _glb(mesh: trimesh.Trimesh) -> bytes:
+    visual = mesh.visual
+    if not isinstance(visual, trimesh.visual.ColorVisuals):
+        raise ValueError("writing a GLB: the mesh has a texture; give it vertex colours")
+    R = T_GLTF_WORLD[:3, :3]
+    rotated = trimesh.Trimesh(
+        mesh.vertices @ R.T,
+        mesh.faces,
+        vertex_normals=mesh.vertex_normals @ np.sign(R),
+        vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(np.asarray(visual.vertex_colors)[:, :3])},
+        process=False,
+    )
+    return trimesh.exchange.gltf.export_glb(
+        trimesh.Scene(rotated), include_normals=True, tree_postprocessor=_with_colours_and_material
+    )
+
+
+def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:
+    """Return (V, 4) uint16 linear colours, opaque, 65535 = 1, of (V, 3) uint8 sRGB colours (IEC 61966-2-1)."""
+    level = np.arange(256) / 255.0
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    rgba = np.full((len(srgb), 4), 65535, np.uint16)
+    rgba[:, :3] = np.round(65535 * linear).astype(np.uint16)[srgb]
+    return rgba
+
+
+def _with_colours_and_material(tree: dict[str, Any]) -> None:
+    """Turn the attribute of all meshes of a glTF tree into colours; give them a matt material seen from both sides.
+
+    Without a material viewers show metal.
+    """
+    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
+    for primitive in (primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]):
+        primitive["material"] = 0
+        primitive["attributes"][_COLOURS] = primitive["attributes"].pop(_WRITTEN_COLOURS)
+        tree["accessors"][primitive["attributes"][_COLOURS]]["normalized"] = True
