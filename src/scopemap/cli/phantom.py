@@ -26,7 +26,8 @@ def phantom(
     loop: Annotated[bool, typer.Option("--loop", help="end in exactly the first pose")] = False,
     events: Annotated[str, typer.Option(help="bad segments: black:A-B,blur:A-B,smoke:A-B (inclusive)")] = "",
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, gloss, ...")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, shutter, h264_crf, ..."),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,

@@ -52,9 +52,9 @@ class Breathing:
     waves: np.ndarray
     period_frames: float
 
-    def at(self, index: int) -> Displacement:
-        """Return the displacement of frame `index`."""
-        strength = 0.5 - 0.5 * np.cos(2 * np.pi * index / self.period_frames)
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        strength = 0.5 - 0.5 * np.cos(2 * np.pi * time / self.period_frames)
         return Displacement(self.waves * [1, 1, 1, strength, strength, strength, 1])
 
 

@@ -10,6 +10,7 @@ from scopemap.errors import InputError
 from scopemap.phantom.camera_path import lumen_path, sweep_path
 from scopemap.phantom.cavity import Tint, laparoscopy_volume
 from scopemap.phantom.deformation import Breathing, breathing
+from scopemap.phantom.exposing import exposure_times, lagging_gains, pose_at
 from scopemap.phantom.lumen import colon_volume, tube_volume
 from scopemap.phantom.march import SurfaceBuffers, march
 from scopemap.phantom.shading import develop, disturb, exposure_for, shade, vignette
@@ -20,6 +21,8 @@ from scopemap.trajectory.formats.text import read_poses
 
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
+# Exposure is measured in a small picture, as cameras do.
+_METERING_SHARE = 8
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Phantom:
     ----------
     volume, appearance : shape and appearance of the tissue at rest. breath : how it moves.
     poses : (N, 4, 4) float64, camera to world, mm.
-    exposure : gain of every frame; None: each frame has its own.
+    exposure : gain of every frame, or of each (N,); None: each frame has its own.
     """
 
     spec: PhantomSpec
@@ -38,7 +41,7 @@ class Phantom:
     appearance: Appearance
     poses: np.ndarray
     breath: Breathing
-    exposure: float | None
+    exposure: float | np.ndarray | None
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
@@ -50,7 +53,18 @@ def prepare(spec: PhantomSpec) -> Phantom:
     volume, appearance = build_scene(spec, poses)
     breath = breathing(spec.breath_mm if spec.deform else 0.0, spec.breath_frames, spec.seed)
     phantom = Phantom(spec, volume, appearance, poses, breath, None)
-    return phantom if spec.auto_exposure else replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
+    if not spec.auto_exposure:
+        return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
+    return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
+
+
+def _lagging_exposure(phantom: Phantom) -> np.ndarray:
+    """Gain of each frame (N,), which follows what the frame needs with the lag of `phantom.spec`."""
+    spec = phantom.spec
+    width, height = (max(size // _METERING_SHARE, 16) for size in (spec.width, spec.height))
+    small = replace(phantom, spec=replace(spec, width=width, height=height, shutter=0.0))
+    wanted = np.array([exposure_for(light(small, index)[0]) for index in range(len(phantom.poses))])
+    return lagging_gains(wanted, spec.exposure_lag_frames)
 
 
 def camera_path(spec: PhantomSpec) -> np.ndarray:
@@ -81,19 +95,35 @@ def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearanc
 
 
 def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return linear light (H, W, 3) float32 of a frame before exposure, and the surface that it came from."""
+    """Return linear light (H, W, 3) float32 of a frame before exposure, and the surface at the frame's own pose.
+
+    Light is the mean over the time during which the shutter is open.
+    """
+    spec = phantom.spec
+    radiance, surface = _light_at(phantom, float(index))
+    if spec.shutter > 0:
+        times = exposure_times(index, spec.shutter, phantom.poses, surface, spec.camera)
+        if len(times) > 1:
+            radiance = np.stack([_light_at(phantom, time)[0] for time in times]).mean(0, dtype=np.float32)
+    return radiance, surface
+
+
+def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Linear light at a moment, in frames, and the surface that it came from."""
     camera, look = phantom.spec.camera, phantom.appearance
-    surface = march(phantom.volume, camera, phantom.poses[index], phantom.breath.at(index))
+    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.breath.at(time))
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
-    return shade(surface, albedo, ripple, look.film(rest), camera) * vignette(camera), surface
+    radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
+    return radiance * vignette(camera), surface
 
 
 def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return frame `index` as sRGB (H, W, 3) uint8 and the surface that it shows, with its true depth."""
+    """Return frame `index` as sRGB (H, W, 3) uint8, before video coding, and the surface that it shows."""
     spec = phantom.spec
     linear, surface = light(phantom, index)
     gain = exposure_for(linear) if phantom.exposure is None else phantom.exposure
+    gain = gain if isinstance(gain, float) else gain[index]
     rng = np.random.default_rng((spec.seed, 4, index))
     kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
     return develop(disturb(linear * np.float32(gain), kinds, rng), spec.noise, rng), surface

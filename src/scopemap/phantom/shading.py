@@ -26,16 +26,25 @@ _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
 
 
 def shade(
-    surface: SurfaceBuffers, albedo: np.ndarray, ripple: np.ndarray, film: np.ndarray, camera: PinholeCamera
+    surface: SurfaceBuffers,
+    albedo: np.ndarray,
+    ripple: np.ndarray,
+    film: np.ndarray,
+    camera: PinholeCamera,
+    indirect: float = 0.0,
 ) -> np.ndarray:
     """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen.
 
     `albedo` (H, W, 3) linear RGB, `ripple` (H, W, 3) tilt of the fluid film, `film` (H, W) strength of reflection.
+    `indirect` : share of the lamp's light that reaches every point alike after scattering in the cavity.
     """
     towards = -camera.rays / np.linalg.norm(camera.rays, axis=-1, keepdims=True)
     light = 1.0 / surface.distance_mm[..., None] ** 2
     cosine = np.clip((surface.normal * towards).sum(-1, keepdims=True), 0, 1)
-    radiance = albedo * cosine * light
+    irradiance = cosine * light
+    if indirect > 0 and np.isfinite(irradiance).any():
+        irradiance = irradiance + indirect * np.nanmean(irradiance)
+    radiance = albedo * irradiance
     if film.any():
         wet = surface.normal + _FILM_TILT * ripple
         wet /= np.linalg.norm(wet, axis=-1, keepdims=True)

@@ -48,6 +48,10 @@ class PhantomSpec:
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo.
     gloss : strength of the wet highlights, 1 = as in the clinic, 0 = none.
     auto_exposure : whether every frame has its own exposure; False: all that of the first.
+    exposure_lag_frames : time constant with which automatic exposure follows the scene, 0: at once.
+    shutter : share of the time between two frames during which light is gathered, 0: no motion blur.
+    indirect : light that the tissue scatters onto itself, share of the lamp's; it lights far walls too much.
+    h264_crf : rate factor of the video coding, 0 to 51, that frames go through (`coding.VideoCoding`); None: none.
     depth_scale_mm : mm per unit of the depth files; the default is C3VD's, 100 mm at most.
     fps : frames per second as written to `camera.yaml`.
     """
@@ -68,6 +72,10 @@ class PhantomSpec:
     texture: float = 1.0
     gloss: float = 1.0
     auto_exposure: bool = False
+    exposure_lag_frames: float = 0.0
+    shutter: float = 0.0
+    indirect: float = 0.0
+    h264_crf: int | None = None
     depth_scale_mm: float = C3VD_DEPTH_SCALE_MM
     fps: float = 30.0
 
@@ -81,6 +89,11 @@ class PhantomSpec:
             "breath_mm must be between 0 and 4": 0 <= self.breath_mm <= 4,
             "breath_frames and fps must be positive": min(self.breath_frames, self.fps) > 0,
             "noise, texture and gloss must not be negative": min(self.noise, self.texture, self.gloss) >= 0,
+            "exposure_lag_frames must not be negative, and needs auto_exposure": self.exposure_lag_frames == 0
+            or (self.exposure_lag_frames > 0 and self.auto_exposure),
+            "shutter must be between 0 and 1": 0 <= self.shutter <= 1,
+            "indirect must be between 0 and 1": 0 <= self.indirect <= 1,
+            "h264_crf must be between 0 and 51": self.h264_crf is None or 0 <= self.h264_crf <= 51,
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
             "loop needs a generated path of at least 3 frames, not a path file": not self.loop
             or (self.path_file is None and (self.frames is None or self.frames >= 3)),

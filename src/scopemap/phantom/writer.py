@@ -19,6 +19,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from scopemap.errors import InputError
+from scopemap.phantom.coding import VideoCoding
 from scopemap.phantom.render import Phantom, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.volume import Volume
@@ -72,9 +73,11 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
         np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
         _write_camera(spec, folder / "camera.yaml")
         seen = np.zeros(phantom.volume.coefficients.shape, bool)
+        coding = None if spec.h264_crf is None else VideoCoding(spec.h264_crf, spec.width, spec.height)
         for index in range(len(phantom.poses)):
             rgb, surface = render_frame(phantom, index)
             seen[phantom.volume.cells_of(surface.rest_mm)] = True
+            rgb = rgb if coding is None else coding(rgb)
             _write_image(folder / f"{index:04d}_color.png", rgb[..., ::-1])
             _write_image(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
             if progress is not None:
@@ -128,7 +131,7 @@ def _write_description(phantom: Phantom, file: Path) -> None:
         "made_by": f"scopemap {version('scopemap')}",
         "spec": spec,
         "frames": len(phantom.poses),
-        "exposure": phantom.exposure,
+        "exposure": None if phantom.exposure is None else np.asarray(phantom.exposure).tolist(),
         "voxel_mm": phantom.volume.voxel_mm,
     }
     file.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")

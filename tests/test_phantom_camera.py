@@ -1,0 +1,137 @@
+"""The phantom's camera: motion blur, exposure that lags, scattered light and video coding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scopemap.errors import SettingsError
+from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.phantom.coding import VideoCoding
+from scopemap.phantom.exposing import MAX_SAMPLES, exposure_times, lagging_gains, pose_at
+from scopemap.phantom.render import Phantom, light, prepare, render_frame
+from scopemap.phantom.spec import PhantomSpec
+from scopemap.phantom.writer import write_phantom
+
+SMALL = PhantomSpec(width=64, height=48, frames=6, seed=3, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def phantom() -> Phantom:
+    return prepare(SMALL)
+
+
+def turning(phantom: Phantom, step_rad: float) -> Phantom:
+    """The phantom with a camera that yaws by `step_rad` from frame to frame."""
+    start = phantom.poses[2]
+    poses = np.stack([start @ se3(so3_exp(np.array([0, n * step_rad, 0])), np.zeros(3)) for n in range(5)])
+    return replace(phantom, poses=poses)
+
+
+def test_poses_between_frames() -> None:
+    poses = np.stack([se3(np.eye(3), np.array([0.0, 0, n])) for n in range(3)])
+    assert pose_at(poses, 1.25)[2, 3] == pytest.approx(1.25)
+    np.testing.assert_array_equal(pose_at(poses, 2.0), poses[2])
+    np.testing.assert_array_equal(pose_at(poses, -0.5), poses[0])
+    np.testing.assert_array_equal(pose_at(poses, 2.4), poses[2])
+    np.testing.assert_array_equal(pose_at(poses[:1], 0.3), poses[0])
+
+
+def test_light_is_sampled_as_often_as_pixels_move(phantom: Phantom) -> None:
+    camera, (_, surface) = SMALL.camera, light(phantom, 2)
+    for step_px, expected in ((0.0, 1), (16.0, 4), (100.0, MAX_SAMPLES)):
+        moving = turning(phantom, step_px / camera.fx)
+        times = exposure_times(2, 0.5, moving.poses, surface, camera)
+        # Rotation moves the corners farther than the centre.
+        assert expected <= len(times) <= 2 * expected if step_px else times == [2]
+        assert np.mean(times) == pytest.approx(2.0)
+        assert np.ptp(times) < 0.5
+
+
+def test_motion_blurs_across_its_direction_alone_and_leaves_depth(phantom: Phantom) -> None:
+    moving = turning(phantom, 8.0 / SMALL.camera.fx)
+    sharp, surface = light(moving, 2)
+    blurred, same = light(replace(moving, spec=replace(SMALL, shutter=1.0)), 2)
+    np.testing.assert_array_equal(surface.depth_mm, same.depth_mm)
+    np.testing.assert_allclose(blurred.mean(), sharp.mean(), rtol=0.1)
+
+    def roughness(image: np.ndarray, axis: int) -> float:
+        return float(np.abs(np.diff(np.log(image[..., 1] + 1e-9), 2, axis)).mean())
+
+    assert roughness(blurred, 1) < 0.5 * roughness(sharp, 1)
+    assert roughness(blurred, 0) > 1.5 * roughness(blurred, 1)
+    still = turning(phantom, 0.0)
+    np.testing.assert_array_equal(light(replace(still, spec=replace(SMALL, shutter=1.0)), 2)[0], light(still, 2)[0])
+
+
+def test_gains_follow_late() -> None:
+    wanted = np.array([1.0, 4.0, 4.0, 4.0, 4.0])
+    np.testing.assert_allclose(lagging_gains(wanted, 0.0), wanted)
+    late = lagging_gains(wanted, 2.0)
+    np.testing.assert_allclose(np.log(late) / np.log(4), 1 - np.exp(-np.arange(5) / 2))
+
+
+def test_exposure_with_lag_is_between_fixed_and_immediate(phantom: Phantom) -> None:
+    closer = phantom.poses[[0, 0, 0]].copy()
+    closer[1:, :3, 3] += 12.0 * closer[0, :3, 2]
+    levels = {}
+    for name, changes in {
+        "fixed": {},
+        "late": {"auto_exposure": True, "exposure_lag_frames": 2.0},
+        "at once": {"auto_exposure": True},
+    }.items():
+        prepared = prepare(replace(SMALL, **changes))
+        moved = replace(phantom, spec=prepared.spec, poses=closer, exposure=prepared.exposure)
+        if name == "late":
+            wanted = np.array([np.percentile(light(moved, n)[0].max(-1), 80) for n in range(3)])
+            moved = replace(moved, exposure=0.48 * lagging_gains(1 / wanted, 2.0))
+            assert len(np.asarray(prepared.exposure)) == 6
+        levels[name] = render_frame(moved, 1)[0].mean()
+    assert levels["fixed"] > levels["late"] + 3 > levels["at once"] + 6
+
+
+def test_scattered_light_reaches_the_far_wall(phantom: Phantom) -> None:
+    direct, surface = light(phantom, 0)
+    lit, _ = light(replace(phantom, spec=replace(SMALL, indirect=0.3)), 0)
+    gain = (lit / np.maximum(direct, 1e-9))[..., 0]
+    near, far = (np.nanpercentile(surface.distance_mm, p) for p in (10, 90))
+    assert np.median(gain[surface.distance_mm > far]) > 2 * np.median(gain[surface.distance_mm < near]) > 2
+
+
+def test_coding_is_coarser_with_a_larger_factor_and_repeatable(phantom: Phantom) -> None:
+    frames = [render_frame(phantom, n)[0][:47, :63] for n in range(4)]
+    errors = {}
+    for crf in (10, 40):
+        coding = VideoCoding(crf, 63, 47)
+        first = [coding(rgb) for rgb in frames]
+        again = VideoCoding(crf, 63, 47)
+        for one, rgb in zip(first, frames, strict=True):
+            assert one.shape == rgb.shape
+            np.testing.assert_array_equal(one, again(rgb))
+        errors[crf] = [np.abs(a.astype(int) - b).mean() for a, b in zip(first, frames, strict=True)]
+    assert max(errors[10]) < 6
+    assert np.mean(errors[40]) > 1.5 * np.mean(errors[10])
+
+
+def test_written_frames_are_coded(tmp_path: Path, phantom: Phantom) -> None:
+    spec = replace(SMALL, frames=2, h264_crf=35)
+    write_phantom(spec, tmp_path / "coded")
+    stored = cv2.imread(str(tmp_path / "coded" / "0001_color.png"))[..., ::-1]
+    plain = prepare(spec)
+    coding = VideoCoding(35, 64, 48)
+    expected = [coding(render_frame(plain, n)[0]) for n in range(2)]
+    np.testing.assert_array_equal(stored, expected[1])
+    assert np.abs(stored.astype(int) - render_frame(plain, 1)[0]).mean() > 1
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"shutter": 1.5}, {"indirect": -0.1}, {"h264_crf": 52}, {"exposure_lag_frames": 3.0}],
+)
+def test_impossible_cameras_are_refused(settings: dict) -> None:
+    with pytest.raises(SettingsError, match=next(iter(settings))):
+        PhantomSpec(**settings)
