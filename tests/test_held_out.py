@@ -5,21 +5,28 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import trimesh
 from tiny_phantom import with_true_depth, write_tiny
+from torchvision.models import alexnet
 from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
+from scopemap.benchmark.held_out import held_out_agreement
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli import app
 from scopemap.cli.run import summary_lines
-from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
+from scopemap.depth.perceptual import StructureDistance
+from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, compare_with_frame
+from scopemap.geometry.rendering import render_mesh
+from scopemap.io.weights import REGISTRY
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 BLACK = np.zeros((64, 80, 3), np.uint8)
@@ -84,7 +91,10 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(run_folder: Path) -> None:
+def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
     result = CliRunner().invoke(app, ["evaluate", str(run_folder), "--against-video", "--json"])
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)["against_video"]
@@ -93,10 +103,47 @@ def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(run_folder
     assert figures["held_out"]["coverage_mean"] > 0.75
     assert figures["held_out"]["depth_error"] < 0.02
     assert figures["held_out"]["ssim"] > 0.4
+    # Neighbouring frames see the same: their coloured points look alike, and no surface adds to that.
+    assert figures["nearest_frame"]["ssim"] > max(0.7, figures["held_out"]["ssim"])
+    assert figures["nearest_frame"]["coverage_mean"] > 0.8
+    assert figures["worst_frames"] == "5"
+    assert "lpips" not in figures["held_out"]
+    assert figures["lpips"] == f"left out: needs the weights alexnet or alexnet-features in {tmp_path}"
     rows = pd.read_csv(run_folder / "against_video" / "frames.csv")
     assert rows["index"].tolist() == list(range(12))
     assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]
+    assert "lpips" not in rows
     assert cv2.imread(str(run_folder / "against_video" / "worst.png")) is not None
+
+
+def test_lpips_is_measured_where_its_weights_are(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(3)
+    checkpoint = REGISTRY["alexnet"]
+    features = {name: tensor for name, tensor in alexnet().state_dict().items() if name.startswith("features.")}
+    torch.save(features, tmp_path / checkpoint.place)
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    monkeypatch.setitem(REGISTRY, "alexnet", replace(checkpoint, files={checkpoint.place: ""}))
+    agreement = held_out_agreement(run_folder)
+    agreement.save(tmp_path / "against_video")
+    figures = agreement.figures()
+    assert "lpips" not in figures
+    assert 0 < figures["nearest_frame"]["lpips"] < figures["held_out"]["lpips"]
+    rows = pd.read_csv(tmp_path / "against_video" / "frames.csv")
+    assert rows.loc[rows["fused"] == 1, "lpips"].mean() == pytest.approx(figures["fused"]["lpips"])
+
+
+def test_lpips_counts_pixels_with_known_depth_alone() -> None:
+    wall = _wall()
+    view = render_mesh(wall, CAMERA, np.eye(4))
+    depth_mm, other = _depth(), view.rgb.copy()
+    depth_mm[:, 40:] = np.nan
+    other[:, 40:] = 255
+    measure = StructureDistance()
+    assert compare_rendering(view, other, depth_mm, measure).lpips == pytest.approx(0, abs=1e-6)
+    assert compare_rendering(view, other, _depth(), measure).lpips > 0.1
+    assert math.isnan(compare_rendering(view, other, depth_mm * np.nan, measure).lpips)
 
 
 def test_a_run_whose_video_is_gone_and_no_truth_are_refused(run_folder: Path, tmp_path: Path) -> None:

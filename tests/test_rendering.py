@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.rendering import render_mesh
+from scopemap.geometry.rendering import render_mesh, render_points
 from scopemap.geometry.se3 import se3, so3_exp
 
 CAMERA = PinholeCamera(60.0, 62.0, 39.5, 31.5, 80, 64)
@@ -71,3 +71,32 @@ def test_a_texture_is_refused() -> None:
     ball.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(ball.vertices), 2)))
     with pytest.raises(ValueError, match="vertex colours"):
         render_mesh(ball, CAMERA, np.eye(4))
+
+
+def test_points_colour_the_pixels_that_their_squares_touch() -> None:
+    z = 20.0
+    pixels = np.array([[10.0, 12.0], [30.5, 20.0], [50.0, 40.25]])
+    points = CAMERA.unproject(pixels) * z
+    colours = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200]], np.uint8)
+    T_world_camera = se3(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([4.0, 5.0, 6.0]))
+    world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    seen = render_points(world, colours, CAMERA, T_world_camera)
+    covered = {(12, 10), (20, 30), (20, 31), (40, 50), (41, 50)}
+    # Rounding of the pose may touch a neighbour with an area of nothing.
+    assert covered <= set(map(tuple, np.argwhere(np.isfinite(seen.depth_mm)).tolist()))
+    for (row, column), colour in zip([(12, 10), (20, 31), (41, 50)], colours, strict=True):
+        np.testing.assert_array_equal(seen.rgb[row, column], colour)
+        assert seen.depth_mm[row, column] == pytest.approx(z)
+    assert np.isnan(seen.depth_mm[30, 30])
+
+
+def test_of_points_in_a_pixel_the_near_ones_are_seen_and_mixed() -> None:
+    rays = CAMERA.unproject(np.array([[20.0, 20.0]] * 4))
+    points = rays * np.array([[30.0], [30.3], [40.0], [-30.0]])
+    colours = np.array([[100, 100, 100], [110, 110, 110], [255, 0, 0], [0, 255, 0]], np.uint8)
+    seen = render_points(points, colours, CAMERA, np.eye(4))
+    assert seen.rgb[20, 20].tolist() == [105, 105, 105]
+    assert seen.depth_mm[20, 20] == pytest.approx(2 / (1 / 30 + 1 / 30.3), rel=1e-6)
+    nothing = render_points(points[3:], colours[3:], CAMERA, np.eye(4))
+    assert np.isnan(nothing.depth_mm).all()
+    assert not nothing.rgb.any()

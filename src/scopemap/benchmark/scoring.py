@@ -103,14 +103,23 @@ def surface_figures_of(
     `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
     """
     file = run / "mesh.ply"
-    true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
-    if true_surface is None or not file.is_file():
+    if not file.is_file():
         return {}
     try:
         mesh = trimesh.load_mesh(file, process=False)
-        moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"cannot read the mesh {file}: {error}") from error
+    return surface_figures(mesh, truth, similarity, icp=icp)
+
+
+def surface_figures(
+    mesh: trimesh.Trimesh, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
+) -> dict[str, float]:
+    """Return the figures of a mesh, world mm, against the true surface of a data set, as in `surface_figures_of`."""
+    true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
+    if true_surface is None:
+        return {}
+    moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
     camera = None
     if true_surface.T_view is not None:
         camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera

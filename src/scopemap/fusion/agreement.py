@@ -11,6 +11,7 @@ import trimesh
 from skimage.metrics import structural_similarity
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.depth.estimate import PerceptualDistance
 from scopemap.geometry.rendering import Rendering, render_mesh
 
 
@@ -23,11 +24,13 @@ class FrameAgreement:
     coverage : share, 0..1, of the pixels with known depth where the mesh is seen.
     depth_error : median of |ln(depth of the mesh / depth of the frame)| where both are known; NaN where nowhere.
     ssim : mean structural similarity of grey values over all pixels with known depth; holes are black.
+    lpips : mean perceptual distance over the same pixels, all others black in both pictures; NaN: not measured.
     """
 
     coverage: float
     depth_error: float
     ssim: float
+    lpips: float = float("nan")
 
 
 def compare_with_frame(
@@ -38,26 +41,37 @@ def compare_with_frame(
     T_world_camera : (4, 4). rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
     """
     rendering = render_mesh(mesh, camera, T_world_camera)
+    return compare_rendering(rendering, rgb, depth_mm), rendering
+
+
+def compare_rendering(
+    rendering: Rendering, rgb: np.ndarray, depth_mm: np.ndarray, perceptual: PerceptualDistance | None = None
+) -> FrameAgreement:
+    """Return the agreement of a rendering with a frame, as in `compare_with_frame`; lpips by `perceptual`, if given."""
     known = depth_mm > 0
     seen = known & np.isfinite(rendering.depth_mm)
     error = np.abs(np.log(rendering.depth_mm[seen] / depth_mm[seen]))
     grey, shown = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (rgb, rendering.rgb))
     _, similarity = structural_similarity(grey, shown, full=True)
-    agreement = FrameAgreement(
+    lpips = float("nan")
+    if perceptual is not None and known.any():
+        frame, view = (np.where(known[..., None], image, np.uint8(0)) for image in (rgb, rendering.rgb))
+        lpips = float(perceptual.compare(frame, view).map[known].mean())
+    return FrameAgreement(
         float(seen.sum() / max(known.sum(), 1)),
         float(np.median(error)) if error.size else float("nan"),
         float(similarity[known].mean()) if known.any() else float("nan"),
+        lpips,
     )
-    return agreement, rendering
 
 
 def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
-    """Return the number of frames, mean and least coverage, median depth error and mean SSIM.
+    """Return the number of frames, mean and least coverage, median depth error, mean SSIM and LPIPS.
 
     A figure that no frame has is absent.
     """
-    rows = [(a.coverage, a.depth_error, a.ssim) for a in agreements]
-    coverage, depth_error, ssim = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 3).T)
+    rows = [(a.coverage, a.depth_error, a.ssim, a.lpips) for a in agreements]
+    coverage, depth_error, ssim, lpips = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 4).T)
     figures: dict[str, float] = {"frames": len(rows)}
     if coverage.size:
         figures |= {"coverage_mean": float(coverage.mean()), "coverage_least": float(coverage.min())}
@@ -65,4 +79,6 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
         figures["depth_error"] = float(np.median(depth_error))
     if ssim.size:
         figures["ssim"] = float(ssim.mean())
+    if lpips.size:
+        figures["lpips"] = float(lpips.mean())
     return figures

@@ -1,4 +1,4 @@
-"""Renders a mesh into a camera: depth and vertex colours by rasterisation with a z-buffer, without a display."""
+"""Renders meshes and coloured points into a camera: depth and colours with a z-buffer, without a display."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import trimesh
 from numba import njit
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.se3 import inverse
+from scopemap.geometry.se3 import inverse, transform
 
 _NEAR_MM = 1e-3
 # Pixels on the edge of two triangles belong to both; rounding must not open a gap between them.
 _EDGE = -1e-9
+# Of the points that fall on a pixel, those farther than the nearest by more than this share are hidden.
+_SAME_SURFACE = 1.05
 
 
 class Rendering(NamedTuple):
@@ -43,6 +45,37 @@ def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
     _rasterise(corners, colours, np.asarray(mesh.faces), inverse_depth, rgb)
     depth_mm = np.divide(1, inverse_depth, out=np.full_like(inverse_depth, np.nan), where=inverse_depth > 0)
+    return Rendering(depth_mm, np.round(rgb).astype(np.uint8))
+
+
+def render_points(
+    points_mm: np.ndarray, colours: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray
+) -> Rendering:
+    """Return the view of points (N, 3), world mm, in their colours (N, 3) uint8, as squares a pixel wide.
+
+    A point colours the four pixels that its square touches, each by the area covered; hidden points do not count.
+    """
+    points = transform(inverse(T_world_camera), points_mm)
+    ahead = points[:, 2] > _NEAR_MM
+    points, colours = points[ahead], colours[ahead]
+    pixels = camera.project(points)
+    first = np.floor(pixels)
+    column = (first[:, :1] + [0, 1, 0, 1]).ravel()
+    row = (first[:, 1:] + [0, 0, 1, 1]).ravel()
+    area = np.prod(1 - np.abs(np.stack([column, row], -1) - np.repeat(pixels, 4, axis=0)), axis=-1)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (area > 0)
+    place = (row[inside] * camera.width + column[inside]).astype(np.int64)
+    z, area, of_point = np.repeat(points[:, 2], 4)[inside], area[inside], np.repeat(np.arange(len(points)), 4)[inside]
+    nearest = np.full(camera.height * camera.width, np.inf)
+    np.minimum.at(nearest, place, z)
+    front = z <= _SAME_SURFACE * nearest[place]
+    place, area, of_point, z = place[front], area[front], of_point[front], z[front]
+    layers = [np.bincount(place, area * values, len(nearest)) for values in (1 / z, *colours[of_point].T.astype(float))]
+    covered = np.bincount(place, area, len(nearest))
+    shape = (camera.height, camera.width)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth_mm = (covered / layers[0]).reshape(shape).astype(np.float32)
+        rgb = np.nan_to_num(np.stack(layers[1:], -1) / covered[:, None]).reshape(*shape, 3)
     return Rendering(depth_mm, np.round(rgb).astype(np.uint8))
 
 
