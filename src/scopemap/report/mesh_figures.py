@@ -1,4 +1,4 @@
-"""Figures of meshes and camera paths, without a display and without OpenGL: triangles painted from far to near.
+"""Figures of meshes and camera paths, without a display and without OpenGL.
 
 Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508.11282).
 """
@@ -16,6 +16,7 @@ import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
+from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR, new_figure
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _SIDE_PX = 480
 _SUBPIXEL_BITS = 4
 _AMBIENT = 0.35
+_UNPAINTED = 190
 _MARGIN_PX = 15
 
 
@@ -77,7 +79,7 @@ def draw_mesh(
     views |= outside_views(framed, T_world_view)
     meshes = {"": mesh} | ({} if reference_mesh is None else {"truth, ": reference_mesh})
     rows = [
-        {prefix + title: render_mesh(drawn, view) for title, view in views.items()} for prefix, drawn in meshes.items()
+        {prefix + title: mesh_picture(drawn, view) for title, view in views.items()} for prefix, drawn in meshes.items()
     ]
     _picture_grid(rows, 4.0, 4.6).savefig(file)
 
@@ -100,7 +102,7 @@ def draw_reconstruction(
     everywhere = np.concatenate([positions for _, positions in paths.values()])
     views = {} if T_world_view is None else {"from behind the start": view_from_behind(T_world_view, everywhere)}
     views |= outside_views(mesh, T_world_view, everywhere)
-    pictures = {title: render_mesh(mesh, view) for title, view in views.items()}
+    pictures = {title: mesh_picture(mesh, view) for title, view in views.items()}
     for title, view in views.items():
         for name, (colour, positions) in paths.items():
             draw_path(pictures[title], view, positions, colour, thickness_px=widths_px[name])
@@ -124,7 +126,9 @@ def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], 
         radius = float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
         for row, yaw_rad in zip(rows, (0.0, 0.8), strict=True):
             view = _view_of(np.eye(3), centre, radius, yaw_rad, 0.0)
-            row[f"{method}\n{where}"] = _cropped(render_points(points, colours, view))
+            row[f"{method}\n{where}"] = _cropped(
+                _on_white(render_points(points, colours, view.camera, view.T_world_camera))
+            )
     _picture_grid(rows, 3.6, 4.0).savefig(file)
 
 
@@ -192,34 +196,28 @@ def _view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: fl
     return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
 
 
-def render_points(points_mm: np.ndarray, colours: np.ndarray, view: MeshView) -> np.ndarray:
-    """Return the (H, W, 3) uint8 picture of points (N, 3), world mm, in their colours (N, 3), 2 px wide, on white."""
-    camera = view.camera
-    picture = np.full((camera.height, camera.width, 3), 255, np.uint8)
-    points, pixels = view.project(points_mm)
-    order = np.argsort(-points[:, 2], kind="stable")
-    # From far to near: of the points in a pixel the last one stays.
-    u, v = (np.rint(pixels[order])[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(-1, 2).astype(int).T
-    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & np.repeat(points[order, 2] > 0, 4)
-    picture[v[shown], u[shown]] = np.repeat(colours[order], 4, axis=0)[shown]
-    return picture
+def mesh_picture(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
+    """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white, with smooth edges.
 
-
-def render_mesh(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
-    """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
-
-    Both sides of a triangle are drawn; triangles partly behind the camera are left out.
+    Both sides of a triangle are drawn; triangles partly behind the camera are left out. A mesh without vertex colours
+    is grey.
     """
-    camera = view.camera
-    picture = np.full((camera.height, camera.width, 3), 255, np.uint8)
-    corners, pixels = view.project(np.asarray(mesh.vertices)[mesh.faces])
-    inside = (pixels.max(1) > -1).all(1) & (pixels.min(1) < [camera.width, camera.height]).all(1)
-    drawn = np.flatnonzero(inside & (corners[..., 2] > 0).all(1))
-    drawn = drawn[np.argsort(-corners[drawn, :, 2].mean(1), kind="stable")]
-    colours = np.round(_shades(corners[drawn]) * _face_colours(mesh)[drawn])
-    for outline, colour in zip(_fixed_point(pixels[drawn]), colours.tolist(), strict=True):
-        cv2.fillConvexPoly(picture, outline, colour, cv2.LINE_8, _SUBPIXEL_BITS)
-    return picture
+    visual, camera, colours = mesh.visual, view.camera, np.full((len(mesh.vertices), 3), _UNPAINTED)
+    if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+        colours = np.asarray(visual.vertex_colors)[:, :3]
+    rays = np.asarray(mesh.vertices) - view.T_world_camera[:3, 3]
+    lengths = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+    cosine = np.abs((np.asarray(mesh.vertex_normals) * rays).sum(1)) / lengths
+    shaded = np.round((_AMBIENT + (1 - _AMBIENT) * cosine)[:, None] * colours).astype(np.uint8)
+    lit = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=shaded, process=False)
+    # Half a pixel's sampling: the mesh's triangles are often smaller than a pixel.
+    fine = camera.resized(2 * camera.width, 2 * camera.height)
+    picture = _on_white(render_mesh(lit, fine, view.T_world_camera))
+    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def _on_white(rendering: Rendering) -> np.ndarray:
+    return np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(255), rendering.rgb)
 
 
 def draw_path(
@@ -244,23 +242,6 @@ def draw_path(
 def _fixed_point(pixels: np.ndarray) -> np.ndarray:
     """Return pixels in OpenCV's fixed point, limited so that they do not overflow."""
     return np.round(np.clip(pixels, -1e6, 1e6) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-
-
-def _shades(corners: np.ndarray) -> np.ndarray:
-    """(F, 1) brightness 0..1 of triangles (F, 3, 3) in the camera: ambient plus the cosine to the lamp."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    rays = corners.mean(1)
-    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(rays, axis=1)
-    cosine = np.abs((normals * rays).sum(1)) / np.maximum(lengths, 1e-12)
-    return (_AMBIENT + (1 - _AMBIENT) * cosine)[:, None]
-
-
-def _face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(F, 3) mean vertex colours; grey where the mesh has none."""
-    visual = mesh.visual
-    if not isinstance(visual, trimesh.visual.ColorVisuals) or visual.kind != "vertex":
-        return np.full((len(mesh.faces), 3), 190.0)
-    return np.asarray(visual.vertex_colors, dtype=np.float64)[mesh.faces, :3].mean(1)
 
 
 def _cropped(picture: np.ndarray) -> np.ndarray:
