@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +20,12 @@ from torchvision.models import alexnet
 from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
-from scopemap.benchmark.held_out import held_out_agreement
+from scopemap.benchmark.held_out import RunFrames, held_out_agreement
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli import app
 from scopemap.cli.run import summary_lines
 from scopemap.depth.perceptual import StructureDistance
+from scopemap.evaluation.surface import distances_mm
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, compare_with_frame
 from scopemap.geometry.rendering import render_mesh
 from scopemap.io.weights import REGISTRY
@@ -114,6 +116,16 @@ def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]
     assert "lpips" not in rows
     assert cv2.imread(str(run_folder / "against_video" / "worst.png")) is not None
+
+
+def test_the_frames_of_a_run_give_its_surface_again(run_folder: Path) -> None:
+    own = trimesh.load_mesh(run_folder / "mesh.ply", process=False)
+    with closing(RunFrames(run_folder)) as frames:
+        assert frames.indices == list(range(12))
+        again, fewer = frames.fuse(), frames.fuse(without=range(6))
+    assert len(again.faces) == pytest.approx(len(own.faces), rel=0.01)
+    assert distances_mm(np.asarray(own.vertices), again).mean() < 0.02
+    assert fewer.area < again.area
 
 
 def test_lpips_is_measured_where_its_weights_are(

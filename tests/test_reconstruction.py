@@ -19,7 +19,7 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.pipeline import Step
-from scopemap.reconstruction import DEPTH_SCALE_MM, DepthWriter, FrameRecord, prepare_folder
+from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, FrameRecord, prepare_folder
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason keyframe residual inlier_share correlation overlap iterations depth_scale"
@@ -56,6 +56,7 @@ def test_contents(run: _Run) -> None:
         "camera.yaml",
         "config.toml",
         "depth",
+        "depth_sigma",
         "frames.csv",
         "mesh.glb",
         "mesh.ply",
@@ -193,6 +194,26 @@ def test_depth_writer_at_the_ends_of_its_range(run: _Run, tmp_path: Path) -> Non
     image = cv2.imread(str(tmp_path / "depth" / "1234567.png"), cv2.IMREAD_UNCHANGED)
     assert image[0, :6].tolist() == [1, 1, 65534, 0, 0, 0]
     assert not image[1:].any()
+
+
+def test_the_deviation_of_depth_is_read_back_to_two_hundredths(run: _Run, tmp_path: Path) -> None:
+    step = run.steps[0]
+    depth_mm = np.full(step.refined.depth_mm.shape, 80.0, np.float32)
+    sigma_mm = np.full(depth_mm.shape, np.nan, np.float32)
+    sigma_mm[0, :6] = [0.08, 0.5, 4.0, 8.0, 30.0, 140.0]
+    sigma_mm[1, :2] = [0.0, np.inf]
+    depth_mm[2], sigma_mm[2] = np.nan, 1.0
+    frame = replace(step.frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm)
+    DepthWriter(tmp_path)(frame)
+    DepthWriter(tmp_path)(replace(frame, index=7, depth_sigma_mm=None))
+    back = DepthReader(tmp_path).read_sigma(frame.index)
+    assert back is not None
+    np.testing.assert_allclose(back[0, :6], sigma_mm[0, :6], rtol=0.02)
+    np.testing.assert_allclose(back[1, :2] / 80, [0.001, 0.001 * 1.03**254], rtol=1e-4)
+    assert np.isnan(back[0, 6:]).all()
+    assert np.isnan(back[1:, 2:]).all()
+    assert DepthReader(tmp_path).read_sigma(7) is None
+    assert DepthReader(tmp_path).read(7) is not None
 
 
 def test_prepare_makes_a_folder_and_takes_an_empty_one(tmp_path: Path) -> None:

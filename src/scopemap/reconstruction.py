@@ -1,7 +1,8 @@
 """The result of a run, and the folder it is written to.
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
-      depth/000000.png (16 bit, depth/depth.json has the scale)  maps/1 (the same for submaps that are not merged), ...
+      depth/000000.png (16 bit, depth/depth.json has the scale)  depth_sigma/000000.png (8 bit, relative)
+      maps/1 (the same for submaps that are not merged), ...
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import trimesh
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.frame_choice import SkippedFrame
@@ -35,6 +36,8 @@ DEPTH_SCALE_MM = 0.01
 """The finest unit of depth/*.png; the largest depth is then 655 mm."""
 
 _LARGEST_UNIT = 65534
+# Standard deviations in 8 bits: shares of depth from 0.1 % to 180 % in steps of 3 %; 0 = unknown.
+_LEAST_SIGMA, _SIGMA_STEP = 0.001, 1.03
 _COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
@@ -44,7 +47,7 @@ _OWN_FILES = (
     *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
     *("config.toml", "provenance.json"),
 )
-_OWN_FOLDERS = ("depth", "pictures", "maps", "against_video")
+_OWN_FOLDERS = ("depth", "depth_sigma", "pictures", "maps", "against_video")
 # Files by which a run's folder is recognised: the first is written last, the second first.
 _MARKS = ("provenance.json", "depth/depth.json")
 
@@ -192,12 +195,14 @@ class Reconstruction:
 class DepthWriter:
     """Writes the depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
 
+    Beside it the standard deviation of frames that have one, as 8-bit PNG: 0.001 * 1.03^(v - 1) of the depth.
+
     largest_mm : depth that must be representable; it makes the unit coarser than `DEPTH_SCALE_MM` where necessary.
     Raises `InputError` where nothing can be written.
     """
 
     def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
-        self._folder = Path(folder) / "depth"
+        self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))
         self._scale_mm = _unit_for(largest_mm)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -207,16 +212,27 @@ class DepthWriter:
             raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
 
     def __call__(self, frame: Frame) -> None:
-        """Write the depth of a frame."""
-        units = np.nan_to_num(np.asarray(frame.depth_mm) / self._scale_mm, nan=0.0)
+        """Write the depth of a frame, and its standard deviation where it has one."""
+        depth_mm = np.asarray(frame.depth_mm)
+        units = np.nan_to_num(depth_mm / self._scale_mm, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
-        file = self._folder / f"{frame.index:06d}.png"
-        try:
-            written = cv2.imwrite(str(file), image)
-        except cv2.error:
-            written = False
-        if not written:
-            raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
+        _write_png(self._folder / f"{frame.index:06d}.png", image)
+        if frame.depth_sigma_mm is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                code = 1 + np.log(frame.depth_sigma_mm / depth_mm / _LEAST_SIGMA) / np.log(_SIGMA_STEP)
+            levels = np.where(np.isnan(code), 0, np.clip(np.round(code), 1, 255)).astype(np.uint8)
+            with reporting(f"cannot write to {self._sigma_folder}"):
+                self._sigma_folder.mkdir(exist_ok=True)
+            _write_png(self._sigma_folder / f"{frame.index:06d}.png", levels)
+
+
+def _write_png(file: Path, image: np.ndarray) -> None:
+    try:
+        written = cv2.imwrite(str(file), image)
+    except cv2.error:
+        written = False
+    if not written:
+        raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
 
 
 class DepthReader:
@@ -226,7 +242,7 @@ class DepthReader:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = Path(folder) / "depth"
+        self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))
         description = self._folder / "depth.json"
         self.present = description.is_file()
         """Whether the run kept its depth."""
@@ -237,11 +253,22 @@ class DepthReader:
 
     def read(self, index: int) -> np.ndarray | None:
         """Return depth (H, W) float32, mm, NaN = unknown, of the frame with this number; None where none was kept."""
-        file = self._folder / f"{index:06d}.png"
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
+        image = _read_png(self._folder / f"{index:06d}.png")
         if image is None:
             return None
         return np.where(image > 0, image * np.float32(self._scale_mm), np.float32(np.nan))
+
+    def read_sigma(self, index: int) -> np.ndarray | None:
+        """Return the standard deviation of `read`, to 1.5 %, in the same form; None where none was kept."""
+        depth_mm, levels = self.read(index), _read_png(self._sigma_folder / f"{index:06d}.png")
+        if depth_mm is None or levels is None:
+            return None
+        share = _LEAST_SIGMA * _SIGMA_STEP ** (levels.astype(np.float32) - 1)
+        return np.where(levels > 0, share * depth_mm, np.float32(np.nan)).astype(np.float32)
+
+
+def _read_png(file: Path) -> np.ndarray | None:
+    return cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
 
 
 def _unit_for(largest_mm: float) -> float:

@@ -1,7 +1,6 @@
 """Measures a run's surface against its own video: frames kept out of fusion are compared with the mesh of the others.
 
-The run's frames are fused again with its settings, poses and depth, but for every n-th one. What the run does not keep
-is made again (masks) or left out (the standard deviation of depth, so that all pixels of a frame weigh alike).
+The run's frames are fused again with its settings, poses and depth, but for every n-th one; masks are made again.
 """
 
 from __future__ import annotations
@@ -188,4 +187,5 @@ def _frames(run: Path, config: Config) -> Iterator[Frame]:
     for frame in sequence.frames():
         masked = mask(frame)
         if frame.index in pose_of and (depth_mm := depth.read(frame.index)) is not None:
-            yield replace(masked, depth_mm=depth_mm, T_world_camera=pose_of[frame.index])
+            sigma_mm, pose = depth.read_sigma(frame.index), pose_of[frame.index]
+            yield replace(masked, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, T_world_camera=pose)
