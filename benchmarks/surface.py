@@ -4,8 +4,8 @@
     python benchmarks/surface.py --data FOLDER --runs FOLDER ...
 
 FOLDER is the real data's (README, "Tests on real data"); phantoms that are not in theirs are rendered. `--runs` holds
-earlier runs by the clips' names: their poses and depth are fused again with today's default settings. LPIPS needs its
-weights (SCOPEMAP_WEIGHTS_DIR).
+earlier runs by the clips' names: their poses and depth are fused again with today's default settings. Runs use networks
+that need no download, whatever weights there are; LPIPS, which only measures, needs its own (SCOPEMAP_WEIGHTS_DIR).
 
 First table, without truth: agreement of the surface with frames kept out of fusion and with those fused, depth as the
 median of |ln ratio|, SSIM and LPIPS with, in brackets, what the coloured points of the nearest fused frame reach.
@@ -60,6 +60,7 @@ TRUTH_HEAD = (
     "| clip | ATE mm | keyframes' depth, AbsRel | mesh to truth mm, mean | truth to mesh mm, mean (median) |\n"
     "|---|---|---|---|---|"
 )
+NO_DOWNLOAD = ("depth.backend=scopenet", "networks.flow=dis", "networks.perceptual=structure")
 _CLIPPED_MM = 99.9
 
 
@@ -93,7 +94,7 @@ def measure(name: str, source: Path, options: argparse.Namespace, out: Path) -> 
         run, fusion = options.runs / name, Config.load(settings=dict(one.split("=", 1) for one in options.set)).fusion
     else:
         run, fusion = out / name, None
-        changes = [word for one in options.set for word in ("--set", one)]
+        changes = [word for one in (*NO_DOWNLOAD, *options.set) for word in ("--set", one)]
         scopemap("run", str(source), "--out", str(run), "--overwrite", "--quiet", *changes)
     with closing(RunFrames(run, fusion)) as frames:
         started = time.perf_counter()
