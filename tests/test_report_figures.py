@@ -19,6 +19,7 @@ from scopemap.report.mesh_figures import (
     draw_mesh,
     draw_path,
     draw_reconstruction,
+    draw_surface,
     draw_trajectories,
     inside_view,
     mesh_picture,
@@ -259,3 +260,23 @@ def test_a_reconstruction_of_nothing_is_white(tmp_path: Path) -> None:
     lost = np.full((4, 3), NAN)
     draw_reconstruction(trimesh.Trimesh(), lost, lost, tmp_path / "nothing.png", np.eye(4))
     assert (read(tmp_path / "nothing.png") > 250).mean() > 0.95
+
+
+def test_a_surface_is_drawn_beside_its_frame(tmp_path: Path) -> None:
+    view = inside_view(np.eye(4))
+    rgb = np.full((view.camera.height, view.camera.width, 3), (250, 0, 250), np.uint8)
+    frame, path = (rgb, view.camera, np.eye(4)), np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
+    confidence = (BALL.vertices[:, 0] > 0).astype(np.float32)
+    draw_surface(frame, BALL, path, tmp_path / "bare.png")
+    draw_surface(frame, BALL, path, tmp_path / "certain.png", confidence)
+    draw_surface(frame, BALL, path, tmp_path / "certain.jpg", confidence)
+    bare, certain = read(tmp_path / "bare.png"), read(tmp_path / "certain.png")
+    assert certain.shape[1] == bare.shape[1] * 4 // 3
+    for picture in (bare, certain):
+        assert count_colour(picture, "#fa00fa") > 300 * 300
+        assert count_colour(picture, "#7878dc") > 1000
+        assert count_colour(picture, ESTIMATE_COLOUR) > 50
+    yellow = (certain[..., 0] > 180) & (certain[..., 2] < 120)
+    assert yellow.sum() > 500
+    assert not ((bare[..., 0] > 180) & (bare[..., 2] < 120)).any()
+    assert (tmp_path / "certain.jpg").stat().st_size < 200_000

@@ -27,6 +27,7 @@ _SIDE_PX = 480
 _SUBPIXEL_BITS = 4
 _AMBIENT = 0.35
 _UNPAINTED = 190
+_JPEG_QUALITY = 88
 _MARGIN_PX = 15
 
 
@@ -112,6 +113,34 @@ def draw_reconstruction(
     title = "dot: start" if reference_positions_mm is not None else "dot: start; no true poses are known"
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title=title)
     figure.savefig(file)
+
+
+def draw_surface(
+    frame: tuple[np.ndarray, PinholeCamera, np.ndarray],
+    mesh: trimesh.Trimesh,
+    positions_mm: np.ndarray,
+    file: Path,
+    confidence: np.ndarray | None = None,
+) -> None:
+    """Draw a mesh beside one of its frames as a PNG or JPEG: the frame, the mesh from there, and from outside.
+
+    frame : picture (H, W, 3) uint8, camera, pose (4, 4), world mm. positions_mm : (N, 3) of the camera, drawn outside.
+    confidence : (V,) 0..1 of the vertices; drawn from the frame's pose, too, blue (0) to yellow (1), where it is given.
+    """
+    rgb, camera, T_world_camera = frame
+    view, outside = MeshView(T_world_camera, camera), outside_views(mesh, T_world_camera, positions_mm)["from outside"]
+    pictures = {"frame": rgb, "surface": _on_white(render_mesh(mesh, camera, T_world_camera))}
+    if confidence is not None:
+        from matplotlib import colormaps
+
+        colours = colormaps["cividis"](np.clip(confidence, 0, 1), bytes=True)[:, :3]
+        certain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+        pictures["confidence, 0 blue to 1 yellow"] = mesh_picture(certain, view)
+    pictures["from outside"] = mesh_picture(mesh, outside)
+    draw_path(pictures["from outside"], outside, positions_mm, ESTIMATE_COLOUR)
+    pictures["from outside"] = _cropped(pictures["from outside"])
+    quality = {"quality": _JPEG_QUALITY} if file.suffix in (".jpg", ".jpeg") else None
+    _picture_grid([pictures], 4.0, 4.0 * camera.height / camera.width + 0.3).savefig(file, pil_kwargs=quality)
 
 
 def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
