@@ -1,7 +1,7 @@
 """How whole, true and alike to its video is the surface of a run, by default settings, on real clips and phantoms?
 
     python benchmarks/surface.py --data FOLDER [--phantoms FOLDER] [--out FOLDER] [--set NAME=VALUE] [--only NAME ...]
-    python benchmarks/surface.py --data FOLDER --runs FOLDER ...
+    python benchmarks/surface.py --data FOLDER --runs FOLDER ... [--unseen]
 
 FOLDER is the real data's (README, "Tests on real data"); phantoms that are not in theirs are rendered. `--runs` holds
 earlier runs by the clips' names: their poses and depth are fused again with today's default settings. Runs use networks
@@ -52,6 +52,15 @@ from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 
 PHANTOM_NAMES = dict(zip(("colon", "laparoscopy", "tube", "breathe"), PHANTOMS, strict=True))
+UNSEEN = {
+    "colon-21": ("--scene", "colon", "--frames", "150", "--seed", "21"),
+    "colon-22": ("--scene", "colon", "--frames", "150", "--seed", "22", "--path", "c3vd_camera_paths/c4v2.txt"),
+    "laparoscopy-23": ("--scene", "laparoscopy", "--frames", "120", "--seed", "23"),
+    "laparoscopy-24": ("--scene", "laparoscopy", "--frames", "120", "--seed", "24", "--set", "fov_deg=65"),
+    "breathe-25": ("--scene", "colon", "--frames", "150", "--seed", "25", "--deform"),
+    "laparoscopy-breathe-26": ("--scene", "laparoscopy", "--frames", "150", "--seed", "26", "--deform"),
+}
+"""Phantoms that took part in no choice; camera paths are below the data's folder "endoscopy"."""
 AGREEMENT_HEAD = (
     "| clip | kept out: covered mean, least | depth | SSIM (points) | LPIPS (points) | fused: covered mean, least "
     "| depth | SSIM | LPIPS | fuse, refine ms per frame |\n|---|---|---|---|---|---|---|---|---|---|"
@@ -86,6 +95,9 @@ def clips(data: Path, phantoms: Path) -> Iterator[tuple[str, Path, tuple[str, ..
         yield Path(place).stem, endoscopy / place, ()
     for name, phantom in PHANTOM_NAMES.items():
         yield name, phantoms / name, PHANTOMS[phantom]
+    for name, arguments in UNSEEN.items():
+        words = (str(endoscopy / word) if word.endswith(".txt") else word for word in arguments)
+        yield name, phantoms / name, tuple(words)
 
 
 def measure(name: str, source: Path, options: argparse.Namespace, out: Path) -> Measured:
@@ -207,13 +219,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keep runs here")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the runs")
     parser.add_argument("--only", nargs="+", help="names of clips")
+    parser.add_argument("--unseen", action="store_true", help="also the phantoms that took part in no choice")
     options = parser.parse_args()
     truths: list[Any] = []
     with tempfile.TemporaryDirectory() as scratch:
         out = options.out or Path(scratch)
         print(AGREEMENT_HEAD, flush=True)
         for name, source, phantom in clips(options.data, options.phantoms or out / "phantoms"):
-            if options.only and name not in options.only:
+            if name not in (options.only or [name]) or (name in UNSEEN and not (options.unseen or options.only)):
                 continue
             if phantom and not (source / "mesh_truth.ply").is_file():
                 scopemap("phantom", str(source), *phantom, "--quiet")
