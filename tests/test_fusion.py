@@ -229,7 +229,7 @@ def test_colours_come_from_the_pixels() -> None:
     plane = plane_frame(np.array([0.0, 0.0, 1.0]), 40.0)
     picture = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
     picture[:, :80], picture[:, 80:] = (200, 20, 40), (10, 90, 250)
-    volume = TsdfVolume(LENIENT)
+    volume = TsdfVolume(LENIENT.model_copy(update={"colours": "raw"}))
     for _ in range(2):
         volume.integrate(frame_of(VIEW, T, plane.depth_mm, picture))
     mesh = volume.extract_mesh()

@@ -155,7 +155,8 @@ class _Run:
         for frame in (corrected_frame(frame, submap.correction) for frame in stored):
             if frame.T_world_camera is not None and frame.depth_mm is not None:
                 depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
-                found, _ = compare_with_frame(fused.mesh, frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+                seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+                found, _ = compare_with_frame(fused.mesh, *seen, albedo=fused.settings.colours == "albedo")
                 agreements.append(found)
         return agreement_figures(agreements) if agreements else {}
 

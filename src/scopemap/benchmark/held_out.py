@@ -21,7 +21,7 @@ from scopemap.config import Config, FusionSettings
 from scopemap.depth.perceptual import CHECKPOINTS, create_perceptual
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering
+from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
@@ -124,6 +124,8 @@ class RunFrames:
         views: list[tuple[float, Frame, Rendering]] = []
         for frame in self._store.frames():
             view, depth_mm = render_mesh(mesh, frame.camera, _pose(frame)), _usable_depth(frame)
+            if self._fusion.colours == "albedo":
+                view = lit_like(view, frame.camera, frame.rgb, depth_mm)
             agreement = compare_rendering(view, frame.rgb, depth_mm, perceptual)
             if frame.index not in held_out:
                 found.fused[frame.index] = agreement

@@ -84,6 +84,10 @@ def run(
         str | None,
         typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small with its weights, else dis."),
     ] = None,
+    colours: Annotated[
+        Literal["albedo", "raw"] | None,
+        typer.Option(help="Of the mesh: the tissue's, without the lamp's fall-off, or the video's own."),
+    ] = None,
     frames: Frames = None,
     fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
     size: Annotated[
@@ -108,6 +112,7 @@ def run(
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
         "networks.flow": flow,
         "networks.device": device,
+        "fusion.colours": colours,
     }
     chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)

@@ -80,4 +80,9 @@ class FusionSettings(Settings):
         None, gt=0, description="depth beyond this is not fused, mm; default: 200 voxels"
     )
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
+    colours: Literal["albedo", "raw"] = Field(
+        "albedo",
+        description="colours of the mesh; albedo: the tissue's, without the lamp's fall-off, in one exposure for all "
+        "frames; raw: the video's",
+    )
     advanced: FusionAdvanced = FusionAdvanced()

@@ -12,6 +12,7 @@ from skimage.metrics import structural_similarity
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.estimate import PerceptualDistance
+from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
 
 
@@ -34,14 +35,36 @@ class FrameAgreement:
 
 
 def compare_with_frame(
-    mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np.ndarray, rgb: np.ndarray, depth_mm: np.ndarray
+    mesh: trimesh.Trimesh,
+    camera: PinholeCamera,
+    T_world_camera: np.ndarray,
+    rgb: np.ndarray,
+    depth_mm: np.ndarray,
+    *,
+    albedo: bool = False,
 ) -> tuple[FrameAgreement, Rendering]:
     """Return the agreement of a mesh, world mm, vertex colours, with a frame, and the rendering of the mesh there.
 
     T_world_camera : (4, 4). rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
+    albedo : whether the vertex colours are those of the tissue: see `lit_like`.
     """
     rendering = render_mesh(mesh, camera, T_world_camera)
+    if albedo:
+        rendering = lit_like(rendering, camera, rgb, depth_mm)
     return compare_rendering(rendering, rgb, depth_mm), rendering
+
+
+def lit_like(rendering: Rendering, camera: PinholeCamera, rgb: np.ndarray, depth_mm: np.ndarray) -> Rendering:
+    """Return the rendering of a mesh in the colours of the tissue as the lamp shows it, exposed as a frame is.
+
+    The light is that of fusion (`fusion/albedo.py`) at the mesh's own distance. One number is fitted to the frame's
+    grey levels, its gain. rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
+    """
+    lit = lit_by_lamp(rendering.rgb, rendering.depth_mm, camera)
+    seen = (depth_mm > 0) & np.isfinite(rendering.depth_mm)
+    shown, wanted = (cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY)[seen] for image in (lit, rgb))
+    gain = float(shown @ wanted / max(float(shown @ shown), 1.0))
+    return rendering._replace(rgb=np.clip(np.round(gain * lit), 0, 255).astype(np.uint8))
 
 
 def compare_rendering(

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from scopemap.config.mapping import FusionAdvanced
+from scopemap.fusion.albedo import displayed
 from scopemap.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
 
 _CHUNK_BLOCKS = 8
@@ -37,18 +38,23 @@ class _Chunk:
     faces: np.ndarray
 
 
-def extract_mesh(blocks: VoxelBlocks, settings: FusionAdvanced, voxel_mm: float) -> trimesh.Trimesh:
+def extract_mesh(
+    blocks: VoxelBlocks, settings: FusionAdvanced, voxel_mm: float, median_level: float | None = None
+) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 
     Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole, and so does the
     space that a fold hides behind its silhouette. Components with
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
+
+    median_level : median grey level, 0..255, that the colours are scaled to; None: they stay as they are.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
     chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
     mesh = _weld([chunk for chunk in chunks if chunk is not None])
     vertices, faces, colours = _without_floaters(*mesh, settings.min_component_share)
-    return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=np.round(colours).astype(np.uint8), process=False)
+    shown = np.round(displayed(colours, median_level)).astype(np.uint8)
+    return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=shown, process=False)
 
 
 def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min_weight: float) -> _Chunk | None:

@@ -204,7 +204,7 @@ def _integrate_block(
     slot: int,
     corner: np.ndarray,
     surface: MeasuredSurface,
-    rgb: np.ndarray,
+    picture: np.ndarray,
     camera: TsdfCamera,
     grid: Grid,
 ) -> None:
@@ -240,8 +240,9 @@ def _integrate_block(
                 tsdf[slot, i, j, k] += (distance - tsdf[slot, i, j, k]) * weight / total
                 weights[slot, i, j, k] = total
                 if abs(distance) <= _COLOUR_BAND_VOXELS * grid.voxel_mm:
+                    weight *= picture[row, col, 3]
                     for channel in range(3):
-                        colour[slot, i, j, k, channel] += weight * rgb[row, col, channel]
+                        colour[slot, i, j, k, channel] += weight * picture[row, col, channel]
                     colour[slot, i, j, k, 3] += weight
 
 
@@ -251,11 +252,13 @@ def integrate_blocks(
     slots: np.ndarray,
     corners: np.ndarray,
     surface: MeasuredSurface,
-    rgb: np.ndarray,
+    picture: np.ndarray,
     camera: TsdfCamera,
     grid: Grid,
 ) -> None:
     """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
+
+    picture : (H, W, 4) float32, r g b and the weight of each pixel's colour beside that of the surface.
 
     The distance of a voxel is the one to the tangent plane of the surface that its pixel sees. Voxels farther behind
     the surface than the truncation, measured along the optical axis, stay unchanged; towards there
@@ -263,7 +266,7 @@ def integrate_blocks(
     its front. Changes `voxels`.
     """
     for n in prange(len(slots)):
-        _integrate_block(voxels, slots[n], corners[n], surface, rgb, camera, grid)
+        _integrate_block(voxels, slots[n], corners[n], surface, picture, camera, grid)
 
 
 class VoxelBlocks:
@@ -295,6 +298,11 @@ class VoxelBlocks:
             spare = _zeros(max(capacity // 2, len(index) + 1 - capacity))
             self.voxels = Voxels(*(np.concatenate(pair) for pair in zip(self.voxels, spare, strict=True)))
         return slots
+
+    def find(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return the (N,) int64 slots of the blocks at (N, 3) int64 block coordinates; 0 where there is no block."""
+        keys = np.asarray(pack.py_func(*coordinates.T))
+        return np.array([self._slots.get(key, 0) for key in keys.tolist()], dtype=np.int64)
 
     def dense(self, corner: np.ndarray, blocks: int) -> Voxels:
         """Return the cube of `blocks`^3 blocks from block coordinate `corner` (3,) on as dense arrays (8 blocks, ...).

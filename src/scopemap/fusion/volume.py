@@ -12,6 +12,7 @@ import trimesh
 
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
+from scopemap.fusion.albedo import AlbedoPainter
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.mesh import extract_mesh
 from scopemap.fusion.tsdf import (
@@ -84,6 +85,7 @@ class TsdfVolume:
         self.settings = settings
         self.parameters = parameters or choose_parameters(settings)
         self._blocks = VoxelBlocks()
+        self._painter = AlbedoPainter() if settings.colours == "albedo" else None
 
     @property
     def block_count(self) -> int:
@@ -114,13 +116,18 @@ class TsdfVolume:
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
         weight = surface.weight * np.minimum(trust, np.float32(1.0))
         surface = surface._replace(weight=weight if advanced.weighted else (weight > 0).astype(np.float32))
+        if self._painter is not None:
+            picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
+        else:
+            picture = np.dstack([frame.rgb, np.ones(depth_mm.shape)]).astype(np.float32)
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
-        integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, frame.rgb, pinhole, grid)
+        integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
 
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
-        return extract_mesh(self._blocks, self.settings.advanced, self.parameters.voxel_mm)
+        median_level = None if self._painter is None else self._painter.median_level
+        return extract_mesh(self._blocks, self.settings.advanced, self.parameters.voxel_mm, median_level)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         for name in ("depth_mm", "T_world_camera"):
