@@ -88,6 +88,12 @@ def run(
         Literal["albedo", "raw"] | None,
         typer.Option(help="Of the mesh: the tissue's, without the lamp's fall-off, or the video's own."),
     ] = None,
+    mesh_faces: Annotated[
+        int | None, typer.Option(min=4, metavar="N", help="Simplify the mesh to about so many faces.")
+    ] = None,
+    mesh_smooth: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Smooth the mesh, so many iterations of Taubin's filter.")
+    ] = None,
     frames: Frames = None,
     fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
     size: Annotated[
@@ -113,6 +119,8 @@ def run(
         "networks.flow": flow,
         "networks.device": device,
         "fusion.colours": colours,
+        "fusion.mesh_faces": mesh_faces,
+        "fusion.mesh_smooth": mesh_smooth,
     }
     chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)

@@ -85,4 +85,13 @@ class FusionSettings(Settings):
         description="colours of the mesh; albedo: the tissue's, without the lamp's fall-off, in one exposure for all "
         "frames; raw: the video's",
     )
+    holes: Literal["small", "none"] = Field(
+        "small",
+        description="holes of the mesh that are closed; small: those within the surface with a border of up to 20 "
+        "voxels' edges, their new vertices with confidence 0; what no frame saw stays open",
+    )
+    mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
+    mesh_faces: int | None = Field(
+        None, ge=4, description="simplify the mesh to about so many faces; default: as fusion gives it"
+    )
     advanced: FusionAdvanced = FusionAdvanced()

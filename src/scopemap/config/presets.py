@@ -37,6 +37,7 @@ _PAPER: dict[str, Any] = {
     "fusion.truncation_mm": 5.0,
     "fusion.max_depth_mm": 100.0,
     "fusion.colours": "raw",
+    "fusion.holes": "none",
 }
 # What the text does not have and can be turned off (docs/method.md lists both): `paper` with these values.
 _BEYOND_PAPER: dict[str, Any] = {

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scopemap.geometry.rendering import vertex_colours
+
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
@@ -35,15 +37,12 @@ def save_mesh(mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Pat
 
 
 def _glb(mesh: trimesh.Trimesh) -> bytes:
-    visual = mesh.visual
-    if not isinstance(visual, trimesh.visual.ColorVisuals):
-        raise ValueError("writing a GLB: the mesh has a texture; give it vertex colours")
     R = T_GLTF_WORLD[:3, :3]
     rotated = trimesh.Trimesh(
         mesh.vertices @ R.T,
         mesh.faces,
         vertex_normals=mesh.vertex_normals @ np.sign(R),
-        vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(np.asarray(visual.vertex_colors)[:, :3])},
+        vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
         process=False,
     )
     return trimesh.exchange.gltf.export_glb(

@@ -25,6 +25,14 @@ class Rendering(NamedTuple):
     rgb: np.ndarray
 
 
+def vertex_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Return the vertex colours of a mesh, (V, 4) uint8. Raises `ValueError` for a mesh with a texture."""
+    visual = mesh.visual
+    if not isinstance(visual, trimesh.visual.ColorVisuals):
+        raise ValueError("the mesh has a texture; give it vertex colours")
+    return np.asarray(visual.vertex_colors)
+
+
 def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np.ndarray) -> Rendering:
     """Return the view of a mesh with vertex colours, world mm, from a pose; both sides of a face are seen.
 
@@ -37,10 +45,7 @@ def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np
     z = np.where(ahead, points[:, 2], 1.0)
     pixels = points[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     corners = np.column_stack([pixels, np.where(ahead, 1 / z, -1.0)])
-    visual = mesh.visual
-    if not isinstance(visual, trimesh.visual.ColorVisuals):
-        raise ValueError("rendering a mesh: it has a texture; give it vertex colours")
-    colours = np.asarray(visual.vertex_colors)[:, :3].astype(np.float32)
+    colours = vertex_colours(mesh)[:, :3].astype(np.float32)
     inverse_depth = np.zeros((camera.height, camera.width), np.float32)
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
     _rasterise(corners, colours, np.asarray(mesh.faces), inverse_depth, rgb)
