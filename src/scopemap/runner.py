@@ -29,7 +29,7 @@ from scopemap.fusion.agreement import agreement_figures, compare_with_frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
-from scopemap.mapping.submaps import Submap, corrected_frame
+from scopemap.mapping.submaps import FinalFrames, Submap
 from scopemap.pipeline import Estimators, Pipeline, PreprocessedFrame, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of
 from scopemap.tracking.track import FrameTracker
@@ -128,14 +128,16 @@ class _Run:
     def _fuse_submap(self, submap: Submap, notes: list[str]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
         sequence, pipeline = self.sequence, self.pipeline
-        stored = pipeline.fusion.store.frames(submap.frames)
-        frames = (self._write_depth(corrected_frame(frame, submap.correction)) for frame in stored)
+        store = pipeline.fusion.store
+        final = pipeline.mapper.final_frames(submap, store.poses(submap.frames), store.frame, sequence.camera)
+        checked: list[Frame] = []
+        frames = self._written(final, submap, checked)
         fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
-        agreement = self.clock.timed("check surface", self._surface_agreement, submap, fused)
+        agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
         correction = [] if submap.correction is None else [submap.correction.description]
-        provenance["notes"] += notes + correction + fused.notes
+        provenance["notes"] += notes + correction + final.notes + fused.notes
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
         provenance["warnings"] += _depth_warnings(self.median_depths_mm, fused.settings)
@@ -146,19 +148,13 @@ class _Run:
             sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
         )
 
-    def _surface_agreement(self, submap: Submap, fused: FusedSurface) -> dict[str, float]:
-        """Return the agreement of a submap's surface with some of its frames; {} without a surface or stored frames."""
-        tracked = [record.index for record in self.records if record.index in submap.frames]
-        some = tracked[:: -(-len(tracked) // _CHECKED_FRAMES)] if len(fused.mesh.faces) else []
-        stored = self.pipeline.fusion.store.frames(some)
-        agreements = []
-        for frame in (corrected_frame(frame, submap.correction) for frame in stored):
-            if frame.T_world_camera is not None and frame.depth_mm is not None:
-                depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
-                seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
-                found, _ = compare_with_frame(fused.mesh, *seen, albedo=fused.settings.colours == "albedo")
-                agreements.append(found)
-        return agreement_figures(agreements) if agreements else {}
+    def _written(self, final: FinalFrames, submap: Submap, checked: list[Frame]) -> Iterator[Frame]:
+        """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked."""
+        every = -(-len(submap.frames) // _CHECKED_FRAMES)
+        for number, frame in enumerate(final):
+            if number % every == 0:
+                checked.append(frame)
+            yield self._write_depth(frame)
 
     def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
         """Yield the stored frames that are in no submap, as tracked."""
@@ -170,6 +166,17 @@ class _Run:
         if self.write is not None:
             self.write(frame)
         return frame
+
+
+def _surface_agreement(fused: FusedSurface, frames: list[Frame]) -> dict[str, float]:
+    """Return the agreement of a surface with some of its frames; {} without a surface or frames."""
+    agreements = []
+    for frame in frames if len(fused.mesh.faces) else []:
+        if frame.T_world_camera is not None and frame.depth_mm is not None:
+            depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
+            found, _ = compare_with_frame(fused.mesh, frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+            agreements.append(found)
+    return agreement_figures(agreements) if agreements else {}
 
 
 class _Clock:

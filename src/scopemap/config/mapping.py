@@ -49,6 +49,11 @@ class MappingSettings(Settings):
     min_loop_inliers: int = Field(
         25, ge=0, description="PnP inliers that a loop closure needs at least; 0: no loop closure, no map merging"
     )
+    triangulate_depth: bool = Field(
+        True,
+        description="triangulate the depth of keyframes against frames around them, where method is full and the scene "
+        "is rigid; all frames take it over; false: depth as predicted, corrected at the keyframes' corners",
+    )
     advanced: MappingAdvanced = MappingAdvanced()
 
 

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import IO
 
 import cv2
@@ -47,6 +48,8 @@ class FrameStore:
         self._folder = Path(tempfile.gettempdir() if folder is None else folder)
         self._file: IO[bytes] | None = None
         self._entries: list[_Entry] = []
+        self._place: dict[int, int] = {}
+        self._reading = Lock()
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -74,7 +77,17 @@ class FrameStore:
         sizes = [len(part) for part in parts]
         offset = self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
         entry = (frame.index, frame.time_s, frame.camera, frame.T_world_camera, offset, sizes, _median_depth_mm(frame))
+        self._place[frame.index] = len(self._entries)
         self._entries.append(_Entry(*entry))
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with this number; any thread may call it."""
+        return self._read(self._entries[self._place[index]])
+
+    def poses(self, among: Collection[int]) -> dict[int, np.ndarray]:
+        """Return the poses (4, 4) of the frames with the given numbers that have one, by number."""
+        some = [entry for entry in self._entries if entry.index in among]
+        return {entry.index: entry.T_world_camera for entry in some if entry.T_world_camera is not None}
 
     def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
         """Yield the frames, or those with the given numbers, in order; depth to 0.015 %, colours to a few levels."""
@@ -95,9 +108,10 @@ class FrameStore:
 
     def _read(self, entry: _Entry) -> Frame:
         assert self._file is not None
-        self._file.seek(entry.offset)
         shape = (entry.camera.height, entry.camera.width)
-        colours, valid, depth, *sigma = (np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes)
+        with self._reading:
+            self._file.seek(entry.offset)
+            colours, valid, depth, *sigma = [np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes]
         return Frame(
             entry.index,
             entry.time_s,
