@@ -16,6 +16,9 @@ import trimesh
 
 from scopemap.benchmark.result import read_provenance
 from scopemap.benchmark.truth import open_truth
+from scopemap.config import Config
+from scopemap.fusion.agreement import compare_with_frame
+from scopemap.reconstruction import DepthReader
 from scopemap.report.mesh_figures import draw_surface
 from scopemap.trajectory.formats.opening import read_trajectory
 
@@ -35,9 +38,14 @@ def draw_run(run: Path, file: Path, number: int | None = None) -> None:
     row = tracked[len(tracked) // 2] if number is None else int(np.flatnonzero(trajectory.indices == number)[0])
     sequence = open_truth(run, Path(read_provenance(run)["input"]))
     frame = next(frame for frame in sequence.frames() if frame.index == trajectory.indices[row])
+    depth_mm = DepthReader(run).read(frame.index)
+    if depth_mm is None:
+        raise SystemExit(f"{run} kept no depth of frame {frame.index}")
+    albedo = Config.load(file=run / "config.toml").fusion.colours == "albedo"
+    pose = trajectory.T_world_camera[row]
+    _, rendering = compare_with_frame(mesh, frame.camera, pose, frame.rgb, depth_mm, albedo=albedo)
     positions_mm = trajectory.T_world_camera[tracked, :3, 3]
-    seen = (frame.rgb, frame.camera, trajectory.T_world_camera[row])
-    draw_surface(seen, mesh, positions_mm, file, confidence_of(mesh))
+    draw_surface((frame.rgb, frame.camera, pose), rendering, mesh, positions_mm, file, confidence_of(mesh))
     if file.stat().st_size > MOST_BYTES:
         raise SystemExit(f"{file} has {file.stat().st_size} bytes, over {MOST_BYTES}")
 

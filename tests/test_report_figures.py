@@ -12,6 +12,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scopemap.geometry.rendering import render_mesh
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap.report.depth_figures import DepthScene, colour_depth, draw_depth_change, draw_depths
@@ -267,9 +268,10 @@ def test_a_surface_is_drawn_beside_its_frame(tmp_path: Path) -> None:
     rgb = np.full((view.camera.height, view.camera.width, 3), (250, 0, 250), np.uint8)
     frame, path = (rgb, view.camera, np.eye(4)), np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
     confidence = (BALL.vertices[:, 0] > 0).astype(np.float32)
-    draw_surface(frame, BALL, path, tmp_path / "bare.png")
-    draw_surface(frame, BALL, path, tmp_path / "certain.png", confidence)
-    draw_surface(frame, BALL, path, tmp_path / "certain.jpg", confidence)
+    rendering = render_mesh(BALL, view.camera, np.eye(4))
+    draw_surface(frame, rendering, BALL, path, tmp_path / "bare.png")
+    draw_surface(frame, rendering, BALL, path, tmp_path / "certain.png", confidence)
+    draw_surface(frame, rendering, BALL, path, tmp_path / "certain.jpg", confidence)
     bare, certain = read(tmp_path / "bare.png"), read(tmp_path / "certain.png")
     assert certain.shape[1] == bare.shape[1] * 4 // 3
     for picture in (bare, certain):

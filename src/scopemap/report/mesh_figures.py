@@ -117,6 +117,7 @@ def draw_reconstruction(
 
 def draw_surface(
     frame: tuple[np.ndarray, PinholeCamera, np.ndarray],
+    rendering: Rendering,
     mesh: trimesh.Trimesh,
     positions_mm: np.ndarray,
     file: Path,
@@ -124,12 +125,13 @@ def draw_surface(
 ) -> None:
     """Draw a mesh beside one of its frames as a PNG or JPEG: the frame, the mesh from there, and from outside.
 
-    frame : picture (H, W, 3) uint8, camera, pose (4, 4), world mm. positions_mm : (N, 3) of the camera, drawn outside.
+    frame : picture (H, W, 3) uint8, camera, pose (4, 4), world mm. rendering : of the mesh from there, in the frame's
+    light. positions_mm : (N, 3) of the camera, drawn outside.
     confidence : (V,) 0..1 of the vertices; drawn from the frame's pose, too, blue (0) to yellow (1), where it is given.
     """
     rgb, camera, T_world_camera = frame
     view, outside = MeshView(T_world_camera, camera), outside_views(mesh, T_world_camera, positions_mm)["from outside"]
-    pictures = {"frame": rgb, "surface": _on_white(render_mesh(mesh, camera, T_world_camera))}
+    pictures = {"frame": rgb, "surface": _on_white(rendering)}
     if confidence is not None:
         from matplotlib import colormaps
 
