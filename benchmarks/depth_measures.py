@@ -19,8 +19,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.consistency import ConsistencyMeter
 from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher
 from scopemap.evaluation.depth import depth_scale, evaluate_depth, scale_jitter
-from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
+from scopemap.flow.estimator import pair_flow
 from scopemap.frame import Frame
 from scopemap.geometry.warp import pull
 

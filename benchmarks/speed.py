@@ -22,8 +22,8 @@ import numpy as np
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
 from scopemap.estimators import create_estimators
-from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
+from scopemap.flow.estimator import pair_flow
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.io.opening import open_sequence
 from scopemap.mapping.submaps import corrected_frame

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from torchvision.models.optical_flow import raft_large, raft_small
 
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.flow.consistency import agree, pair_flow
 from scopemap.flow.create import create_flow
 from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import NoFlow
+from scopemap.flow.estimator import NoFlow, agree, pair_flow
 from scopemap.flow.raft import RaftFlow, torchvision_names
 from scopemap.geometry.warp import pull
 

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,9 +26,11 @@ from scopemap.errors import InputError
 from scopemap.estimators import create_estimators, estimators_provenance, largest_depth_mm
 from scopemap.frame import Frame, is_constant
 from scopemap.fusion.agreement import agreement_figures, compare_with_frame
+from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import FusedSurface
 from scopemap.io.sequence import Sequence
+from scopemap.mapping.multiview_depth import KeyframeDepths
 from scopemap.mapping.submaps import FinalFrames, Submap
 from scopemap.pipeline import Estimators, Pipeline, PreprocessedFrame, Step
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, prepare_folder, records_of
@@ -129,15 +131,17 @@ class _Run:
         """Correct, write and fuse the frames of a submap."""
         sequence, pipeline = self.sequence, self.pipeline
         store = pipeline.fusion.store
-        final = pipeline.mapper.final_frames(submap, store.poses(submap.frames), store.frame, sequence.camera)
-        checked: list[Frame] = []
-        frames = self._written(final, submap, checked)
-        fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
+        final = FinalFrames(submap, store.poses(submap.frames), store.frame)
+        depths, checked = self._triangulated_depths(final), list[Frame]()
+        with closing(depths) if depths is not None else nullcontext():
+            frames = self._written(final.frames(None if depths is None else depths.depth), submap, checked)
+            fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
+        fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
         correction = [] if submap.correction is None else [submap.correction.description]
-        provenance["notes"] += notes + correction + final.notes + fused.notes
+        provenance["notes"] += notes + correction + ([] if depths is None else [depths.description]) + fused.notes
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
         provenance["warnings"] += _depth_warnings(self.median_depths_mm, fused.settings)
@@ -148,10 +152,17 @@ class _Run:
             sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
         )
 
-    def _written(self, final: FinalFrames, submap: Submap, checked: list[Frame]) -> Iterator[Frame]:
+    def _triangulated_depths(self, final: FinalFrames) -> KeyframeDepths | None:
+        """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
+        flow = self.pipeline.estimators.keyframe_flow
+        if not self.config.mapping.triangulate_depth or not final.keyframes or flow.name == "none":
+            return None
+        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
+
+    def _written(self, frames: Iterator[Frame], submap: Submap, checked: list[Frame]) -> Iterator[Frame]:
         """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked."""
         every = -(-len(submap.frames) // _CHECKED_FRAMES)
-        for number, frame in enumerate(final):
+        for number, frame in enumerate(frames):
             if number % every == 0:
                 checked.append(frame)
             yield self._write_depth(frame)

@@ -22,6 +22,7 @@ from scopemap.depth.perceptual import CHECKPOINTS, create_perceptual
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
+from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
@@ -108,7 +109,8 @@ class RunFrames:
         """Return the surface of all frames but those with the given numbers."""
         fused = set(self.indices) - set(without)
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        return fusion.fuse(self._store.frames(fused), fused).mesh
+        surface = fusion.fuse(self._store.frames(fused), fused)
+        return finished(surface.mesh, surface.settings)
 
     def agreement(self, every: int = HELD_OUT_EVERY) -> SurfaceAgreement:
         """Return the agreement of the surface with the video; every `every`-th frame is kept out of fusion.

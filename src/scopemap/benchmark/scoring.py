@@ -21,9 +21,8 @@ from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
 from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
-from scopemap.flow.consistency import pair_flow
 from scopemap.flow.create import create_flow
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.geometry.align import AlignMode, Similarity
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence

@@ -8,8 +8,7 @@ import numpy as np
 
 from scopemap.config import MapisSettings
 from scopemap.depth.estimate import PerceptualDistance
-from scopemap.flow.consistency import pair_flow
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.geometry.warp import pull
 
 

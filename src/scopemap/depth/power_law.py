@@ -26,9 +26,8 @@ from scopemap.config import Config
 from scopemap.depth.anchor import apply_power_law, ray_lengths
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
 from scopemap.errors import check_shape
-from scopemap.flow.consistency import pair_flow
 from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.frame import Frame
 from scopemap.geometry.least_squares import robust_sigma
 from scopemap.geometry.se3 import se3, so3_exp, transform

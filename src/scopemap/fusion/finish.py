@@ -16,10 +16,10 @@ from scopemap.geometry.rendering import vertex_colours
 _SHRINK, _GROW = 0.5, -0.52
 
 
-def finished(mesh: trimesh.Trimesh, settings: FusionSettings, voxel_mm: float) -> trimesh.Trimesh:
-    """Return the mesh of a fusion with voxels of this size as the settings want it."""
-    if settings.holes == "small":
-        mesh = without_small_holes(mesh, LARGEST_PERIMETER_VOXELS * voxel_mm)
+def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh:
+    """Return the mesh of a fusion as the settings, with the voxel size that was used, want it."""
+    if settings.holes == "small" and settings.voxel_mm is not None:
+        mesh = without_small_holes(mesh, LARGEST_PERIMETER_VOXELS * settings.voxel_mm)
     mesh = smoothed(mesh, settings.mesh_smooth)
     return mesh if settings.mesh_faces is None else simplified(mesh, settings.mesh_faces)
 

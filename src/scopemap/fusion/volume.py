@@ -13,7 +13,6 @@ import trimesh
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
 from scopemap.fusion.albedo import AlbedoPainter
-from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.mesh import extract_mesh
 from scopemap.fusion.tsdf import (
@@ -197,5 +196,4 @@ class SurfaceFusion:
             return FusedSurface(trimesh.Trimesh(), settings, [])
         notes = [] if settings.voxel_mm is not None else [volume.parameters.description]
         used = settings.model_copy(update=volume.parameters._asdict())
-        mesh = finished(volume.extract_mesh(), settings, volume.parameters.voxel_mm)
-        return FusedSurface(mesh, used, notes)
+        return FusedSurface(volume.extract_mesh(), used, notes)

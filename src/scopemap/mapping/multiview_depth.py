@@ -11,7 +11,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import cv2
@@ -177,20 +177,21 @@ def carry_depth(
 class KeyframeDepths:
     """Depth of the keyframes of a submap, triangulated in a thread of its own, one keyframe ahead.
 
-    view : returns a frame by its number, from any thread. T_world_camera : (4, 4) pose of each frame by number.
-    keyframes : numbers, increasing. flow : no other thread may use it meanwhile.
+    view : returns picture (H, W, 3) uint8 and depth (H, W) mm of a frame by its number, from any thread; NaN = unknown
+    or not usable. T_world_camera : (4, 4) pose of each frame by number. keyframes : numbers, increasing. flow : not to
+    be used by another thread meanwhile.
     """
 
     def __init__(
         self,
-        view: Callable[[int], StereoView],
+        view: Callable[[int], tuple[np.ndarray, np.ndarray]],
         T_world_camera: Mapping[int, np.ndarray],
         keyframes: Sequence[int],
         camera: PinholeCamera,
         flow: FlowEstimator,
     ) -> None:
-        self._view = lru_cache(_CACHED_VIEWS)(view)
-        self._poses, self._order, self._keyframes = T_world_camera, sorted(T_world_camera), list(keyframes)
+        self._poses, self._order, self.keyframes = T_world_camera, sorted(T_world_camera), list(keyframes)
+        self._stereo_view = lru_cache(_CACHED_VIEWS)(partial(self._read, view))
         self._camera, self._flow = camera, flow
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="depth")
         self._found: dict[int, Future[TriangulatedDepth | None]] = {}
@@ -202,9 +203,9 @@ class KeyframeDepths:
 
         Numbers must not decrease from call to call.
         """
-        place = bisect_right(self._keyframes, index)
-        around = self._keyframes[max(place - 1, 0) : place + 1]
-        for keyframe in self._keyframes[max(place - 1, 0) : place + 2]:
+        place = bisect_right(self.keyframes, index)
+        around = self.keyframes[max(place - 1, 0) : place + 1]
+        for keyframe in self.keyframes[max(place - 1, 0) : place + 2]:
             if keyframe not in self._found:
                 self._found[keyframe] = self._worker.submit(self._triangulate, keyframe)
         for keyframe in [number for number in self._found if number < around[0]]:
@@ -220,12 +221,23 @@ class KeyframeDepths:
         """Stop the thread."""
         self._worker.shutdown(cancel_futures=True)
 
+    @property
+    def description(self) -> str:
+        """A note on how many keyframes were triangulated; complete after the last frame."""
+        text = f"depth: {self.triangulated} of {len(self.keyframes)} keyframes triangulated against frames around them"
+        rest = "; the others keep the predicted depth: views disagree (moving tissue, uncertain poses) or are too few"
+        return text + (rest if self.triangulated < len(self.keyframes) else "")
+
+    def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
+        rgb, depth_mm = view(index)
+        return StereoView(normalised_contrast(rgb), depth_mm, self._poses[index])
+
     def _triangulate(self, keyframe: int) -> TriangulatedDepth | None:
-        view = self._view(keyframe)
+        view = self._stereo_view(keyframe)
         place = bisect_left(self._order, keyframe)
         near = self._order[max(0, place - _SEARCHED_FRAMES) : place + 1 + _SEARCHED_FRAMES]
         chosen = choose_neighbours(keyframe, view.depth_mm, self._camera, {n: self._poses[n] for n in near})
-        found = triangulate_depth(view, [self._view(number) for number in chosen], self._camera, self._flow)
+        found = triangulate_depth(view, [self._stereo_view(number) for number in chosen], self._camera, self._flow)
         self.triangulated += found is not None
         return found
 

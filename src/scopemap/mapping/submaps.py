@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.mapping.backend import Backend
-from scopemap.mapping.multiview_depth import KeyframeDepths, StereoView, normalised_contrast
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.tracking.track import Track
+
+TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
+"""Returns the triangulated depth of a frame, mm, and sigma of its ln, by its number and its depth; None: unknown."""
 
 LEAST_FRAMES = 10
 """Tracked frames that a submap needs to be a result beside the largest."""
@@ -52,7 +52,6 @@ class Mapper:
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         links = settings.method == "full" and flow.name != "none"
-        self._flow = flow if links and settings.triangulate_depth else None
         self._backend = Backend(settings, flow) if links else None
         self._tracked: dict[int, TrackedPose] = {}
         self._lost_frames = 0
@@ -96,20 +95,6 @@ class Mapper:
             f"{len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
         ]
 
-    def final_frames(
-        self,
-        submap: Submap,
-        T_world_camera: Mapping[int, np.ndarray],
-        read: Callable[[int], Frame],
-        camera: PinholeCamera,
-    ) -> FinalFrames:
-        """Return the frames of a submap with final poses and depth.
-
-        T_world_camera : poses (4, 4) as tracked, by number, of the submap's frames. read : returns a frame by number,
-        from any thread.
-        """
-        return FinalFrames(submap, T_world_camera, read, camera, self._flow)
-
     def _frames_of(self, maps: tuple[int, ...]) -> frozenset[int]:
         return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)
 
@@ -130,55 +115,37 @@ def corrected_frame(frame: Frame, correction: FrameCorrection | None) -> Frame:
 
 
 class FinalFrames:
-    """Frames of a submap, in order, with poses and depth corrected by the back end, depth triangulated where it can be.
+    """Frames of a submap, in order, with poses and depth corrected by the back end.
 
     Attributes
     ----------
-    notes : what was triangulated; complete after the last frame.
+    T_world_camera : corrected poses (4, 4) by number. keyframes : numbers of those whose depth can be triangulated:
+    none where a rigid scene does not explain the observations.
     """
 
-    def __init__(
-        self,
-        submap: Submap,
-        T_world_camera: Mapping[int, np.ndarray],
-        read: Callable[[int], Frame],
-        camera: PinholeCamera,
-        flow: FlowEstimator | None,
-    ) -> None:
+    def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
+        """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
         self._read, self._correction = read, submap.correction
-        self._order = sorted(T_world_camera)
-        self._depths: KeyframeDepths | None = None
-        self._keyframes: list[int] = []
-        self.notes: list[str] = []
-        # Where a rigid scene does not explain the observations nothing can be triangulated.
-        if submap.correction is not None and not submap.correction.refused and flow is not None:
-            poses = {index: submap.correction.pose(index, pose) for index, pose in T_world_camera.items()}
-            self._keyframes = [int(index) for index in submap.correction.index if index in poses]
-            if self._keyframes:
-                self._depths = KeyframeDepths(self._view, poses, self._keyframes, camera, flow)
+        rigid = submap.correction is not None and not submap.correction.refused
+        correct = submap.correction.pose if submap.correction is not None else lambda _, pose: pose
+        self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
+        adjusted = submap.correction.index.tolist() if rigid and submap.correction is not None else []
+        self.keyframes = [index for index in adjusted if index in self.T_world_camera]
 
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, once."""
-        if self._depths is None:
-            yield from (corrected_frame(self._read(index), self._correction) for index in self._order)
-            return
-        with closing(self._depths):
-            for index in self._order:
-                frame = corrected_frame(self._read(index), self._correction)
-                found = self._depths.depth(index, _usable_depth_mm(frame))
-                if found is not None:
-                    frame = replace(frame, depth_mm=found.depth_mm, depth_sigma_mm=found.sigma * found.depth_mm)
-                yield frame
-        count = self._depths.triangulated
-        self.notes.append(
-            f"depth: {count} of {len(self._keyframes)} keyframes triangulated against frames around them"
-            + ("" if count == len(self._keyframes) else "; the others keep the predicted depth, their views disagree")
-        )
+    def frames(self, triangulated: TriangulatedDepths | None) -> Iterator[Frame]:
+        """Yield the frames, with triangulated depth where there is one."""
+        for index in self.T_world_camera:
+            frame = corrected_frame(self._read(index), self._correction)
+            found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
+            if found is not None:
+                depth_mm, sigma = found
+                frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
+            yield frame
 
-    def _view(self, index: int) -> StereoView:
+    def view(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return picture (H, W, 3) and corrected usable depth (H, W) mm of a frame, from any thread."""
         frame = corrected_frame(self._read(index), self._correction)
-        assert frame.T_world_camera is not None
-        return StereoView(normalised_contrast(frame.rgb), _usable_depth_mm(frame), frame.T_world_camera)
+        return frame.rgb, _usable_depth_mm(frame)
 
 
 def _usable_depth_mm(frame: Frame) -> np.ndarray:
