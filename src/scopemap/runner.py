@@ -144,7 +144,9 @@ class _Run:
         provenance["notes"] += notes + correction + ([] if depths is None else [depths.description]) + fused.notes
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
-        provenance["warnings"] += _depth_warnings(self.median_depths_mm, fused.settings)
+        median_mm = store.median_depth_mm(submap.frames)
+        medians_mm = self.median_depths_mm if median_mm is None else [median_mm]
+        provenance["warnings"] += _depth_warnings(medians_mm, fused.settings)
         provenance["surface"] = agreement
         config = self.config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px

@@ -58,6 +58,7 @@ _BEYOND_PAPER: dict[str, Any] = {
     "fusion.max_depth_mm": 300.0,
     "fusion.advanced.weighted": False,
     "fusion.advanced.min_incidence": 0.0,
+    "fusion.advanced.truncation_share": 0.0,
     "fusion.advanced.min_weight": 0.0,
     "fusion.advanced.min_component_share": 0.0,
 }

@@ -56,12 +56,14 @@ class MeasuredSurface(NamedTuple):
 class Grid(NamedTuple):
     """Voxel size and truncation in mm, and the largest relative change of depth per px that is one surface.
 
+    The truncation at a pixel is the larger one of `truncation_mm` and `truncation_share` of its depth.
     full_weight_share : share of the truncation behind the surface from which on a voxel counts less and less.
     """
 
     voxel_mm: float
     truncation_mm: float
     largest_step: float
+    truncation_share: float = 0.0
     full_weight_share: float = 0.2
 
 
@@ -138,8 +140,6 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     blocks. The boxes overlap from pixel to pixel, so no voxel that the frame can see near the surface is missed.
     """
     block_mm = BLOCK * grid.voxel_mm
-    pieces = int(np.ceil(4.0 * grid.truncation_mm / block_mm))
-    piece_mm = 2.0 * grid.truncation_mm / pieces
     footprint = 1.5 / min(camera.fx, camera.fy)
     # Outside the loop: numba counts references of arrays that are read from a tuple.
     R, per_mm = camera.R, 1.0 / grid.voxel_mm
@@ -147,7 +147,7 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     recent = np.full(_RECENT, -1, np.int64)
     keys, count = np.empty(4096, np.int64), 0
     # By piece: the blocks of the pixel before, which are most often this one's as well. At first, none.
-    last_box = [(0, -1, 0, -1, 0, -1)] * pieces
+    last_box = [(0, -1, 0, -1, 0, -1)]
     for row in range(inverse_depth.shape[0]):
         for col in range(inverse_depth.shape[1]):
             if not inverse_depth[row, col] > 0:
@@ -156,9 +156,14 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
             x, y = (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
             dx, dy = R[0, 0] * x + R[1, 0] * y + R[2, 0], R[0, 1] * x + R[1, 1] * y + R[2, 1]
             dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
+            truncation_mm = max(grid.truncation_mm, grid.truncation_share * depth)
+            pieces = int(np.ceil(4.0 * truncation_mm / block_mm))
+            piece_mm = 2.0 * truncation_mm / pieces
             for piece in range(pieces):
-                near = max(depth - grid.truncation_mm + piece * piece_mm, 0.0)
-                far = max(near, depth - grid.truncation_mm + (piece + 1) * piece_mm)
+                if piece == len(last_box):
+                    last_box.append((0, -1, 0, -1, 0, -1))
+                near = max(depth - truncation_mm + piece * piece_mm, 0.0)
+                far = max(near, depth - truncation_mm + (piece + 1) * piece_mm)
                 wide = footprint * far
                 first_x, last_x = _blocks_between(origin[0] + near * dx, origin[0] + far * dx, wide, per_mm)
                 first_y, last_y = _blocks_between(origin[1] + near * dy, origin[1] + far * dy, wide, per_mm)
@@ -211,7 +216,7 @@ def _integrate_block(
     # Outside the loop: numba counts references of arrays that are read from a tuple.
     tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
     inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
-    R, t, truncation = camera.R, camera.t, grid.truncation_mm
+    R, t = camera.R, camera.t
     height, width = inverse_depths.shape
     for i in range(BLOCK):
         for j in range(BLOCK):
@@ -230,6 +235,7 @@ def _integrate_block(
                 if weight == 0:
                     continue
                 inverse_depth = _sample(inverse_depths, u, v, grid.largest_step)
+                truncation = max(grid.truncation_mm, grid.truncation_share / inverse_depth)
                 gap = 1.0 - depth * inverse_depth
                 behind = -gap / (inverse_depth * truncation)
                 if behind >= 1.0:

@@ -108,7 +108,7 @@ class TsdfVolume:
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
         # A share of 1: voxels have the full weight up to the truncation.
         ramp = {} if advanced.weighted else {"full_weight_share": 1.0}
-        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, **ramp)
+        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, advanced.truncation_share, **ramp)
         with np.errstate(invalid="ignore"):
             usable = frame.valid & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
