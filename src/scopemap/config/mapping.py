@@ -68,7 +68,10 @@ class FusionAdvanced(Settings):
         0.2, gt=0, description="relative error that all depth has; more uncertain pixels weigh less; large: off"
     )
     truncation_share: float = Field(
-        0.08, ge=0, le=1, description="truncation as a share of the pixel's depth, where that is larger than truncation_mm"
+        0.08,
+        ge=0,
+        le=1,
+        description="truncation as a share of the pixel's depth, where that is larger than truncation_mm",
     )
     min_weight: float = Field(0.1, ge=0, description="voxels with less weight give no surface")
     min_component_share: float = Field(

@@ -30,7 +30,7 @@ _MOST_LIGHT = 3.0
 _SATURATED_LEVEL = 250
 # A clipped channel has lost its share of the hue; where no other frame has the place it is better than nothing.
 _SATURATED_WEIGHT = 0.02
-_STEP_PX = 6  # between the pixels that are compared with what is fused
+_STEP_PX = 8  # between the pixels that are compared with what is fused
 _LEAST_OVERLAP = 50  # of such pixels
 # A gain follows the overlap, and forgets it slowly: an error of the light's model must not grow along a path.
 _FOLLOWED = 0.9
@@ -81,6 +81,13 @@ class AlbedoPainter:
             return usual
         overlap = float(np.median(np.log(np.maximum(fused[known], 1.0) / levels[known])))
         return _FOLLOWED * overlap + (1 - _FOLLOWED) * usual
+
+
+def raw_picture(rgb: np.ndarray) -> np.ndarray:
+    """Return the pixels (H, W, 3) of a video as they are, with weight 1, (H, W, 4) float32."""
+    picture = np.ones((*rgb.shape[:2], 4), np.float32)
+    picture[..., :3] = rgb
+    return picture
 
 
 def relative_light(surface: MeasuredSurface, camera: TsdfCamera) -> np.ndarray:

@@ -78,9 +78,7 @@ def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min
     local, faces, _, _ = marching_cubes(tsdf, 0.0, mask=mask, gradient_direction="descent")
     low, high = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64)
     offset = corner * BLOCK
-    return _Chunk(
-        local + offset.astype(np.float64), low + high + 2 * offset, _values(samples, local, low, high), faces
-    )
+    return _Chunk(local + offset.astype(np.float64), low + high + 2 * offset, _values(samples, local, low, high), faces)
 
 
 def _crossed_cells(tsdf: np.ndarray, known: np.ndarray, largest_spread_mm: float) -> np.ndarray:

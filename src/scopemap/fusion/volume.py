@@ -12,7 +12,7 @@ import trimesh
 
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
-from scopemap.fusion.albedo import AlbedoPainter
+from scopemap.fusion.albedo import AlbedoPainter, raw_picture
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.mesh import extract_mesh
 from scopemap.fusion.tsdf import (
@@ -119,7 +119,7 @@ class TsdfVolume:
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
         else:
-            picture = np.dstack([frame.rgb, np.ones(depth_mm.shape)]).astype(np.float32)
+            picture = raw_picture(frame.rgb)
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
