@@ -29,7 +29,7 @@ READERS = {
     "networks": ["estimators.py"],
     "tracking": ["tracking/*.py"],
     "smoothing": ["tracking/smoothing.py"],
-    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py"],
+    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py", "runner.py"],
     "fusion": ["fusion/*.py", "pipeline.py"],
 }
 

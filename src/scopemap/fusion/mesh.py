@@ -7,6 +7,7 @@ grid edge, and the edge's address welds the chunks exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -61,7 +62,7 @@ def extract_mesh(
     mesh = _weld([chunk for chunk in chunks if chunk is not None])
     vertices, faces, values = _without_floaters(*mesh, settings.min_component_share)
     shown = np.round(displayed(values[:, :3], median_level)).astype(np.uint8)
-    confidence = {"confidence": values[:, 3].astype(np.float32)}
+    confidence: dict[str, Any] = {"confidence": values[:, 3].astype(np.float32)}
     return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=shown, vertex_attributes=confidence, process=False)
 
 

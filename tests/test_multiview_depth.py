@@ -1,0 +1,154 @@
+"""Multi-view depth: a wall with relief, seen by a moving camera, whose depth is known exactly."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.flow.dis import DisFlow
+from scopemap.geometry.se3 import inverse, se3, so3_exp
+from scopemap.mapping.multiview_depth import (
+    KeyframeDepths,
+    StereoView,
+    carry_depth,
+    choose_neighbours,
+    normalised_contrast,
+    triangulate_depth,
+)
+
+CAMERA = PinholeCamera(fx=110.0, fy=110.0, cx=79.5, cy=63.5, width=160, height=128)
+WALL_MM = 60.0
+FRAMES = 9
+MIDDLE = FRAMES // 2
+
+
+def _texture() -> np.ndarray:
+    noise = np.random.default_rng(3).normal(size=(600, 600)).astype(np.float32)
+    mixed = sum(cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1.5, 3.0, 6.0))
+    return np.asarray(128 + 45 * mixed / mixed.std(), np.float32)
+
+
+TEXTURE = _texture()
+
+
+def _pose(number: int, step_mm: float = 2.0) -> np.ndarray:
+    """Sideways motion with a small turn."""
+    return se3(so3_exp(np.array([0.0, 0.004 * (number - MIDDLE), 0.0])), np.array([step_mm * (number - MIDDLE), 0, 0]))
+
+
+def _relief_mm(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return WALL_MM + 6 * np.sin(x / 12) * np.cos(y / 10)
+
+
+def _seen(T_world_camera: np.ndarray, shift_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Picture and depth, mm, of the wall from a pose; shift_mm: the wall has moved so far in x."""
+    rays = CAMERA.rays @ T_world_camera[:3, :3].T
+    origin, along = T_world_camera[:3, 3], np.full(CAMERA.rays.shape[:2], WALL_MM)
+    for _ in range(30):
+        point = origin + rays * along[..., None]
+        along = (_relief_mm(point[..., 0] - shift_mm, point[..., 1]) - origin[2]) / rays[..., 2]
+    point = origin + rays * along[..., None]
+    x, y = (4 * (point[..., 0] - shift_mm) + 300).astype(np.float32), (4 * point[..., 1] + 300).astype(np.float32)
+    grey = np.clip(cv2.remap(TEXTURE, x, y, cv2.INTER_LINEAR), 0, 255).astype(np.uint8)
+    return cv2.merge([grey] * 3), ((point - origin) @ T_world_camera[:3, 2]).astype(np.float32)
+
+
+def _view(number: int, error: float | np.ndarray = 0.0, shift_mm: float = 0.0, gain: float = 1.0) -> StereoView:
+    rgb, depth_mm = _seen(_pose(number), shift_mm)
+    rgb = np.clip(gain * rgb, 0, 255).astype(np.uint8)
+    return StereoView(normalised_contrast(rgb), (depth_mm * np.exp(error)).astype(np.float32), _pose(number))
+
+
+def _bias() -> np.ndarray:
+    """An error of ln depth that varies over the image, up to 12 %."""
+    u, v = np.meshgrid(np.linspace(-1, 1, CAMERA.width), np.linspace(-1, 1, CAMERA.height))
+    return 0.06 + 0.06 * np.sin(3 * u) * np.cos(2 * v)
+
+
+def _error(depth_mm: np.ndarray) -> float:
+    """Median of |ln| against the truth in the middle of the middle frame."""
+    return float(np.median(np.abs(np.log(depth_mm / _seen(_pose(MIDDLE))[1]))[16:-16, 24:-24]))
+
+
+def test_a_wrong_depth_is_corrected_to_a_fraction() -> None:
+    wrong = _view(MIDDLE, _bias())
+    neighbours = [_view(number, _bias(), gain=0.8 if number % 2 else 1.0) for number in (2, 3, 5, 6)]
+    found = triangulate_depth(wrong, neighbours, CAMERA, DisFlow())
+    assert found is not None
+    assert _error(wrong.depth_mm) > 0.05
+    assert _error(found.depth_mm) < 0.2 * _error(wrong.depth_mm)
+    assert np.median(found.sigma) < 0.06
+
+
+def test_a_right_depth_stays() -> None:
+    found = triangulate_depth(_view(MIDDLE), [_view(number) for number in (2, 3, 5, 6)], CAMERA, DisFlow())
+    assert found is not None
+    assert _error(found.depth_mm) < 0.006
+
+
+def test_unknown_depth_stays_unknown() -> None:
+    view = _view(MIDDLE, _bias())
+    view.depth_mm[40:60, 50:90] = np.nan
+    found = triangulate_depth(view, [_view(number) for number in (2, 3, 5, 6)], CAMERA, DisFlow())
+    assert found is not None
+    assert np.array_equal(np.isnan(found.depth_mm), np.isnan(view.depth_mm))
+
+
+def test_tissue_that_moves_is_not_triangulated() -> None:
+    """The wall slides to and fro by as much as the camera moves: neighbours contradict each other."""
+    neighbours = [_view(number, shift_mm=3.0 * (-1) ** number) for number in (1, 2, 3, 5, 6, 7)]
+    assert triangulate_depth(_view(MIDDLE), neighbours, CAMERA, DisFlow()) is None
+
+
+def test_one_neighbour_is_not_enough() -> None:
+    assert triangulate_depth(_view(MIDDLE), [_view(2)], CAMERA, DisFlow()) is None
+
+
+def test_neighbours_are_on_both_sides_and_have_parallax() -> None:
+    poses = {number: _pose(number, step_mm=0.5) for number in range(60)}
+    depth_mm = np.full((CAMERA.height, CAMERA.width), WALL_MM, np.float32)
+    chosen = choose_neighbours(30, depth_mm, CAMERA, poses)
+    assert min(chosen) < 30 < max(chosen)
+    # Parallax: focal length times distance over depth, px per unit of ln depth.
+    parallax_px = [CAMERA.fx * 0.5 * abs(number - 30) / WALL_MM for number in chosen]
+    assert all(3 < px < 25 for px in parallax_px), parallax_px
+
+
+def test_a_camera_at_rest_has_no_neighbours() -> None:
+    depth_mm = np.full((CAMERA.height, CAMERA.width), WALL_MM, np.float32)
+    assert choose_neighbours(3, depth_mm, CAMERA, dict.fromkeys(range(9), np.eye(4))) == []
+
+
+def test_frames_take_over_their_keyframes_depth() -> None:
+    flow = DisFlow()
+    keyframe = triangulate_depth(_view(2, _bias()), [_view(number, _bias()) for number in (0, 1, 4, 6)], CAMERA, flow)
+    assert keyframe is not None
+    frame = _view(MIDDLE, _bias())
+    carried = carry_depth(frame.depth_mm, [(inverse(_pose(2)) @ _pose(MIDDLE), keyframe)], CAMERA)
+    assert _error(carried.depth_mm) < 0.4 * _error(frame.depth_mm)
+
+
+@pytest.fixture
+def depths() -> KeyframeDepths:
+    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
+        rgb, depth_mm = _seen(_pose(number))
+        return rgb, (depth_mm * np.exp(_bias())).astype(np.float32)
+
+    poses = {number: _pose(number) for number in range(FRAMES)}
+    return KeyframeDepths(read, poses, [0, 4, 8], CAMERA, DisFlow())
+
+
+def test_every_frame_gets_the_depth_of_the_keyframes_around_it(depths: KeyframeDepths) -> None:
+    wrong_mm = partial(_view, error=_bias())
+    found = [depths.depth(number, wrong_mm(number).depth_mm) for number in range(FRAMES)]
+    depths.close()
+    assert depths.triangulated == 3
+    assert "3 of 3 keyframes" in depths.description
+    assert all(one is not None for one in found)
+    middle = found[MIDDLE]
+    assert middle is not None
+    assert _error(middle.depth_mm) < 0.02
