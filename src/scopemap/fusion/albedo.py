@@ -32,8 +32,8 @@ _SATURATED_LEVEL = 250
 _SATURATED_WEIGHT = 0.02
 _STEP_PX = 8  # between the pixels that are compared with what is fused
 _LEAST_OVERLAP = 50  # of such pixels
-# A gain follows the overlap, and forgets it slowly: an error of the light's model must not grow along a path.
-_FOLLOWED = 0.9
+# Share of the overlap in a gain: an error of the light's model must not grow along a path.
+_FOLLOWED = 0.75
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
 
