@@ -86,11 +86,11 @@ def test_a_ball_with_pricks_is_whole_again() -> None:
     ball = trimesh.creation.icosphere(4, 10.0)
     volume = ball.volume
     ball.update_faces(np.arange(len(ball.faces)) % 97 != 0)
-    settings = FusionSettings()
+    settings = FusionSettings(voxel_mm=1.0)
     assert not ball.is_watertight
-    assert finished(ball, settings, 1.0).is_watertight
-    assert finished(ball, settings, 1.0).volume == pytest.approx(volume, rel=1e-3)
-    assert finished(ball, settings.model_copy(update={"holes": "none"}), 1.0) is ball
+    assert finished(ball, settings).is_watertight
+    assert finished(ball, settings).volume == pytest.approx(volume, rel=1e-3)
+    assert finished(ball, settings.model_copy(update={"holes": "none"})) is ball
 
 
 def test_a_simplified_mesh_keeps_its_shape_colours_and_confidence() -> None:
