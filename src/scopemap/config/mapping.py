@@ -15,6 +15,9 @@ class MappingAdvanced(Settings):
     keyframe_gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         (1, 2, 3, 5, 8), min_length=1, description="a keyframe's corners are tracked to the keyframes so many before it"
     )
+    correlated_observations: float = Field(
+        4.0, ge=1, description="so many observations count as one: errors of flow are alike at neighbouring corners"
+    )
     depth_sigma_share: float = Field(
         0.15, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
     )

@@ -1,6 +1,8 @@
 """Corners of a frame, matched in other frames by optical flow.
 
-Shading moves with the lamp and biases flow on tissue without texture; corners stay on the tissue.
+Shading moves with the lamp and biases flow on tissue without texture; corners stay on the tissue. Flow is smooth over
+tens of pixels, so that its errors are alike at neighbouring corners; patches of locally normalised brightness, aligned
+one by one, show the tissue alone (Lucas and Kanade, IJCAI 1981, in the iterative form of Bouguet, 2001).
 """
 
 from __future__ import annotations
@@ -18,6 +20,14 @@ _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
 _CELL_PX = 12
 _CONSISTENCY_PX = 1.0
+# Refinement.
+_SURROUND_PX, _DARKEST = 8.0, 8.0  # of the local mean and contrast; grey levels added to the mean
+_CONTRAST, _LEAST_CONTRAST = 50.0, 0.02  # grey levels of one local standard deviation; smaller contrast is noise
+_PATCH_PX = 15
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+_LEAST_EIGENVALUE = 1e-4
+_MAX_STEP_PX = 1.5  # from where flow has it
+_PATCH_CONSISTENCY_PX = 0.5  # largest forward-backward error
 
 
 @dataclass(frozen=True)
@@ -128,3 +138,47 @@ def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     top = (1 - a) * flow[y, x] + a * flow[y, x + 1]
     bottom = (1 - a) * flow[y + 1, x] + a * flow[y + 1, x + 1]
     return np.where(inside, (1 - b) * top + b * bottom, np.nan)
+
+
+def normalised_brightness(rgb: np.ndarray) -> np.ndarray:
+    """Return grey values (H, W) uint8 of an (H, W, 3) uint8 image, less their local mean, over their local contrast."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    relative = grey / (cv2.GaussianBlur(grey, (0, 0), _SURROUND_PX) + _DARKEST) - 1
+    contrast = np.sqrt(cv2.GaussianBlur(relative**2, (0, 0), _SURROUND_PX)) + _LEAST_CONTRAST
+    return np.clip(128 + _CONTRAST * relative / contrast, 0, 255).astype(np.uint8)
+
+
+def refined_corners(
+    image_from: np.ndarray, image_to: np.ndarray, corners: np.ndarray, pixels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which corners (m,) int have a similar patch in the other image, and their pixels (m, 2) float64 there.
+
+    image_from, image_to : (H, W) uint8, `normalised_brightness`. corners : (n, 2) x, y in the first. pixels : (n, 2)
+    in the second, as matched by flow.
+    """
+    if not len(corners):
+        return np.zeros(0, int), np.zeros((0, 2))
+    there, found = _aligned(image_from, image_to, corners, pixels)
+    back, found_back = _aligned(image_to, image_from, there, corners)
+    good = found & found_back & (np.linalg.norm(there - pixels, axis=1) <= _MAX_STEP_PX)
+    kept = np.flatnonzero(good & (np.linalg.norm(back - corners, axis=1) <= _PATCH_CONSISTENCY_PX))
+    return kept, there[kept].astype(np.float64)
+
+
+def _aligned(
+    image_from: np.ndarray, image_to: np.ndarray, places: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where patches around places (n, 2) are in another image, searched from `start` (n, 2), and whether found (n,)."""
+    first, last = (np.ascontiguousarray(p, np.float32).reshape(-1, 1, 2).copy() for p in (places, start))
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        image_from,
+        image_to,
+        first,
+        last,
+        winSize=(_PATCH_PX, _PATCH_PX),
+        maxLevel=0,
+        criteria=_STOP,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_LEAST_EIGENVALUE,
+    )
+    return moved.reshape(-1, 2), status.ravel() > 0

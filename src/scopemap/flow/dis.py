@@ -25,9 +25,17 @@ class DisFlow(FlowEstimator):
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
+        return self._estimate(rgb_from, rgb_to, np.zeros((*rgb_from.shape[:2], 2), np.float32))
+
+    def estimate_both_from(
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the flows a to b and b to a; the coarsest scale begins at `start`."""
+        return self._estimate(rgb_a, rgb_b, start[0]), self._estimate(rgb_b, rgb_a, start[1])
+
+    def _estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: np.ndarray) -> np.ndarray:
         grey_from, grey_to = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_from, rgb_to))
-        start = np.zeros((*grey_from.shape, 2), np.float32)
-        return np.asarray(self._dis.calc(grey_from, grey_to, start), np.float32)
+        return np.asarray(self._dis.calc(grey_from, grey_to, start.astype(np.float32)), np.float32)
 
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""

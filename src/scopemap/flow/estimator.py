@@ -24,6 +24,12 @@ class FlowEstimator(Protocol):
         """Return the flows a to b and b to a; an estimator that can share work between them overrides this."""
         return self.estimate(rgb_a, rgb_b), self.estimate(rgb_b, rgb_a)
 
+    def estimate_both_from(
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the flows a to b and b to a, searched from `start`; an estimator that has no start ignores it."""
+        return self.estimate_both(rgb_a, rgb_b)
+
     def provenance(self) -> dict[str, str]:
         """Return what the result depends on, as text: names, versions, hashes."""
         ...

@@ -172,7 +172,15 @@ class Backend:
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
         pairs = tracked_pairs([self._frames[k] for k in chosen], own)
-        problem = BundleProblem(inverse(T_world_camera), points, observations, priors, pairs, camera.fx)
+        problem = BundleProblem(
+            inverse(T_world_camera),
+            points,
+            observations,
+            priors,
+            pairs,
+            camera.fx,
+            correlated=settings.correlated_observations,
+        )
         loops = [loop.among(chosen, log_unit) for loop in self._loops if {loop.past, loop.new} <= set(chosen)]
         if not loops:
             return problem, 0

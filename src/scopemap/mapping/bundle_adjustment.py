@@ -2,10 +2,13 @@
 
 With the notation of `reprojection`:
 
-    sum of rho(|projected - observed| / s) + sum of rho((u_p - ln depth_p - a_h) / sigma_p) + sum of (a_k / sigma_a)^2
-    +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted  +  sum of ((lens - expected) / sigma_lens)^2
+    sum of rho(|projected - observed| / s) / c  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)
+    +  sum of (a_k / sigma_a)^2  +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
+    +  sum of ((lens - expected) / sigma_lens)^2
 
-rho is Cauchy's kernel and s the robust standard deviation of the reprojection errors. The second sum holds points to
+rho is Cauchy's kernel, s the robust standard deviation of the reprojection errors, and c the number of observations
+that count as one, because the errors of flow are alike at neighbouring corners: with c = 1 thousands of observations
+that share a small bias outweigh everything that is known of the scale along the path. The second sum holds points to
 the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these factors to 1; the fourth holds a
 keyframe j to its tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement:
 Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
@@ -29,6 +32,7 @@ _PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its de
 _CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
+_POINT_STEPS = 5  # of the points alone, after the keyframes
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     search = least_squares.Problem(partial(linearised, problem), partial(_retract, problem), rescaled)
     found = minimise(search, rescaled(start), options)
     state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
+    if problem.correlated > 1:
+        state = _with_points(problem, state)
     return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
@@ -95,7 +101,7 @@ def linearised(problem: BundleProblem, state: State) -> SchurModel:
     free = np.setdiff1d(np.arange(_PER_KEYFRAME * count + lens), np.concatenate([np.arange(6), *held]))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
-        parts = _Rows(seen.error, _weights(state, seen), *jacobians(problem, state, seen))
+        parts = _Rows(seen.error, _weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
         hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
         return hosts, _camera_blocks(problem, state, edges)
 
@@ -108,7 +114,7 @@ def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
-    cost = cauchy(square, _CAUCHY)[0].sum() + cauchy(depth**2, _CAUCHY)[0].sum()
+    cost = cauchy(square, _CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, _CAUCHY)[0].sum()
     cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
@@ -192,6 +198,23 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     columns = (_PER_KEYFRAME * keyframes[:, None] + np.arange(_PER_KEYFRAME)).ravel()
     columns = np.append(columns, _PER_KEYFRAME * len(state.T_camera_world) + np.arange(by_lens.shape[2]))
     return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
+
+
+def _with_points(problem: BundleProblem, state: State) -> State:
+    """Return the state with the points where all observations place them, keyframes held.
+
+    What observations share makes the keyframes uncertain, not the shape of the tissue between neighbouring points.
+    """
+    points, number = problem.points, problem.observations.point
+    for _ in range(_POINT_STEPS):
+        seen = reproject(problem, state)
+        by_depth, weight = jacobians(problem, state, seen)[2], _weights(state, seen)
+        h, g = (np.bincount(number, weight * (by_depth * by).sum(1), len(points.host)) for by in (by_depth, seen.error))
+        off = state.log_depth - points.log_depth - state.log_scale[points.host]
+        held = cauchy((off / points.sigma) ** 2, _CAUCHY)[1] / points.sigma**2
+        step = -(g + held * off) / (h + held)
+        state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
+    return state
 
 
 def _log_depth_sigma(problem: BundleProblem, state: State) -> np.ndarray:

@@ -1,17 +1,22 @@
-"""Feature tracks: corners of keyframes, and where optical flow and loop closures observe them in other keyframes."""
+"""Feature tracks: corners of keyframes, and where optical flow and loop closures observe them in other keyframes.
+
+Flow between distant keyframes is searched from the flows from keyframe to keyframe in between, composed: from zero it
+would often stay where shading, which moves with the lamp, is alike. Aligned patches then refine each observation.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow.corners import detect_corners, match_corners
+from scopemap.flow.corners import detect_corners, match_corners, normalised_brightness, refined_corners
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.uncertainty import relative_sigma
@@ -22,12 +27,13 @@ _CELL_PX = 16  # one corner in each cell of that size
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
 
 
-@dataclass(frozen=True)
+@dataclass
 class _FlowKeyframe:
     """A keyframe that later ones are matched with.
 
     number : among all keyframes. number_in_map : among those of its map. corners : (n, 2) int px; the first of them is
-    point `first_point`.
+    point `first_point`. pattern : (H, W) uint8 as `normalised_brightness`. composed : flows to the latest
+    keyframe of its map and back, None: it is the latest.
     """
 
     number: int
@@ -36,6 +42,11 @@ class _FlowKeyframe:
     valid: np.ndarray
     corners: np.ndarray
     first_point: int
+    pattern: np.ndarray = field(init=False)
+    composed: tuple[np.ndarray, np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        self.pattern = normalised_brightness(self.rgb)
 
 
 class _Matches(NamedTuple):
@@ -70,13 +81,25 @@ class FeatureTracks:
         recent = self._recent[map_number]
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self._keyframe_count, number_in_map, keyframe.rgb, keyframe.valid, corners, first)
-        for past in recent:
-            if new.number_in_map - past.number_in_map in self.settings.keyframe_gaps:
-                to_new, to_past = self._flow.estimate_both(past.rgb, new.rgb)
-                self._match(new, past, (to_past, to_new))
-                self._match(past, new, (to_new, to_past))
+        self._match_with(recent, new)
         recent.append(new)
         self._keyframe_count += 1
+
+    def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
+        """Match a new keyframe both ways with recent ones of its map."""
+        if not recent:
+            return
+        step = self._flow.estimate_both(recent[-1].rgb, new.rgb)
+        for past in recent:
+            flows = step
+            if past.composed is not None:
+                flows = _composed(past.composed[0], step[0]), _composed(step[1], past.composed[1])
+            past.composed = flows
+            if new.number_in_map - past.number_in_map in self.settings.keyframe_gaps:
+                if past is not recent[-1]:
+                    flows = self._flow.estimate_both_from(past.rgb, new.rgb, flows)
+                self._match(past, new, flows)
+                self._match(new, past, flows[::-1])
 
     def add_loop(self, loop: Loop) -> None:
         """Take the features of a loop closure: points of either keyframe that the other one observes."""
@@ -132,4 +155,14 @@ class FeatureTracks:
     def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: tuple[np.ndarray, np.ndarray]) -> None:
         """Add the observations of the host's corners in another keyframe; `flows` : to the other one, and back."""
         number, pixel = match_corners(host.corners, flows, other.valid, _CONSISTENCY_PX)
-        self._matches.append(_Matches(host.first_point + number, np.full(len(number), other.number), pixel))
+        kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel)
+        self._matches.append(_Matches(host.first_point + number[kept], np.full(len(kept), other.number), pixel))
+
+
+def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the flow (H, W, 2) from a to c by those from a to b and from b to c; borders of the second go on."""
+    height, width = first.shape[:2]
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    onwards = cv2.remap(second, u + first[..., 0], v + first[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    composed: np.ndarray = first + onwards
+    return composed

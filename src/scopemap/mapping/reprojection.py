@@ -75,6 +75,7 @@ class BundleProblem:
     T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
     keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
     to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
+    correlated : so many observations count as one, since errors of flow are alike at neighbouring corners.
     """
 
     T_camera_world: np.ndarray
@@ -86,6 +87,7 @@ class BundleProblem:
     start: State | None = None
     lens: UnknownLens | None = None
     least_sigma_px: float = 0.1
+    correlated: float = 1.0
 
     @property
     def unit_mm(self) -> float:

@@ -1,0 +1,112 @@
+"""Feature tracks that shading and long ways do not bias: composed starts of flow, aligned patches, shared errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+from test_backend_adjustment import FOCAL_PX, LINE, _tracked, _world
+
+from scopemap.config import MappingSettings
+from scopemap.config.mapping import MappingAdvanced
+from scopemap.flow.corners import normalised_brightness, refined_corners
+from scopemap.flow.dis import DisFlow
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse
+from scopemap.mapping.bundle_adjustment import adjust
+from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.reprojection import BundleProblem, Observations, Priors
+
+
+class _Biased(DisFlow):
+    """DIS flow with a bias along x that both directions share, so that they stay consistent."""
+
+    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        forth, back = super().estimate_both(rgb_a, rgb_b)
+        return forth + np.float32([0.8, 0]), back - np.float32([0.8, 0])
+
+
+class _FromZero(DisFlow):
+    """DIS flow that takes no start."""
+
+    def estimate_both_from(
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return self.estimate_both(rgb_a, rgb_b)
+
+
+def _errors_px(flow: FlowEstimator, gap: int, step_mm: float) -> np.ndarray:
+    """Errors (n,) of the observations at a gap between keyframes that slide along the plane by steps."""
+    poses = [plane_scene.pose(at_mm=(step_mm * n, 0.0, 0.0)) for n in range(gap + 1)]
+    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(gap,))), flow)
+    for number, pose in enumerate(poses):
+        view = plane_scene.see(pose)
+        tracks.add(Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose))
+    points, observations = tracks.collected()
+    host = points.host[observations.point]
+    errors = []
+    for one, pixel, h, t in zip(observations.point, observations.pixel, host, observations.keyframe, strict=True):
+        x = np.exp(points.log_depth[one]) * np.append(points.pixel[one] / CAMERA.fx, 1.0)
+        T = inverse(poses[t]) @ poses[h]
+        there = T[:3, :3] @ x + T[:3, 3]
+        errors.append(np.linalg.norm(CAMERA.fx * there[:2] / there[2] - pixel))
+    return np.array(errors)
+
+
+def test_patches_take_away_a_bias_that_flow_shares_in_both_directions() -> None:
+    away = _errors_px(_Biased(), 1, 2.0)
+    assert len(away) > 150
+    assert np.median(away) < 0.15
+
+
+def test_distant_keyframes_are_matched_along_those_between() -> None:
+    # 66 px in steps of 11: more than a quarter of the picture, which a search from zero hardly finds.
+    along, from_zero = (_errors_px(flow, 6, 11.0 / 3.0) for flow in (DisFlow(), _FromZero()))
+    good, without = (int((away < 0.5).sum()) for away in (along, from_zero))
+    assert good > 100
+    assert good > 1.5 * without
+    assert np.median(along) < 0.25
+
+
+def test_patches_that_differ_are_no_observations() -> None:
+    view, rng = plane_scene.see(plane_scene.pose()), np.random.default_rng(0)
+    image, other = (
+        normalised_brightness(view.rgb),
+        normalised_brightness(rng.integers(0, 255, view.rgb.shape, np.uint8)),
+    )
+    corners = np.stack(np.meshgrid(np.arange(30, 210, 20), np.arange(30, 150, 20)), -1).reshape(-1, 2)
+    kept, pixels = refined_corners(image, image, corners, corners + rng.uniform(-0.7, 0.7, corners.shape))
+    assert len(kept) > 0.95 * len(corners)
+    np.testing.assert_allclose(pixels, corners[kept], atol=0.05)
+    assert len(refined_corners(image, other, corners, corners.astype(float))[0]) < 0.2 * len(corners)
+    assert len(refined_corners(image, image, corners[:0], corners[:0])[0]) == 0
+
+
+def test_normalised_brightness_forgets_the_lamp() -> None:
+    rgb = plane_scene.see(plane_scene.pose()).rgb // 2 + 40
+    lit = np.linspace(0.5, 1.3, rgb.shape[1])[None, :, None] * rgb
+    assert np.abs(lit - rgb).mean() > 0.7 * rgb.std()
+    difference = normalised_brightness(lit.astype(np.uint8)).astype(int) - normalised_brightness(rgb)
+    assert np.abs(difference).mean() < 0.2 * normalised_brightness(rgb).std()
+
+
+def test_observations_that_share_their_errors_count_as_one() -> None:
+    rng = np.random.default_rng(3)
+    T, points, observations = _world(rng)
+    observations = replace(observations, pixel=observations.pixel + rng.normal(0, 3.0, observations.pixel.shape))
+    once = BundleProblem(_tracked(T, rng), points, observations, Priors(translation_share=0.002), LINE, FOCAL_PX)
+    repeated = Observations(*(np.repeat(part, 4, axis=0) for part in observations.__dict__.values()))
+    problems = once, replace(once, observations=repeated, correlated=4.0), replace(once, observations=repeated)
+    wanted, found, trusted = (adjust(p, max_iterations=50, min_decrease=1e-8).state for p in problems)
+    np.testing.assert_allclose(found.T_camera_world, wanted.T_camera_world, atol=1e-3)
+    np.testing.assert_allclose(found.log_scale, wanted.log_scale, atol=1e-4)
+    assert np.abs(trusted.T_camera_world - wanted.T_camera_world).max() > 0.02
+
+
+def test_less_than_one_observation_is_refused() -> None:
+    with pytest.raises(ValueError, match="correlated_observations"):
+        MappingAdvanced(correlated_observations=0.5)
