@@ -1,6 +1,6 @@
 """Keeps a table with the command, commit and date that made it, and tells which tables are older than the code.
 
-    python benchmarks/record.py NAME [--note TEXT] -- COMMAND ...     run COMMAND, write benchmarks/results/NAME.md
+    python benchmarks/record.py [--note TEXT] NAME -- COMMAND ...     run COMMAND, write benchmarks/results/NAME.md
     python benchmarks/record.py --check                               name the tables that the code has outdated
 
 A table is outdated where `src/` has changed since its commit. `.ci/release` asks; tests do not.
