@@ -153,25 +153,23 @@ def carry_depth(
     depth_mm : (H, W) float32, NaN = unknown. keyframes : T_keyframe_camera (4, 4) and depth of each, at least one.
     """
     everywhere = np.ones(depth_mm.shape, bool)
-    # Twice, because the first correction moves the pixel that is looked up.
-    for _ in range(2):
-        total, information = np.zeros_like(depth_mm), np.zeros_like(depth_mm)
-        for T, triangulated in keyframes:
-            seen = _project(depth_mm, everywhere, T, camera.fx, camera.fy, camera.cx, camera.cy)
-            at_mm, at_sigma = (
-                cv2.remap(image, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
-                for image in triangulated
-            )
-            with np.errstate(invalid="ignore", divide="ignore"):
-                log_factor = np.log(at_mm / seen.z)
-                same = (seen.usable > 0) & (np.abs(log_factor) < _MAX_CARRIED)
-            weight = np.where(same, 1 / (at_sigma**2 + np.float32(_VIEW_SIGMA**2)), np.float32(0))
-            total += weight * np.where(same, log_factor, np.float32(0))
-            information += weight
-        mean = np.divide(total, information, out=np.zeros_like(total), where=information > 0)
-        depth_mm = depth_mm * np.exp(_smoothed(mean, information))
+    total, information = np.zeros_like(depth_mm), np.zeros_like(depth_mm)
+    for T, triangulated in keyframes:
+        seen = _project(depth_mm, everywhere, T, camera.fx, camera.fy, camera.cx, camera.cy)
+        at_mm, at_sigma = (
+            cv2.remap(image, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+            for image in triangulated
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_factor = np.log(at_mm / seen.z)
+            same = (seen.usable > 0) & (np.abs(log_factor) < _MAX_CARRIED)
+        weight = np.where(same, 1 / (at_sigma**2 + np.float32(_VIEW_SIGMA**2)), np.float32(0))
+        total += weight * np.where(same, log_factor, np.float32(0))
+        information += weight
+    mean = np.divide(total, information, out=np.zeros_like(total), where=information > 0)
     # Keyframes err alike: their mean is not more certain than one of them.
-    return TriangulatedDepth(depth_mm, 1 / np.sqrt(information / len(keyframes) + np.float32(PRIOR_SIGMA**-2)))
+    sigma = 1 / np.sqrt(information / len(keyframes) + np.float32(PRIOR_SIGMA**-2))
+    return TriangulatedDepth(depth_mm * np.exp(_smoothed(mean, information)), sigma)
 
 
 class KeyframeDepths:
