@@ -3,10 +3,11 @@
     python benchmarks/camera_effects.py --data FOLDER [--paths t2v1 ...] [--effects clean ...] [--keep FOLDER]
 
 Colon phantoms along true hand motion (FOLDER/endoscopy/c3vd_camera_paths), 320x256, 80 degrees, with motion blur,
-H.264, automatic exposure that lags, and scattered light, one by one and together; also with faint texture. scopenet, DIS
-flow, no surface. One run gives both: poses as tracked are what observers see, poses adjusted are the result's. ATE in mm
-after Sim(3). Steps: length of the way between keyframes over its true length, in the four quarters of the way, relative
-to the whole; all 1 without drift of scale. --keep renders phantoms there once and uses them again.
+H.264, automatic exposure that lags, and scattered light, one by one and together; also with faint texture. Depth is
+scopenet's, flow DIS, and there is no surface. One run gives both: poses as tracked are what observers see, poses
+adjusted are the result's. ATE in mm after Sim(3). Steps: length of the way between keyframes over its true length, in
+the four quarters of the way, relative to the whole; all 1 without drift of scale. --keep renders phantoms there once
+and uses them again.
 """
 
 from __future__ import annotations
