@@ -19,7 +19,7 @@ class MappingAdvanced(Settings):
         4.0, ge=1, description="so many observations count as one: errors of flow are alike at neighbouring corners"
     )
     depth_sigma_share: float = Field(
-        0.15, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
+        0.2, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
     )
     scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
     depth_step_sigma: float = Field(
