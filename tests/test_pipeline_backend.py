@@ -48,7 +48,7 @@ class _Run:
     tracked: Reconstruction
 
 
-@pytest.fixture(scope="module", params=[0.0, 0.1], ids=["depth scaled", "depth correction field"])
+@pytest.fixture(scope="module", params=[0.0, 0.1], ids=["depth only scaled", "depth corrected and triangulated"])
 def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> _Run:
     folder = tmp_path_factory.mktemp("backend")
     phantom = write_tiny(folder / "phantom", f"black:{LOST}-{LOST}", frames=FRAMES)
@@ -60,7 +60,8 @@ def run(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("scopemap.runner.create_estimators", bent)
-        config = with_true_depth(phantom, **SETTINGS, mapping__advanced__depth_step_sigma=request.param)
+        shaped = {"mapping__advanced__depth_step_sigma": request.param, "mapping__triangulate_depth": request.param > 0}
+        config = with_true_depth(phantom, **SETTINGS, **shaped)
         adjusted = reconstruct(open_sequence(phantom), config, out=folder / "out", observers=(steps.append,))
         plain = with_true_depth(phantom, **SETTINGS, mapping__method="none")
         tracked = reconstruct(open_sequence(phantom), plain)

@@ -35,8 +35,7 @@ _FLOW_SIGMA_PX, _VIEW_SIGMA, PRIOR_SIGMA = 0.3, 0.03, 0.3
 # Above this median standard deviation tissue moves or poses are wrong: the predicted depth is better.
 MAX_SIGMA = 0.08
 _MAX_FLOW_PX, _MAX_LOG_FACTOR = 20.0, 0.5
-_CAUCHY, _ITERATIONS = 2.0, 4
-_WARPS = 2
+_CAUCHY, _ITERATIONS, _WARPS = 2.0, 4, 2
 _CACHED_VIEWS = 24
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
@@ -58,10 +57,15 @@ class StereoView(NamedTuple):
 
 
 class TriangulatedDepth(NamedTuple):
-    """Depth (H, W) float32, mm, NaN = unknown, and the standard deviation (H, W) float32 of its ln."""
+    """Depth of a frame, each (H, W) float32.
+
+    depth_mm : NaN where it was unknown or not usable. sigma : standard deviation of its ln. log_factor : ln of what the
+    depth was multiplied by; continued where depth is not usable.
+    """
 
     depth_mm: np.ndarray
     sigma: np.ndarray
+    log_factor: np.ndarray
 
 
 class _Projection(NamedTuple):
@@ -142,7 +146,7 @@ def triangulate_depth(
         shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
         total = _smoothed(shrunk, information)
     sigma = np.where(known > 0, np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2)), PRIOR_SIGMA)
-    return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32))
+    return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
 
 
 def carry_depth(
@@ -158,7 +162,7 @@ def carry_depth(
         seen = _project(depth_mm, everywhere, T, camera.fx, camera.fy, camera.cx, camera.cy)
         at_mm, at_sigma = (
             cv2.remap(image, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
-            for image in triangulated
+            for image in (triangulated.depth_mm, triangulated.sigma)
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             log_factor = np.log(at_mm / seen.z)
@@ -169,7 +173,8 @@ def carry_depth(
     mean = np.divide(total, information, out=np.zeros_like(total), where=information > 0)
     # Keyframes err alike: their mean is not more certain than one of them.
     sigma = 1 / np.sqrt(information / len(keyframes) + np.float32(PRIOR_SIGMA**-2))
-    return TriangulatedDepth(depth_mm * np.exp(_smoothed(mean, information)), sigma)
+    log_factor = _smoothed(mean, information)
+    return TriangulatedDepth(depth_mm * np.exp(log_factor), sigma, log_factor)
 
 
 class KeyframeDepths:

@@ -19,8 +19,8 @@ from scopemap.mapping.backend import Backend
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.tracking.track import Track
 
-TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
-"""Returns the triangulated depth of a frame, mm, and sigma of its ln, by its number and its depth; None: unknown."""
+TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
+"""Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
 
 LEAST_FRAMES = 10
 """Tracked frames that a submap needs to be a result beside the largest."""
@@ -138,7 +138,9 @@ class FinalFrames:
             frame = corrected_frame(self._read(index), self._correction)
             found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
             if found is not None:
-                depth_mm, sigma = found
+                # The factor, not the depth: pixels that are masked keep a depth, too.
+                _, sigma, log_factor = found
+                depth_mm = np.asarray(frame.depth_mm) * np.exp(log_factor)
                 frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
             yield frame
 
