@@ -18,6 +18,7 @@ from scopemap.cameras.camera import source_pixel
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
+from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
 from scopemap.pipeline import Step
 from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, FrameRecord, prepare_folder
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -134,6 +135,23 @@ def test_mesh_files_hold_the_surface(run: _Run) -> None:
     np.testing.assert_array_equal(ply.faces, run.result.mesh.faces)
     glb = trimesh.load(run.out / "mesh.glb", force="mesh", process=False)
     np.testing.assert_allclose(np.sort(glb.extents), np.sort(ply.extents) / 1000, rtol=1e-3)
+
+
+def test_surface_is_compared_with_the_video_in_the_light_of_the_lamp(run: _Run) -> None:
+    """The mesh has the colours of the tissue; unlit they would tell nothing about the surface."""
+    trajectory, depth = read_trajectory(run.out), DepthReader(run.out)
+    agreements: dict[bool, list[FrameAgreement]] = {True: [], False: []}
+    for step in run.steps:
+        depth_mm, pose = depth.read(step.frame.index), trajectory.T_world_camera[step.frame.index]
+        if step.frame.index != LOST and depth_mm is not None:
+            seen = (step.frame.camera, pose, step.frame.rgb, np.where(step.frame.valid, depth_mm, np.nan))
+            for lit, found in agreements.items():
+                found.append(compare_with_frame(run.result.mesh, *seen, albedo=lit)[0])
+    told = run.result.provenance["surface"]
+    # The store's JPEG changes little.
+    lit, unlit = (agreement_figures(agreements[lit])["ssim"] for lit in (True, False))
+    assert told["frames"] == len(agreements[True]) == FRAMES - 1
+    assert abs(told["ssim"] - lit) < 0.2 * abs(lit - unlit)
 
 
 def test_camera_and_settings_are_read_back(run: _Run) -> None:

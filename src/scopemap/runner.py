@@ -187,7 +187,8 @@ def _surface_agreement(fused: FusedSurface, frames: list[Frame]) -> dict[str, fl
     for frame in frames if len(fused.mesh.faces) else []:
         if frame.T_world_camera is not None and frame.depth_mm is not None:
             depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
-            found, _ = compare_with_frame(fused.mesh, frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+            seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+            found, _ = compare_with_frame(fused.mesh, *seen, albedo=fused.settings.colours == "albedo")
             agreements.append(found)
     return agreement_figures(agreements) if agreements else {}
 

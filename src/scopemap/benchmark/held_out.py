@@ -117,7 +117,7 @@ class RunFrames:
 
         Raises `InputError` where the frames are too few for that.
         """
-        held_out = self.indices[every // 2 :: every]
+        held_out = frozenset(self.indices[every // 2 :: every])
         if not held_out:
             raise InputError(f"the run {self._run} has too few tracked frames to keep every {every}th out of fusion")
         mesh, missing = self.fuse(without=held_out), _lpips_missing()
