@@ -73,7 +73,7 @@ def test_distant_keyframes_are_matched_along_those_between() -> None:
 
 
 def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_back() -> None:
-    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
+    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2, 3))), DisFlow())
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
         view = plane_scene.see(pose)
