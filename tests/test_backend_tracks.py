@@ -72,6 +72,23 @@ def test_distant_keyframes_are_matched_along_those_between() -> None:
     assert np.median(along) < 0.25
 
 
+def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_back() -> None:
+    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2, 3))), DisFlow())
+    poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
+    for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
+        view = plane_scene.see(pose)
+        frame = Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose)
+        tracks.add(frame, map_number)
+        if map_number == 1:
+            assert all(past.composed is None for past in tracks._recent[0])
+    points, observations = tracks.collected()
+    pairs = set(zip(points.host[observations.point].tolist(), observations.keyframe.tolist(), strict=True))
+    assert pairs == {(0, 1), (1, 0), (1, 3), (3, 1), (0, 3), (3, 0)}
+    # To the last keyframe the camera moved by 6 mm from the first one, by 4 mm from the second one.
+    first, second = (np.median(past.composed[0][..., 0]) for past in list(tracks._recent[0])[:2] if past.composed)
+    assert first / second == pytest.approx(1.5, abs=0.05)
+
+
 def test_patches_that_differ_are_no_observations() -> None:
     view, rng = plane_scene.see(plane_scene.pose()), np.random.default_rng(0)
     image, other = (

@@ -106,6 +106,9 @@ def test_tissue_that_moves_is_not_triangulated() -> None:
 
 def test_one_neighbour_is_not_enough() -> None:
     assert triangulate_depth(_view(MIDDLE), [_view(2)], CAMERA, DisFlow()) is None
+    blind = _view(6)
+    blind.depth_mm[:] = np.nan
+    assert triangulate_depth(_view(MIDDLE), [_view(2), blind], CAMERA, DisFlow()) is None
 
 
 def test_neighbours_are_on_both_sides_and_have_parallax() -> None:

@@ -172,7 +172,7 @@ class _Run:
     def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
         """Yield the stored frames that are in no submap, as tracked."""
         submapped = {index for submap in submaps for index in submap.frames}
-        return self.pipeline.fusion.store.frames([r.index for r in self.records if r.index not in submapped])
+        return self.pipeline.fusion.store.frames({r.index for r in self.records if r.index not in submapped})
 
     def _write_depth(self, frame: Frame) -> Frame:
         """Write the final depth of a frame."""

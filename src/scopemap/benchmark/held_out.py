@@ -83,7 +83,7 @@ class SurfaceAgreement:
 
 
 class RunFrames:
-    """The frames of a run's surface, read again from its folder and its input, in a temporary file until `close`.
+    """The frames of a run's surface, read again from its folder and its input, in an unnamed file there until `close`.
 
     fusion : settings instead of the run's. Raises `InputError` where the run has no surface, kept no depth, or its
     input is not there any more.
@@ -94,7 +94,7 @@ class RunFrames:
         fusion = fusion or config.fusion
         if config.fusion.voxel_mm is None or not config.fusion.enabled:
             raise InputError(f"the run {run} has no surface that could be compared with its video")
-        self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore()
+        self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore(run)
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
         for frame in _frames(run, config):
@@ -102,7 +102,7 @@ class RunFrames:
             self.indices.append(frame.index)
 
     def close(self) -> None:
-        """Delete the temporary file."""
+        """Delete the unnamed file."""
         self._store.close()
 
     def fuse(self, without: Collection[int] = ()) -> trimesh.Trimesh:

@@ -53,7 +53,8 @@ def extract_mesh(
     space that a fold hides behind its silhouette. Components with
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
     `vertex_attributes["confidence"]`: (V,) float32, 0..1, 1 - exp(-weight / 1.5): rises with the number of frames that
-    saw a vertex, and falls with their distance, obliqueness and uncertainty.
+    saw a vertex, and falls with their distance, obliqueness and uncertainty; the latter beside the median of its
+    frame: a frame that is uncertain everywhere counts like any other.
 
     median_level : median grey level, 0..255, that the colours are scaled to; None: they stay as they are.
     """

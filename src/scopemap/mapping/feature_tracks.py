@@ -33,7 +33,7 @@ class _FlowKeyframe:
 
     number : among all keyframes. number_in_map : among those of its map. corners : (n, 2) int px; the first of them is
     point `first_point`. pattern : (H, W) uint8 as `normalised_brightness`. composed : flows to the latest
-    keyframe of its map and back, None: it is the latest.
+    keyframe of its map and back, None: it is the latest, or the camera has been in another map since.
     """
 
     number: int
@@ -79,11 +79,17 @@ class FeatureTracks:
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self._keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         recent = self._recent[map_number]
+        self._forget_flows_of_other_maps(map_number)
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self._keyframe_count, number_in_map, keyframe.rgb, keyframe.valid, corners, first)
         self._match_with(recent, new)
         recent.append(new)
         self._keyframe_count += 1
+
+    def _forget_flows_of_other_maps(self, map_number: int) -> None:
+        """Keep the flows of one map only: with each new map memory would grow by tens of megabytes."""
+        for past in (past for other, recent in self._recent.items() if other != map_number for past in recent):
+            past.composed = None
 
     def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
         """Match a new keyframe both ways with recent ones of its map."""
@@ -94,6 +100,8 @@ class FeatureTracks:
             flows = step
             if past.composed is not None:
                 flows = _composed(past.composed[0], step[0]), _composed(step[1], past.composed[1])
+            elif past is not recent[-1]:
+                flows = self._flow.estimate_both(past.rgb, new.rgb)
             past.composed = flows
             if new.number_in_map - past.number_in_map in self.settings.keyframe_gaps:
                 if past is not recent[-1]:

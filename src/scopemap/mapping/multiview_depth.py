@@ -132,7 +132,7 @@ def triangulate_depth(
     total = np.zeros_like(view.depth_mm)
     for _ in range(_WARPS):
         start = view._replace(depth_mm=view.depth_mm * np.exp(total))
-        estimates = [_estimate(start, neighbour, camera, flow) for neighbour in neighbours]
+        estimates = [found for n in neighbours if (found := _estimate(start, n, camera, flow)).information.any()]
         if len(estimates) < 2:
             return None
         stacks = (np.stack(parts) for parts in zip(*estimates, strict=True))
