@@ -104,6 +104,23 @@ def test_tissue_that_moves_is_not_triangulated() -> None:
     assert triangulate_depth(_view(MIDDLE), neighbours, CAMERA, DisFlow()) is None
 
 
+def test_a_wall_without_texture_is_not_triangulated() -> None:
+    """Flow sees nothing there, so neighbours would agree on whatever depth they start from."""
+    flat = [_view(number, 0.2)._replace(contrast=np.full((128, 160, 3), 128, np.uint8)) for number in range(2, 7)]
+    assert triangulate_depth(flat[2], [flat[0], flat[1], flat[3], flat[4]], CAMERA, DisFlow()) is None
+
+
+def test_what_one_neighbour_sees_alone_keeps_its_depth() -> None:
+    view, neighbours = _view(MIDDLE, 0.1), [_view(number, 0.1) for number in (2, 3, 5, 6)]
+    for neighbour in neighbours[1:]:
+        neighbour.depth_mm[:, :60] = np.nan
+    found = triangulate_depth(view, neighbours, CAMERA, DisFlow())
+    assert found is not None
+    assert np.abs(found.log_factor[20:-20, 90:140]).mean() > 0.08
+    assert np.abs(found.log_factor[20:-20, 12:30]).mean() < 0.06
+    assert found.sigma[20:-20, 12:30].mean() > 2 * found.sigma[20:-20, 90:140].mean()
+
+
 def test_one_neighbour_is_not_enough() -> None:
     assert triangulate_depth(_view(MIDDLE), [_view(2)], CAMERA, DisFlow()) is None
     blind = _view(6)
@@ -155,3 +172,18 @@ def test_every_frame_gets_the_depth_of_the_keyframes_around_it(depths: KeyframeD
     middle = found[MIDDLE]
     assert middle is not None
     assert _error(middle.depth_mm) < 0.02
+
+
+def test_a_keyframe_that_fails_takes_over_its_neighbours_depth() -> None:
+    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
+        rgb, depth_mm = _seen(_pose(number))
+        return (np.zeros_like(rgb) if number == MIDDLE else rgb), (depth_mm * np.exp(_bias())).astype(np.float32)
+
+    poses = {number: _pose(number) for number in range(FRAMES)}
+    depths = KeyframeDepths(read, poses, [1, MIDDLE, 7], CAMERA, DisFlow())
+    found = [depths.depth(number, _view(number, _bias()).depth_mm) for number in range(FRAMES)]
+    depths.close()
+    assert depths.triangulated == 2
+    middle = found[MIDDLE]
+    assert middle is not None
+    assert _error(middle.depth_mm) < 0.03

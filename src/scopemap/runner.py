@@ -157,7 +157,8 @@ class _Run:
     def _triangulated_depths(self, final: FinalFrames) -> KeyframeDepths | None:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
         flow = self.pipeline.estimators.keyframe_flow
-        if not self.config.mapping.triangulate_depth or not final.keyframes or flow.name == "none":
+        used = self.write is not None or self.config.fusion.enabled
+        if not (used and self.config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
 

@@ -35,13 +35,13 @@ _FLOW_SIGMA_PX, _VIEW_SIGMA, PRIOR_SIGMA = 0.3, 0.03, 0.3
 # Above this median standard deviation tissue moves or poses are wrong: the predicted depth is better.
 MAX_SIGMA = 0.08
 _MAX_FLOW_PX, _MAX_LOG_FACTOR = 20.0, 0.5
+_MIN_SPREAD = 4.0  # grey levels of normalised contrast, standard deviation
 _CAUCHY, _ITERATIONS, _WARPS = 2.0, 4, 2
 _CACHED_VIEWS = 24
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
 _CONTRAST_PX, _DISAGREEMENT_PX, _SMOOTHING_PX, _WIDE_PX = 6.0, 6.0, 2.0, 16.0
-# Larger differences between a frame's depth and its keyframe's are an occlusion.
-_MAX_CARRIED = 0.25
+_MAX_CARRIED = 0.25  # larger differences between a frame's depth and its keyframe's are an occlusion
 
 
 class StereoView(NamedTuple):
@@ -109,9 +109,8 @@ def choose_neighbours(
     points = points[np.isfinite(points[:, 2])]
     if not len(points):
         return []
+    order, chosen = sorted(T_world_camera), list[int]()
     far = points[:, 2] >= np.percentile(points[:, 2], _FAR_PERCENTILE)
-    chosen: list[int] = []
-    order = sorted(T_world_camera)
     for side in ([number for number in order if number < index], [number for number in order if number > index]):
         motions = [inverse(T_world_camera[number]) @ T_world_camera[index] for number in side]
         parallax = np.array([_parallax_px(points, far, camera, T) for T in motions]).reshape(-1, 2)
@@ -136,16 +135,15 @@ def triangulate_depth(
         if len(estimates) < 2:
             return None
         stacks = (np.stack(parts) for parts in zip(*estimates, strict=True))
-        log_factor, information, scatter = _combined(*stacks)
-        known = (information > 0).astype(np.float32)
-        share = np.maximum(_blurred(known, _DISAGREEMENT_PX), np.float32(1e-3))
+        log_factor, information, scatter, compared = _combined(*stacks)
+        share, few = _blurred(compared, _DISAGREEMENT_PX), np.float32(0.01)  # where few can be compared depth stays
         with np.errstate(divide="ignore"):
-            variance = _blurred(scatter, _DISAGREEMENT_PX) / share + 1 / information
+            variance = (_blurred(scatter, _DISAGREEMENT_PX) + few * PRIOR_SIGMA**2) / (share + few) + 1 / information
         if not np.sqrt(np.median(variance[usable])) <= MAX_SIGMA:
             return None
         shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
         total = _smoothed(shrunk, information)
-    sigma = np.where(known > 0, np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2)), PRIOR_SIGMA)
+    sigma = np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2))
     return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
 
 
@@ -207,14 +205,15 @@ class KeyframeDepths:
         Numbers must not decrease from call to call.
         """
         place = bisect_right(self.keyframes, index)
-        around = self.keyframes[max(place - 1, 0) : place + 1]
-        for keyframe in self.keyframes[max(place - 1, 0) : place + 2]:
+        is_keyframe = place > 0 and self.keyframes[place - 1] == index
+        around = self.keyframes[max(place - 1 - is_keyframe, 0) : place + 1]
+        for keyframe in [*around, *self.keyframes[place + 1 : place + 2]]:
             if keyframe not in self._found:
                 self._found[keyframe] = self._worker.submit(self._triangulate, keyframe)
         for keyframe in [number for number in self._found if number < around[0]]:
             del self._found[keyframe]
-        if index in around:
-            return self._found[index].result()
+        if is_keyframe and (own := self._found[index].result()) is not None:
+            return own
         known = [(number, found) for number in around if (found := self._found[number].result()) is not None]
         T_camera_world = inverse(self._poses[index])
         relative = [(inverse(T_camera_world @ self._poses[number]), found) for number, found in known]
@@ -227,8 +226,8 @@ class KeyframeDepths:
     @property
     def description(self) -> str:
         """A note on how many keyframes were triangulated; complete after the last frame."""
-        text = f"depth: {self.triangulated} of {len(self.keyframes)} keyframes triangulated against frames around them"
         rest = "; the others keep the predicted depth: views disagree (moving tissue, uncertain poses) or are too few"
+        text = f"depth: {self.triangulated} of {len(self.keyframes)} keyframes triangulated against frames around them"
         return text + (rest if self.triangulated < len(self.keyframes) else "")
 
     def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
@@ -259,12 +258,9 @@ def _parallax_px(
     u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
     inside = (seen[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     slope = np.hypot(camera.fx * (moved[:, 0] - x * moved[:, 2]), camera.fy * (moved[:, 1] - y * moved[:, 2])) / depth
-    near_enough = inside.sum() > _MIN_OVERLAP * len(points)
-    far_enough = (inside & far).sum() > _MIN_OVERLAP * far.sum()
-    return (
-        float(np.median(slope[inside])) if near_enough else 0.0,
-        float(np.median(slope[inside & far])) if far_enough else 0.0,
-    )
+    seen_far = inside & far
+    all_px = float(np.median(slope[inside])) if inside.sum() > _MIN_OVERLAP * len(points) else 0.0
+    return all_px, float(np.median(slope[seen_far])) if seen_far.sum() > _MIN_OVERLAP * far.sum() else 0.0
 
 
 def _estimate(view: StereoView, neighbour: StereoView, camera: PinholeCamera, flow: FlowEstimator) -> _Estimate:
@@ -278,7 +274,10 @@ def _estimate(view: StereoView, neighbour: StereoView, camera: PinholeCamera, fl
     # A neighbourhood that moves across the epipolar lines moves along them as well.
     variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _blurred(across, _DISAGREEMENT_PX)
     information = slope / (variance_px + np.float32(_VIEW_SIGMA**2) * slope)
-    return _Estimate(log_factor, information)
+    # Flow of a picture without texture is what it started from.
+    grey = view.contrast[..., 0].astype(np.float32)
+    spread = _blurred(grey**2, _DISAGREEMENT_PX) - _blurred(grey, _DISAGREEMENT_PX) ** 2
+    return _Estimate(log_factor, np.where(spread > _MIN_SPREAD**2, information, np.float32(0)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -342,14 +341,14 @@ def _epipolar(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _combined(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _combined(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Combine (N, H, W) estimates by Cauchy's M-estimator.
 
-    Returns ln factor, information and the variance of one estimate, each (H, W) float32.
+    Returns ln factor, information, the variance of one estimate, and 1 where that is known, each (H, W) float32.
     """
     count, height, width = log_factor.shape
-    planes = np.zeros((3, height, width), np.float32)
-    mean, total, scatter = planes[0], planes[1], planes[2]
+    planes = np.zeros((4, height, width), np.float32)
+    mean, total, scatter, compared = planes[0], planes[1], planes[2], planes[3]
     for row in range(height):
         for col in range(width):
             value, weight, views = 0.0, 0.0, 0
@@ -373,8 +372,9 @@ def _combined(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarr
                 sum_weight += w
                 spread += w * min((log_factor[n, row, col] - value) ** 2, 1.0)
             mean[row, col], total[row, col] = value, weight
-            scatter[row, col] = spread / sum_weight * views / max(views - 1, 1)
-    return mean, total, scatter
+            if views > 1:
+                scatter[row, col], compared[row, col] = spread / sum_weight * views / (views - 1), 1.0
+    return mean, total, scatter, compared
 
 
 def _blurred(image: np.ndarray, sigma_px: float) -> np.ndarray:
