@@ -29,7 +29,6 @@ HEADER = (
     "| run | frames tracked | alignment | ATE | rotation mean / max | 10: mm / deg | TLR | mesh to truth | ms |\n"
     "|---|---|---|---|---|---|---|---|---|"
 )
-LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
 SHADING = {"depth.backend": "shading"}
 NO_SURFACE = {"fusion.enabled": False}
 TRACKED = {"mapping.method": "none"}
@@ -89,27 +88,25 @@ def real_runs(data: Path) -> Iterator[Run]:
     near_far = {"depth.near_far_mm": (13.5, 100.0)}
     raft = {"networks.flow": "raft-small", "networks.perceptual": "lpips"}
     yield Run("cecum_t1_a, Depth Anything files, near-far, RAFT small, LPIPS", cecum, "sim3", files | near_far | raft)
-    yield Run("the same, DIS, structural similarity", cecum, "sim3", files | near_far | LIGHT)
-    yield Run("the same, no back end", cecum, "sim3", files | near_far | LIGHT | TRACKED)
+    yield Run("the same, DIS, structural similarity", cecum, "sim3", files | near_far)
+    yield Run("the same, no back end", cecum, "sim3", files | near_far | TRACKED)
     one_field = {"input.deinterlace": True}
-    yield Run("the same, one field of each picture", cecum, "sim3", files | near_far | LIGHT | one_field)
-    yield Run("anchored by shading, DIS", cecum, "sim3", files | {"depth.anchor": "shading"} | LIGHT)
+    yield Run("the same, one field of each picture", cecum, "sim3", files | near_far | one_field)
+    yield Run("anchored by shading, DIS", cecum, "sim3", files | {"depth.anchor": "shading"})
     yield Run("cecum_t1_a, scopenet, RAFT small, LPIPS", cecum, "sim3", raft)
-    yield Run("cecum_t1_a, scopenet, DIS, structural similarity", cecum, "sim3", LIGHT)
-    yield Run("the same, no back end", cecum, "sim3", LIGHT | TRACKED)
+    yield Run("cecum_t1_a, scopenet, DIS, structural similarity", cecum, "sim3")
+    yield Run("the same, no back end", cecum, "sim3", TRACKED)
     yield Run("cecum_t1_a, shading, RAFT small, LPIPS", cecum, "sim3", SHADING | raft)
-    yield Run("cecum_t1_a, shading, DIS, structural similarity", cecum, "sim3", SHADING | LIGHT)
-    yield Run("the same, no back end", cecum, "sim3", SHADING | LIGHT | TRACKED)
+    yield Run("cecum_t1_a, shading, DIS, structural similarity", cecum, "sim3", SHADING)
+    yield Run("the same, no back end", cecum, "sim3", SHADING | TRACKED)
     yield Run(
         "trans_t1_a, true depth",
         trans,
         "se3",
-        {"depth.backend": f"files:{trans}", "fusion.advanced.min_weight": 0.5} | LIGHT,
+        {"depth.backend": f"files:{trans}", "fusion.advanced.min_weight": 0.5},
     )
     room = {"fusion.voxel_mm": 10, "fusion.truncation_mm": 40, "fusion.max_depth_mm": 4000}
-    yield Run(
-        "7scenes_kitchen_100f, measured depth", kitchen, "sim3", {"depth.backend": f"files:{kitchen}"} | room | LIGHT
-    )
+    yield Run("7scenes_kitchen_100f, measured depth", kitchen, "sim3", {"depth.backend": f"files:{kitchen}"} | room)
 
 
 def phantom_runs(folder: Path, data: Path) -> Iterator[Run]:
@@ -124,10 +121,10 @@ def phantom_runs(folder: Path, data: Path) -> Iterator[Run]:
     for number, (name, spec) in enumerate(specs.items()):
         source = folder / f"phantom{number}"
         write_phantom(spec, source)
-        yield Run(f"{name}, true depth", source, "origin", {"depth.backend": f"files:{source}"} | LIGHT)
-        yield Run(f"{name}, scopenet", source, "sim3", LIGHT)
-        yield Run(f"{name}, scopenet, no back end", source, "sim3", LIGHT | TRACKED)
-        yield Run(f"{name}, shading", source, "sim3", SHADING | LIGHT)
+        yield Run(f"{name}, true depth", source, "origin", {"depth.backend": f"files:{source}"})
+        yield Run(f"{name}, scopenet", source, "sim3")
+        yield Run(f"{name}, scopenet, no back end", source, "sim3", TRACKED)
+        yield Run(f"{name}, shading", source, "sim3", SHADING)
 
 
 def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
@@ -146,7 +143,7 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
             "default": {},
             "always adjusted": {"mapping.advanced.max_sigma_px": 99.0, "mapping.advanced.max_depth_change": 9.0},
         }.items():
-            yield Run(f"{name}, {variant}", source, "sim3", LIGHT | NO_SURFACE | changes)
+            yield Run(f"{name}, {variant}", source, "sim3", NO_SURFACE | changes)
 
 
 def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
@@ -161,14 +158,14 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
     files = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
     fast = (cecum, "cecum_t1_a, every third frame", files, slice(None, None, 3))
     for source, where, settings, frames in (fast, (colon, "colon, scopenet", {}, None)):
-        light = settings | NO_SURFACE | LIGHT
+        light = settings | NO_SURFACE
         for name, changes in ({"default": {}} | BACK_END).items():
             yield Run(f"{name}: {where}", source, "sim3", light | changes, frames)
         for name, changes in ({"as tracked": {}} | FRONT_END).items():
             yield Run(f"{name}: {where}", source, "sim3", light | TRACKED | changes, frames)
     for name, changes in ({"default": {}} | LOOPS).items():
-        yield Run(f"{name}: colon that returns, scopenet", returning, "sim3", NO_SURFACE | LIGHT | changes)
-    exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE | LIGHT
+        yield Run(f"{name}: colon that returns, scopenet", returning, "sim3", NO_SURFACE | changes)
+    exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE
     for name, changes in ({"as tracked": {}} | PHOTOMETRIC).items():
         yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
 
@@ -177,7 +174,7 @@ def photometric_runs(data: Path) -> Iterator[Run]:
     """Yield the ablations of photometric alignment where it gives every pose: fast motion, predicted depth."""
     cecum = data / "endoscopy/c3vd/cecum_t1_a"
     alone = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
-    alone |= NO_SURFACE | LIGHT | TRACKED | {"tracking.advanced.corner_depth_sigma": 0.0}
+    alone |= NO_SURFACE | TRACKED | {"tracking.advanced.corner_depth_sigma": 0.0}
     for name, changes in ({"photometric alignment alone": {}} | PHOTOMETRIC).items():
         where = "cecum_t1_a, every third frame, Depth Anything"
         yield Run(f"{name}: {where}", cecum, "sim3", alone | changes, slice(None, None, 3))

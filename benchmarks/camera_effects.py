@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import LIGHT, NO_SURFACE
+from accuracy import NO_SURFACE
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
@@ -64,7 +64,7 @@ def row(name: str, source: Path) -> str:
         if step.frame.T_world_camera is not None:
             tracked[step.frame.index] = step.frame.T_world_camera
 
-    result = reconstruct(open_sequence(source), Config.load(settings=LIGHT | NO_SURFACE), observers=(note,))
+    result = reconstruct(open_sequence(source), Config.load(settings=NO_SURFACE), observers=(note,))
     adjusted, truth = result.trajectory, read_reference(source)
     poses = np.stack([tracked.get(int(n), T) for n, T in zip(adjusted.indices, adjusted.T_world_camera, strict=True)])
     before = replace(adjusted, T_world_camera=poses)

@@ -80,7 +80,7 @@ def networks(models: Sequence[str]) -> dict[str, Callable[[], Estimator]]:
     from scopemap.depth.scopenet.estimator import ScopeNetDepth
 
     def make(model: str) -> Estimator:
-        network = ScopeNetDepth.from_file(model)
+        network = ScopeNetDepth(model)
 
         def estimate(frame: Frame) -> Prediction:
             found = network.estimate(frame)

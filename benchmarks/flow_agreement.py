@@ -25,7 +25,6 @@ from scopemap.pipeline import Pipeline, Step
 from scopemap.tracking.track import FrameTracker
 
 LEAST_SHARE = 0.1
-LIGHT = {"networks.flow": "dis", "networks.perceptual": "structure"}
 
 
 class Agreement(NamedTuple):
@@ -84,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--set", dest="settings", action="append", default=[])
     options = parser.parse_args(arguments)
     fixed = {"mapping.method": "none", "fusion.enabled": "false"}
-    config = Config.load(settings=LIGHT | fixed | parse_settings(options.settings))
+    config = Config.load(settings=fixed | parse_settings(options.settings))
     found = measure(options.input, options.frames, config)
     print(
         f"{options.input.name}: tissue moves by {found.moved_px:.1f} px a frame, poses are {found.off_px:.2f} px from "

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import LIGHT, NO_SURFACE, TRACKED
+from accuracy import NO_SURFACE, TRACKED
 
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
@@ -37,7 +37,7 @@ VARIANTS: dict[str, dict[str, Any]] = {"default": {}, "no back end": TRACKED}
 
 def run(source: Path, settings: dict[str, Any]) -> Reconstruction:
     """Reconstruct a phantom with scopenet."""
-    return reconstruct(open_sequence(source), Config.load(settings=LIGHT | NO_SURFACE | settings))
+    return reconstruct(open_sequence(source), Config.load(settings=NO_SURFACE | settings))
 
 
 def without(trajectory: Trajectory, frames: list[int]) -> Trajectory:

@@ -4,7 +4,7 @@
 
 Without an input a colon phantom of 337x270 px is rendered first. Prints median milliseconds per frame and the ratio to
 one DIS flow pair in the same run: machines differ and are shared, ratios travel better. The embedded depth network is
-timed on the same frames at 320x256 px, whichever depth the run uses, with torch on one thread and on two.
+timed on the same frames at 320x256 px, whichever depth the run uses, on one thread and on two.
 """
 
 from __future__ import annotations
@@ -87,18 +87,14 @@ def measure(path: Path, frames: int, config: Config) -> tuple[dict[str, float], 
 
 def measure_network(path: Path, frames: int, model: str) -> dict[str, float]:
     """Return milliseconds per frame of the embedded depth network on the CPU, by threads; `model` as in Config."""
-    import torch
-
     from scopemap.depth.scopenet.estimator import ScopeNetDepth
 
     images = [frame for frame, _ in open_sequence(path, size=NETWORK_SIZE, frames=slice(0, frames))]
-    network, threads_before = ScopeNetDepth.from_file(model, device="cpu"), torch.get_num_threads()
     seconds: dict[str, list[float]] = defaultdict(list)
     for threads, words in ((1, "1 thread"), (2, "2 threads")):
-        torch.set_num_threads(threads)
+        network = ScopeNetDepth(model, threads=threads)
         for frame in images:
             timed(network.estimate, f"depth scopenet {NETWORK_SIZE[0]}x{NETWORK_SIZE[1]}, {words}", seconds)(frame)
-    torch.set_num_threads(threads_before)
     return {part: 1e3 * float(np.median(values[WARM_UP:])) for part, values in seconds.items()}
 
 

@@ -69,7 +69,7 @@ TRUTH_HEAD = (
     "| clip | ATE mm | keyframes' depth, AbsRel | mesh to truth mm, mean | truth to mesh mm, mean (median) |\n"
     "|---|---|---|---|---|"
 )
-NO_DOWNLOAD = ("depth.backend=scopenet", "networks.flow=dis", "networks.perceptual=structure")
+NO_DOWNLOAD = "depth.backend=scopenet"
 _CLIPPED_MM = 99.9
 
 
@@ -106,7 +106,7 @@ def measure(name: str, source: Path, options: argparse.Namespace, out: Path) -> 
         run, fusion = options.runs / name, Config.load(settings=dict(one.split("=", 1) for one in options.set)).fusion
     else:
         run, fusion = out / name, None
-        changes = [word for one in (*NO_DOWNLOAD, *options.set) for word in ("--set", one)]
+        changes = [word for one in (NO_DOWNLOAD, *options.set) for word in ("--set", one)]
         scopemap("run", str(source), "--out", str(run), "--overwrite", "--quiet", *changes)
     with closing(RunFrames(run, fusion)) as frames:
         started = time.perf_counter()

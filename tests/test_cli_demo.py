@@ -16,7 +16,8 @@ import pytest
 from scopemap.benchmark import demonstration
 from scopemap.benchmark.demonstration import Demonstration
 from scopemap.cli import main
-from scopemap.errors import InputError, SettingsError
+from scopemap.config import Config
+from scopemap.errors import InputError
 from scopemap.io import weights
 
 TINY = replace(demonstration.PHANTOM, frames=8, width=160, height=128)
@@ -48,7 +49,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def demo(out: Path, nothing_outside: Path) -> Demonstration:
     demonstration.prepare_out(out, overwrite=False)
     assert demonstration.render(out, TINY)
-    return demonstration.run_on_phantom(out, demonstration.demo_config(SETTINGS))
+    return demonstration.run_on_phantom(out, Config.load("default", settings=SETTINGS))
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +86,7 @@ def test_nothing_from_outside_is_used(demo: Demonstration, nothing_outside: Path
     assert list(nothing_outside.iterdir()) == []
     parts = demo.result.provenance["estimators"]
     assert (parts["depth"], parts["model"]) == ("scopenet", "that come with the package")
-    assert [name for name in parts if "sha256" in name] == ["sha256 scopenet.safetensors"]
-
-
-def test_weights_that_happen_to_be_there_change_nothing() -> None:
-    assert demonstration.demo_config({}).networks.perceptual == "structure"
-    assert demonstration.demo_config({"networks.perceptual": "lpips"}).networks.perceptual == "lpips"
-    with pytest.raises(SettingsError, match=r"did you mean 'tracking"):
-        demonstration.demo_config({"tracking.hubert": 1})
+    assert [name for name in parts if "sha256" in name] == ["sha256 scopenet.onnx"]
 
 
 def test_pictures_show_something(demo: Demonstration, out: Path) -> None:

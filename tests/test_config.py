@@ -263,6 +263,15 @@ def test_renamed_settings_exist_and_removed_ones_do_not() -> None:
     assert not (set(RENAMED) | REMOVED) & names
 
 
+def test_what_depended_on_the_machine_s_weights_is_what_the_preset_names(tmp_path: Path) -> None:
+    file = tmp_path / "old.toml"
+    file.write_text('networks.flow = "auto"\nnetworks.perceptual = "auto"\n')
+    assert Config.load(file=file).networks == Config().networks
+    assert Config.load("paper", file=file).networks.flow == "raft-large"
+    with pytest.raises(SettingsError, match=r"networks\.perceptual"):
+        Config.load(settings={"networks.perceptual": "auto"})
+
+
 def test_the_page_of_settings_is_the_generated_one() -> None:
     page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     assert page == settings_page(), "docs/settings.md is out of date: python docs/settings_page.py writes it"

@@ -259,17 +259,16 @@ def test_weights_of_several_seeds_share_a_row_with_mean_and_range() -> None:
 
 
 def test_each_weights_file_is_an_estimator_that_tells_sigma(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
+    from training.export import export
+    from training.network import ScopeNet
 
-    from scopemap.depth.scopenet.network import ScopeNet
-
-    files = [tmp_path / f"seed{seed}" / "weights.safetensors" for seed in (0, 1)]
+    files = [tmp_path / f"seed{seed}" / "weights.onnx" for seed in (0, 1)]
     for file in files:
         file.parent.mkdir()
-        save_file(ScopeNet().state_dict(), file)
+        export(ScopeNet().eval(), file, {})
     makers = bench.networks([str(file) for file in files])
-    assert list(makers) == ["scopenet seed0/weights.safetensors", "scopenet seed1/weights.safetensors"]
-    found = makers["scopenet seed1/weights.safetensors"]()(frame())
+    assert list(makers) == ["scopenet seed0/weights.onnx", "scopenet seed1/weights.onnx"]
+    found = makers["scopenet seed1/weights.onnx"]()(frame())
     assert found.sigma_mm is not None
     assert found.depth_mm.shape == found.sigma_mm.shape == (48, 64)
     assert (found.depth_mm > 0).all()

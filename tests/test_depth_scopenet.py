@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from chosen_settings import chosen
-from safetensors.torch import save_file
 from torch import nn
 
 from scopemap.cameras.camera import PinholeCamera
@@ -20,12 +20,14 @@ from scopemap.cameras.rectification import Rectifier
 from scopemap.config import Config, DepthSettings
 from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.scopenet import estimator as module
-from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth, folded, load_network
-from scopemap.depth.scopenet.network import ScopeNet
+from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth, load_network
 from scopemap.depth.scopenet.planes import input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
+from scopemap.io.device import cpu_threads
+from training.export import export, read_network
+from training.network import ScopeNet
 
 HEIGHT, WIDTH = 50, 61  # no multiple of anything
 CAMERA = PinholeCamera(40.0, 42.0, 28.0, 26.0, WIDTH, HEIGHT)
@@ -48,19 +50,11 @@ def _shaken(network: ScopeNet) -> ScopeNet:
 
 
 def _small() -> ScopeNet:
+    """A small network; its weights are numbers that float16 has."""
     torch.manual_seed(2)
-    return _shaken(ScopeNet(widths=(8, 8, 16, 16, 16)))
-
-
-def _saved(file: Path, network: ScopeNet | None = None, **changes: Any) -> Path:
-    state = {name: value.half() for name, value in (network or _whole()).state_dict().items()} | changes
-    save_file({name: value.contiguous() for name, value in state.items() if value is not None}, file)
-    return file
-
-
-def _whole() -> ScopeNet:
-    torch.manual_seed(3)
-    return _shaken(ScopeNet())
+    network = _shaken(ScopeNet(widths=(8, 8, 16, 16, 16)))
+    network.load_state_dict({name: value.half() for name, value in network.state_dict().items()})
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +67,9 @@ def frame() -> Frame:
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _saved(tmp_path_factory.mktemp("weights") / "mine.safetensors")
+    path = tmp_path_factory.mktemp("weights") / "mine.onnx"
+    export(_small(), path, {})
+    return path
 
 
 def _told(network: nn.Module, planes: np.ndarray) -> np.ndarray:
@@ -82,20 +78,22 @@ def _told(network: nn.Module, planes: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rays_known", [True, False])
-def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(frame: Frame, rays_known: bool) -> None:
-    estimate = ScopeNetDepth(_small(), device="cpu", rays_known=rays_known).estimate(frame)
+def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(
+    frame: Frame, file: Path, rays_known: bool
+) -> None:
+    estimate = ScopeNetDepth(str(file), rays_known=rays_known).estimate(frame)
     told = _told(_small(), input_planes(frame.rgb, UNIT_RAYS if rays_known else None, frame.valid))
     assert np.ptp(told[0]) > 0.1
     depth_mm = np.exp(told[0]) * UNIT_RAYS[..., 2]
     assert estimate.kind == "depth"
     assert estimate.focal_px is None
-    np.testing.assert_allclose(estimate.values, depth_mm, rtol=1e-4)
+    np.testing.assert_allclose(estimate.values, depth_mm, rtol=1e-5)
     assert estimate.sigma is not None
-    np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-4)
+    np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-5)
 
 
-def test_the_answer_has_the_frames_size_and_is_repeatable_and_whole(frame: Frame) -> None:
-    estimator = ScopeNetDepth(_small(), device="cpu")
+def test_the_answer_has_the_frames_size_and_is_repeatable_and_whole(frame: Frame, file: Path) -> None:
+    estimator = ScopeNetDepth(str(file))
     estimate, again = estimator.estimate(frame), estimator.estimate(frame)
     for array, twin in ((estimate.values, again.values), (estimate.sigma, again.sigma)):
         assert array is not None
@@ -106,8 +104,8 @@ def test_the_answer_has_the_frames_size_and_is_repeatable_and_whole(frame: Frame
         np.testing.assert_array_equal(array, twin)
 
 
-def test_the_network_is_told_the_mask_and_the_rays(frame: Frame) -> None:
-    estimator = ScopeNetDepth(_small(), device="cpu")
+def test_the_network_is_told_the_mask_and_the_rays(frame: Frame, file: Path) -> None:
+    estimator = ScopeNetDepth(str(file))
     plain = estimator.estimate(frame).values
     masked = estimator.estimate(replace(frame, valid=np.zeros_like(frame.valid))).values
     wide = replace(CAMERA, fx=20.0, fy=21.0)
@@ -116,31 +114,27 @@ def test_the_network_is_told_the_mask_and_the_rays(frame: Frame) -> None:
     assert np.isfinite(masked).all()
     unit_z = 1 / np.linalg.norm(wide.rays, axis=-1)
     assert np.abs(elsewhere / unit_z / (plain / UNIT_RAYS[..., 2]) - 1).max() > 1e-3
-    blind = ScopeNetDepth(_small(), device="cpu", rays_known=False)
+    blind = ScopeNetDepth(str(file), rays_known=False)
     one, two = blind.estimate(frame).values, blind.estimate(replace(frame, camera=wide)).values
     np.testing.assert_allclose(two / unit_z, one / UNIT_RAYS[..., 2], rtol=1e-5)
 
 
-def test_folding_leaves_no_normalisation_and_the_same_function(frame: Frame) -> None:
-    planes = input_planes(frame.rgb, UNIT_RAYS, frame.valid)
-    fast = folded(_small())
-    assert not any(isinstance(part, nn.BatchNorm2d) for part in fast.modules())
-    np.testing.assert_allclose(_told(fast, planes), _told(_small(), planes), atol=1e-5)
+def test_the_package_s_network_answers_as_torch_does(frame: Frame) -> None:
+    shipped = Path(module.__file__).parent / WEIGHTS_NAME
+    told = _told(read_network(shipped), input_planes(frame.rgb, UNIT_RAYS, frame.valid))
+    estimate = ScopeNetDepth().estimate(frame)
+    assert estimate.sigma is not None
+    np.testing.assert_allclose(np.log(estimate.values / UNIT_RAYS[..., 2]), told[0], atol=1e-5)
+    np.testing.assert_allclose(np.log(estimate.sigma / estimate.values / math.sqrt(2)), told[1], atol=1e-5)
 
 
-def test_a_network_in_training_is_put_to_evaluation(frame: Frame) -> None:
-    training = ScopeNetDepth(_small().train(), device="cpu").estimate(frame).values
-    np.testing.assert_array_equal(training, ScopeNetDepth(_small(), device="cpu").estimate(frame).values)
-
-
-def test_float16_weights_of_a_file_are_used_in_float32(frame: Frame, file: Path) -> None:
-    network = load_network(file)
-    assert {value.dtype for value in network.parameters()} == {torch.float32}
-    rounded = _whole()
-    rounded.load_state_dict({name: value.half() for name, value in rounded.state_dict().items()})
-    expected = ScopeNetDepth(rounded, device="cpu").estimate(frame).values
-    estimator = create_depth(chosen(DepthSettings, backend="scopenet", model=str(file)), SAME, "cpu")
-    np.testing.assert_array_equal(estimator.estimate(frame).values, expected)
+def test_threads_change_nothing(frame: Frame, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = (ScopeNetDepth(str(file), threads=n).estimate(frame).values for n in (1, 2))
+    np.testing.assert_array_equal(one, two)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert cpu_threads() == 3
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert 1 <= cpu_threads() <= (os.cpu_count() or 1)
 
 
 def test_the_weights_of_the_package_are_the_default(
@@ -152,14 +146,14 @@ def test_the_weights_of_the_package_are_the_default(
     origin = estimator.provenance()
     assert origin["model"] == "that come with the package"
     assert origin[f"sha256 {WEIGHTS_NAME}"] == weights.sha256_of(file)
-    named = ScopeNetDepth.from_file(str(file), "cpu").estimate(frame)
+    named = ScopeNetDepth(str(file)).estimate(frame)
     np.testing.assert_array_equal(estimator.estimate(frame).values, named.values)
 
 
 def test_what_is_shipped_is_small_and_fits() -> None:
     shipped = Path(module.__file__).parent / WEIGHTS_NAME
     assert shipped.stat().st_size <= 8_000_000
-    load_network(shipped)
+    assert load_network(shipped).get_modelmeta().custom_metadata_map["name"] == "scopenet"
 
 
 def test_what_is_shipped_is_what_the_model_card_describes() -> None:
@@ -182,7 +176,8 @@ def test_provenance_says_whose_weights_and_whether_the_rays_were_known(file: Pat
     assert origin == {
         "depth": "scopenet",
         "model": str(file),
-        "sha256 mine.safetensors": weights.sha256_of(file),
+        "sha256 mine.onnx": weights.sha256_of(file),
+        "runtime": f"onnxruntime {version('onnxruntime')}",
         "rays": rays,
     }
 
@@ -191,43 +186,30 @@ def test_an_installation_without_weights_says_what_to_do(tmp_path: Path, monkeyp
     monkeypatch.setattr(module.resources, "files", lambda package: tmp_path)
     monkeypatch.setattr(module, "__file__", str(tmp_path / "estimator.py"))
     with pytest.raises(WeightsError, match=r"installation lacks .*depth\.backend=shading"):
-        ScopeNetDepth.from_file()
-    with pytest.raises(WeightsError, match=r"names .*other\.safetensors, which is no file"):
-        ScopeNetDepth.from_file(str(tmp_path / "other.safetensors"))
+        ScopeNetDepth()
+    with pytest.raises(WeightsError, match=r"names .*other\.onnx, which is no file"):
+        ScopeNetDepth(str(tmp_path / "other.onnx"))
 
 
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"head.bias": None}, r"1 missing \(head\.bias"),
-        ({"more.weight": torch.zeros(3)}, r"1 unknown \(more\.weight"),
-        ({"head.bias": torch.zeros(5)}, r"1 of another shape \(head\.bias"),
-        ({"head.bias": torch.tensor([0.0, math.nan])}, r"1 not finite \(head\.bias"),
-    ],
-)
-def test_weights_that_do_not_fit_are_refused(changes: dict[str, Any], complaint: str, tmp_path: Path) -> None:
-    wrong = _saved(tmp_path / "wrong.safetensors", **changes)
-    with pytest.raises(WeightsError, match=complaint):
-        ScopeNetDepth.from_file(str(wrong))
+def test_files_that_are_no_scopenet_are_refused(file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    wrong = tmp_path / "wrong.onnx"
+    wrong.write_bytes(b"rubbish")
+    with pytest.raises(WeightsError, match=r"cannot load ScopeNet from .*wrong\.onnx.*depth\.model"):
+        ScopeNetDepth(str(wrong))
+    wrong.write_bytes(file.read_bytes().replace(b"planes", b"pictur"))
+    with pytest.raises(WeightsError, match=r"cannot load ScopeNet from .*planes"):
+        ScopeNetDepth(str(wrong))
+    broken = _small()
+    with torch.no_grad():
+        broken.head.bias[1] = math.nan
+    export(broken, wrong, {})
+    with pytest.raises(WeightsError, match=r"network in .*wrong\.onnx is not a ScopeNet that can be used"):
+        ScopeNetDepth(str(wrong))
+    assert capfd.readouterr() == ("", "")
 
 
-def test_weights_of_another_architecture_and_rubbish_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match="do not fit ScopeNet"):
-        load_network(_saved(tmp_path / "small.safetensors", _small()))
-    rubbish = tmp_path / "rubbish.safetensors"
-    rubbish.write_bytes(b"rubbish")
-    with pytest.raises(WeightsError, match="cannot load ScopeNet from"):
-        load_network(rubbish)
-
-
-def test_training_s_counters_may_be_left_out(tmp_path: Path) -> None:
-    names = [name for name in ScopeNet().state_dict() if name.endswith("num_batches_tracked")]
-    assert names
-    load_network(_saved(tmp_path / "bare.safetensors", **dict.fromkeys(names)))
-
-
-def test_its_millimetres_are_its_anchor_unless_another_is_asked_for(frame: Frame) -> None:
-    estimate = ScopeNetDepth(_small(), device="cpu").estimate(frame)
+def test_its_millimetres_are_its_anchor_unless_another_is_asked_for(frame: Frame, file: Path) -> None:
+    estimate = ScopeNetDepth(str(file)).estimate(frame)
     lit = replace(frame, rgb=np.full_like(frame.rgb, 120))
     own = create_anchor(chosen(DepthSettings, backend="scopenet"), "cpu")
     np.testing.assert_array_equal(own.depth_mm(estimate, lit), estimate.values)
@@ -246,8 +228,8 @@ def test_the_paper_names_its_own_depth() -> None:
     assert Config.load("paper").depth.backend == "depth-anything"
 
 
-def test_what_was_given_is_not_changed_by_the_answer(frame: Frame) -> None:
+def test_what_was_given_is_not_changed_by_the_answer(frame: Frame, file: Path) -> None:
     before = copy.deepcopy(frame)
-    ScopeNetDepth(_small(), device="cpu").estimate(frame)
+    ScopeNetDepth(str(file)).estimate(frame)
     np.testing.assert_array_equal(frame.rgb, before.rgb)
     np.testing.assert_array_equal(frame.valid, before.valid)

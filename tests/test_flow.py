@@ -231,14 +231,3 @@ def test_real_raft_agrees_with_dis(name: str, cecum: tuple[np.ndarray, np.ndarra
     dis = DisFlow().estimate(current, previous)
     assert np.median(np.linalg.norm(raft - dis, axis=-1)[30:-30, 30:-30]) < 1.5
     assert np.median(np.linalg.norm(raft, axis=-1)) > 1.0
-
-
-def test_auto_takes_raft_only_where_its_weights_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
-    assert create_flow("auto").name == "dis"
-
-
-@pytest.mark.real
-def test_auto_takes_raft_where_its_weights_are(monkeypatch: pytest.MonkeyPatch, real_data: Path) -> None:
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(real_data / "weights"))
-    assert create_flow("auto").name == "raft-small"

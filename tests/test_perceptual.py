@@ -13,7 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.depth.perceptual import LpipsAlex, StructureDistance, create_perceptual
+from scopemap.depth.perceptual import LpipsAlex, StructureDistance, create_perceptual, structural_similarity
 from scopemap.errors import SettingsError, WeightsError
 
 SHAPE = (70, 93, 3)
@@ -131,30 +131,39 @@ def test_unfit_backbones_are_refused(tmp_path: Path) -> None:
             LpipsAlex(device="cpu", checkpoint=tmp_path / file)
 
 
-def test_auto_takes_what_is_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_used_where_it_is_named_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
-    assert create_perceptual("auto", "cpu").name == "structure"
+    assert create_perceptual("structure", "cpu").name == "structure"
     with pytest.raises(WeightsError, match="scopemap models pull alexnet"):
         create_perceptual("lpips", "cpu")
     with pytest.raises(SettingsError, match="unknown perceptual distance 'vgg'"):
         create_perceptual("vgg")
     torch.save(_alexnet_state(), tmp_path / "alexnet_features_torch.pth")
     with pytest.raises(WeightsError, match="damaged"):
-        create_perceptual("auto", "cpu")
+        create_perceptual("lpips", "cpu")
 
 
 def test_images_must_fit(random_lpips: LpipsAlex) -> None:
     for measure in (random_lpips, StructureDistance()):
         with pytest.raises(ValueError, match="rgb_b"):
             measure.compare(_random_image(1), _random_image(1)[:-1])
-    assert set(StructureDistance().provenance()) == {"perceptual", "scikit-image"}
+
+
+def test_structural_similarity_is_that_of_scikit_image() -> None:
+    from skimage.metrics import structural_similarity as theirs
+
+    rng = np.random.default_rng(3)
+    one = cv2.GaussianBlur(rng.integers(0, 256, (40, 53), np.uint8), (0, 0), 2)
+    other = np.clip(one + rng.normal(0, 8, one.shape), 0, 255).astype(np.uint8)
+    _, expected = theirs(one, other, full=True)
+    np.testing.assert_allclose(structural_similarity(one, other), expected, atol=1e-10)
+    np.testing.assert_allclose(structural_similarity(one, one), 1.0)
 
 
 @pytest.mark.real
 def test_real_lpips(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(real_data / "weights"))
-    measure = create_perceptual("auto", "cpu")
-    assert measure.name == "lpips"
+    measure = create_perceptual("lpips", "cpu")
     assert len(measure.provenance()["sha256"]) == 64
     files = [real_data / "endoscopy/c3vd/cecum_t1_a" / f"{index}_color.jpg" for index in (50, 51, 90)]
     start, next_, later = (cv2.resize(cv2.imread(str(f)), (337, 270), interpolation=cv2.INTER_AREA) for f in files)

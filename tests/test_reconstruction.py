@@ -175,7 +175,7 @@ def test_provenance(run: _Run) -> None:
     assert "camera.yaml" in told["camera"]["source"]
     assert told["camera"]["fx"] == pytest.approx(80.0)
     assert told["estimators"]["anchor"] == "measured depth"
-    assert set(told["versions"]) >= {"scopemap", "numpy", "torch", "python"}
+    assert set(told["versions"]) >= {"scopemap", "numpy", "onnxruntime", "python"}
     parts = told["seconds"]
     assert {"read", "preprocess", "track and fuse", "fuse", "total"} <= set(parts)
     assert parts["total"] >= max(parts["track and fuse"], parts["fuse"])

@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 import torch
 from drawn_buffers import HEIGHT, WIDTH, sphere
-from safetensors.torch import load_file
 
-from scopemap.depth.scopenet.estimator import ScopeNetDepth
-from scopemap.depth.scopenet.network import TYPICAL_LOG_MM, ScopeNet
+from scopemap.depth.scopenet.estimator import ScopeNetDepth, load_network
 from training.buffers import create_store, open_store, thinned
 from training.calibrate import calibrated, fit_calibration
 from training.evaluate import Look, score_pictures
-from training.export import export
+from training.export import export, read_network
+from training.network import TYPICAL_LOG_MM, ScopeNet
 from training.recipe import Part, Recipe, Use
 from training.report import LOOKS, main, write_report
 from training.train import Training
@@ -69,14 +68,14 @@ def test_another_recipe_does_not_go_on_with_a_checkpoint(scenes, whole):
 
 
 def test_a_training_can_begin_from_the_weights_of_another(scenes, whole, tmp_path):
-    export(whole[0], tmp_path / "start.safetensors", {})
+    export(whole[0], tmp_path / "start.onnx", {})
     still = replace(RECIPE, seed=5, steps=1, rate=0.0, rate_end=0.0)
     folder = tmp_path / "run"
     folder.mkdir()
-    network = Training(still, scenes, folder, "cpu", lambda text: None, start=tmp_path / "start.safetensors").run()
-    begun = load_file(tmp_path / "start.safetensors")
+    network = Training(still, scenes, folder, "cpu", lambda text: None, start=tmp_path / "start.onnx").run()
+    begun = dict(read_network(tmp_path / "start.onnx").named_parameters())
     for name, value in network.named_parameters():
-        assert torch.equal(value, begun[name].float()), name
+        assert torch.equal(value, begun[name]), name
 
 
 def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
@@ -88,13 +87,19 @@ def test_training_learns_the_one_thing_there_is_to_learn(scenes, tmp_path):
 
 def test_the_exported_file_holds_the_network_in_half_precision(whole, tmp_path):
     network, _ = whole
-    export(network, tmp_path / "net.safetensors", {"seed": "0"})
-    tensors = load_file(tmp_path / "net.safetensors")
-    assert {t.dtype for t in tensors.values()} == {torch.float16, torch.int64}
-    again = ScopeNet()
-    again.load_state_dict({name: t.float() for name, t in tensors.items()})
-    planes = torch.randn(1, 8, 32, 32)
-    assert torch.allclose(again.eval()(planes), network(planes), atol=0.02)
+    export(network, tmp_path / "net.onnx", {"seed": "0"})
+    assert (tmp_path / "net.onnx").stat().st_size < 2.1 * sum(value.numel() for value in network.parameters())
+    assert load_network(tmp_path / "net.onnx").get_modelmeta().custom_metadata_map == {"seed": "0"}
+    again = read_network(tmp_path / "net.onnx").state_dict()
+    for name, value in network.state_dict().items():
+        counter = name.endswith("num_batches_tracked")
+        assert counter or torch.equal(again[name], value.half().float()), name
+
+
+def test_weights_of_another_network_are_not_read(whole, tmp_path):
+    export(ScopeNet(widths=(8, 8, 16, 16, 16)), tmp_path / "small.onnx", {})
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        read_network(tmp_path / "small.onnx")
 
 
 def test_calibration_stretches_a_compressed_range_and_rights_the_spread(tmp_path):
@@ -139,8 +144,8 @@ def test_the_report_says_every_kind_that_was_there(whole, scenes):
 
 def test_figures_of_a_weights_file_are_those_of_its_training(scenes, whole, tmp_path):
     network, folder = whole
-    export(network, tmp_path / "net.safetensors", {})
-    main(["--model", str(tmp_path / "net.safetensors"), "--scenes", str(scenes / "held-out"), "--out", str(tmp_path)])
+    export(network, tmp_path / "net.onnx", {})
+    main(["--model", str(tmp_path / "net.onnx"), "--scenes", str(scenes / "held-out"), "--out", str(tmp_path)])
     write_report(network, open_store(scenes / "held-out"), folder, lambda text: None)
     ours, theirs = (json.loads((f / "held_out.json").read_text())["half size"]["all"] for f in (tmp_path, folder))
     # Half precision is all the difference.
@@ -185,12 +190,13 @@ def test_one_command_renders_trains_evaluates_and_exports(tmp_path):
     recipe = replace(RECIPE, parts=(small,), uses=(Use("small", 1, 2, 1.0),), held_out=large)
     (tmp_path / "tiny.toml").write_text(recipe.toml())
     command = [sys.executable, "-m", "training", "--out", "run", "--recipe", "tiny.toml", "--threads", "1"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    root = Path(__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root / "src")])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "3 of 3 scenes rendered" in done.stdout
     assert "calibrated on training scenes" in done.stdout
     made = {path.name for path in (tmp_path / "run").iterdir()}
-    assert made >= {"recipe.toml", "log.csv", "curves.png", "checkpoint.pt", "held_out.json", "scopenet.safetensors"}
-    estimator = ScopeNetDepth.from_file(str(tmp_path / "run" / "scopenet.safetensors"))
+    assert made >= {"recipe.toml", "log.csv", "curves.png", "checkpoint.pt", "held_out.json", "scopenet.onnx"}
+    estimator = ScopeNetDepth(str(tmp_path / "run" / "scopenet.onnx"))
     assert estimator.provenance()["depth"] == "scopenet"

@@ -50,7 +50,7 @@ def main() -> int:
     _say(f"calibrated on training scenes: exponent {calibration.exponent:.3f}, spread times {calibration.spread:.3f}")
     network = calibrated(network, calibration)
     facts = {"name": "scopenet", "licence": "Apache-2.0", "seed": str(recipe.seed), "steps": str(recipe.steps)}
-    export(network, options.out / "scopenet.safetensors", facts)
+    export(network, options.out / "scopenet.onnx", facts)
     write_report(network, open_store(scenes / recipe.held_out.name), options.out, _say)
     return 0
 

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
 
-from scopemap.depth.scopenet.network import TYPICAL_LOG_MM, ScopeNet
 from training.buffers import Store
+from training.network import TYPICAL_LOG_MM, ScopeNet
 from training.samples import make_sample
 
 _SEED = 88

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
-from scopemap.depth.scopenet.network import ScopeNet
 from training.buffers import Store, thinned
+from training.network import ScopeNet
 from training.samples import make_sample
 
 _SEED = 77

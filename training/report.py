@@ -9,11 +9,10 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from safetensors.torch import load_file
-
-from scopemap.depth.scopenet.network import ScopeNet
 from training.buffers import Store, open_store
 from training.evaluate import Look, PictureScore, Summary, score_pictures
+from training.export import read_network
+from training.network import ScopeNet
 from training.scene import KINDS
 
 LOOKS = {
@@ -53,10 +52,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scenes", type=Path, required=True, help="store of the held-out scenes")
     parser.add_argument("--out", type=Path, required=True, help="folder for held_out.json")
     options = parser.parse_args(arguments)
-    network = ScopeNet()
-    network.load_state_dict({name: value.float() for name, value in load_file(options.model).items()}, strict=True)
+    network = read_network(options.model)
     options.out.mkdir(parents=True, exist_ok=True)
-    write_report(network.eval(), open_store(options.scenes), options.out, print)
+    write_report(network, open_store(options.scenes), options.out, print)
 
 
 def _draw_curves(folder: Path) -> None:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from scopemap.depth.scopenet.network import ScopeNet
 from training.buffers import open_store
 from training.evaluate import Look, evaluate
+from training.export import read_network
 from training.losses import Weights, loss_parts, total
+from training.network import ScopeNet
 from training.recipe import Recipe
 from training.samples import Batch, make_batch
 
@@ -41,7 +41,7 @@ class Training:
         torch.manual_seed(recipe.seed)
         self.network = ScopeNet().to(device, memory_format=torch.channels_last)
         if start is not None:
-            self.network.load_state_dict(load_file(start))
+            self.network.load_state_dict(read_network(start).state_dict())
         average = get_ema_multi_avg_fn(recipe.ema)
         self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)

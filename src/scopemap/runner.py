@@ -13,6 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,8 @@ from scopemap.tracking.track import FrameTracker
 
 Observer = Callable[[Step], None]
 _CHECKED_FRAMES = 16  # of a submap, at which its surface is rendered again
-_VERSIONS = (
-    *("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "torch", "torchvision", "transformers", "lpips"),
-)
+_VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
+_VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
 
 
 def reconstruct(
@@ -308,6 +308,12 @@ def _provenance(
         "notes": sequence.notes,
         "warnings": sequence.warnings,
         "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
-        "versions": {name: version(name) for name in _VERSIONS} | {"python": platform.python_version()},
+        "versions": _versions(),
         "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",
     }
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on; of `networks` if present."""
+    installed = [name for name in _VERSIONS_OF_NETWORKS if find_spec(name) is not None]
+    return {name: version(name) for name in (*_VERSIONS, *installed)} | {"python": platform.python_version()}

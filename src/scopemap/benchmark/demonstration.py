@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -35,8 +34,6 @@ from scopemap.trajectory.formats.opening import read_trajectory
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
 """The phantom of the demonstration."""
 
-# RAFT and LPIPS would be used where their weights are installed; the figures must not depend on that.
-_WITHOUT_WEIGHTS = {"networks.flow": "dis", "networks.perceptual": "structure"}
 _DRAWN_FRAMES = 4
 
 
@@ -65,11 +62,6 @@ class Demonstration:
     def true_mesh(self) -> trimesh.Trimesh:
         """The surface that the camera saw, true world mm."""
         return trimesh.load_mesh(self.sequence.path / "mesh_truth.ply", process=False)
-
-
-def demo_config(settings: dict[str, Any]) -> Config:
-    """Return the default preset without optional weights, then `settings` (dotted names)."""
-    return Config.load("default", settings=_WITHOUT_WEIGHTS | settings)
 
 
 def prepare_out(out: Path, *, overwrite: bool) -> None:

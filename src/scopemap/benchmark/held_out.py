@@ -18,7 +18,7 @@ import trimesh
 from scopemap.benchmark.result import read_provenance
 from scopemap.benchmark.truth import is_camera_of, open_truth
 from scopemap.config import Config, FusionSettings
-from scopemap.depth.perceptual import CHECKPOINTS, create_perceptual
+from scopemap.depth.perceptual import CHECKPOINTS, PACKAGES, create_perceptual
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
@@ -28,6 +28,7 @@ from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import transform
 from scopemap.io import weights
+from scopemap.io.device import missing_packages
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 from scopemap.reconstruction import DepthReader
@@ -162,6 +163,8 @@ def held_out_agreement(run: Path, every: int = HELD_OUT_EVERY) -> SurfaceAgreeme
 
 def _lpips_missing() -> str:
     """Return why LPIPS cannot be measured here, or ""."""
+    if fault := missing_packages("LPIPS", *PACKAGES):
+        return f"left out: {fault}"
     if weights.is_present(*CHECKPOINTS):
         return ""
     return f"left out: needs the weights {' or '.join(CHECKPOINTS)} in {weights.weights_folder()}"

@@ -55,7 +55,7 @@ class ProtocolPlan(_Part):
     icp: bool = False
     depth: bool = True
     consistency: bool = False
-    flow: str = "auto"
+    flow: str = "dis"
     depth_scaling: DepthScaling = "median"
     depth_range_mm: tuple[float, float] = (1e-3, 1e4)
     clip_depth: bool = False

@@ -14,13 +14,11 @@ from scopemap.benchmark.runner import kept_result, method_of, planned, what_is_m
 from scopemap.config import Config
 from scopemap.errors import ScopemapError
 from scopemap.estimators import missing_weights
-from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
-from scopemap.io import weights
 
 # Seconds per frame at 400x320 px on two CPU cores: half the CPU time of random networks of full size, flow both ways.
 _FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
 _DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
-_PERCEPTUAL_S = {"lpips": 0.05, "auto": 0.05, "structure": 0.01}
+_PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
 _TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
 _START_S = 20.0  # of a run: imports and kernels
 
@@ -85,8 +83,6 @@ def _seconds(entry: Entry, frames: int) -> float:
     if config is None:
         return 0.0
     flow, networks, mapis = config.networks.flow, config.networks, config.mapis
-    if flow == "auto":
-        flow = "raft-small" if weights.is_present(*RAFT_CHECKPOINTS["small"]) else "dis"
     per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
     per_frame += _FLOW_S.get(networks.keyframe_flow, 0.0)
     if (mapis.paper.blend, mapis.advanced.frame_scale) != ("none", "none"):

@@ -202,7 +202,7 @@ def _facts(entry: Entry) -> dict[str, Any]:
         "key": entry.key,
         "align": entry.sequence.align or entry.protocol.align,
         "depth": _depth_of(entry),
-        "versions": {name: version(name) for name in ("scopemap", "numpy", "torch", "numba")},
+        "versions": {name: version(name) for name in ("scopemap", "numpy", "onnxruntime", "numba")},
         "commit": source_commit(),
         "machine": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores",
     }

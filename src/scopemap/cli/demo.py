@@ -29,9 +29,10 @@ def demo(
     _tell("preparing a phantom colon; the first time kernels are compiled, too", silent)
     # Imported here, so that --help does not wait for the kernels.
     from scopemap.benchmark import demonstration
+    from scopemap.config import Config
 
     started = time.perf_counter()
-    config = demonstration.demo_config(parse_settings(settings or []))
+    config = Config.load("default", settings=parse_settings(settings or []))
     demonstration.prepare_out(out, overwrite=overwrite)
     with count_progress("rendering", "rendered", silent=silent) as progress:
         rendered = demonstration.render(out, demonstration.PHANTOM, progress)

@@ -82,7 +82,7 @@ def run(
     ] = None,
     flow: Annotated[
         str | None,
-        typer.Option(help="raft-small, raft-large, dis or none; auto: raft-small with its weights, else dis."),
+        typer.Option(help="dis, raft-small, raft-large or none; RAFT needs the extra networks and its weights."),
     ] = None,
     colours: Annotated[
         Literal["albedo", "raw"] | None,

@@ -53,6 +53,8 @@ REMOVED = {
 }
 """Settings of earlier versions that are constants now or that nothing reads: a file may still name them, the command
 line may not."""
+REMOVED_VALUES = {"networks.flow": "auto", "networks.perceptual": "auto"}
+"""Values of earlier versions that depended on the weights of the machine: in a file they mean what the preset names."""
 
 
 class Config(Settings):
@@ -131,7 +133,7 @@ def new_name(setting: str) -> str:
 def _of_earlier_versions(flat: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a file by their present names, without removed ones: an old config.toml stays valid."""
     renamed = {new_name(key): value for key, value in flat.items()}
-    return {key: value for key, value in renamed.items() if key not in REMOVED}
+    return {key: value for key, value in renamed.items() if key not in REMOVED and REMOVED_VALUES.get(key) != value}
 
 
 def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class DepthSettings(Settings):
     backend: str = Field("scopenet", description="scopenet | shading | depth-anything | depth-pro | files:FOLDER")
     model: str = Field(
         "",
-        description="weights of the network: hub id or folder, for scopenet a .safetensors file; empty: the default",
+        description="weights of the network: hub id or folder, for scopenet a .onnx file; empty: the default",
     )
     anchor_model: str = Field(
         "", description="inert unless anchor = depth-pro: weights of Depth Pro, hub id or folder; empty: the default"
@@ -153,18 +153,20 @@ class NetworkSettings(Settings):
     """Optical flow and perceptual distance."""
 
     flow: str = Field(
-        "auto",
-        description="flow from frame to frame: raft-small | raft-large | dis | none | auto: raft-small where its "
-        "weights are present, else dis",
+        "dis",
+        description="flow from frame to frame: dis | raft-small | raft-large (both with the extra `networks` and "
+        "their weights) | none",
     )
     keyframe_flow: str = Field(
         "dis",
         description="flow between keyframes (back end) and from the keyframe to the frame (corners), the same names; "
         "none: no corners, and a back end without observations",
     )
-    perceptual: Literal["auto", "lpips", "structure"] = Field(
-        "auto",
-        description="perceptual distance, lpips: AlexNet; structure: local structural similarity, no weights; auto: "
-        "lpips where its weights are present, else structure",
+    perceptual: Literal["lpips", "structure"] = Field(
+        "structure",
+        description="perceptual distance, structure: local structural similarity, no weights; lpips: AlexNet (with the "
+        "extra `networks` and its weights)",
     )
-    device: str = Field("auto", description="where networks run: auto | cpu | cuda")
+    device: str = Field(
+        "auto", description="where the networks of the extra `networks` run: auto | cpu | cuda; scopenet: on the CPU"
+    )

@@ -68,8 +68,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": _PAPER,
     "paper-strict": _PAPER | _BEYOND_PAPER,
     "realtime": {
-        "networks.flow": "dis",
-        "networks.perceptual": "structure",
         "tracking.advanced.max_iterations": 15,
         "fusion.voxel_mm": 1.5,
         "fusion.truncation_mm": 5.0,

@@ -26,7 +26,7 @@ def create_depth(
     """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
 
     rectifier : from the camera that depth files show the view of to the working camera.
-    device : "auto", "cpu" or "cuda", for networks.
+    device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
 
@@ -41,7 +41,7 @@ def create_depth(
     if settings.backend == "scopenet":
         from scopemap.depth.scopenet.estimator import ScopeNetDepth
 
-        return ScopeNetDepth.from_file(settings.model, device, rays_known=calibrated)
+        return ScopeNetDepth(settings.model, rays_known=calibrated)
     if settings.backend == "depth-pro":
         return _depth_pro(settings.model, settings, device)
     if settings.backend == "depth-anything":

@@ -9,7 +9,7 @@ import numpy as np
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.pretrained import load_pretrained
 from scopemap.frame import Frame
-from scopemap.io.device import choose_device
+from scopemap.io.device import choose_device, need_packages
 
 if TYPE_CHECKING:
     from transformers import DepthAnythingForDepthEstimation, DPTImageProcessor
@@ -46,6 +46,7 @@ class DepthAnything:
 
         Never downloads. Raises `WeightsError` with the name to pull.
         """
+        need_packages(f"depth by {cls.name}", "torch", "torchvision", "transformers", "safetensors")
         from transformers import DepthAnythingForDepthEstimation
 
         network, processor, origin = load_pretrained(DepthAnythingForDepthEstimation, model or cls.name)

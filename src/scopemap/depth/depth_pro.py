@@ -11,7 +11,7 @@ from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.pretrained import load_pretrained
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
-from scopemap.io.device import choose_device
+from scopemap.io.device import choose_device, need_packages
 
 if TYPE_CHECKING:
     import torch
@@ -57,6 +57,7 @@ class DepthPro:
 
         Never downloads. Raises `WeightsError` with the name to pull.
         """
+        need_packages(f"depth by {cls.name}", "torch", "torchvision", "transformers", "safetensors")
         from transformers import DepthProForDepthEstimation
 
         network, processor, origin = load_pretrained(DepthProForDepthEstimation, model or cls.name)

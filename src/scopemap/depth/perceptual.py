@@ -8,37 +8,54 @@ from __future__ import annotations
 
 import re
 import warnings
-from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
-from skimage.metrics import structural_similarity
 
 from scopemap.depth.estimate import PerceptualDistance, PerceptualResult
 from scopemap.errors import SettingsError, WeightsError, check_shape
 from scopemap.io import weights
-from scopemap.io.device import choose_device
+from scopemap.io.device import choose_device, need_packages
 
 CHECKPOINTS = ("alexnet", "alexnet-features")
+PACKAGES = ("torch", "torchvision", "lpips")
 
 # lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
 _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
 
 
-def create_perceptual(name: str = "auto", device: str = "auto") -> PerceptualDistance:
-    """Return the distance "lpips", "structure", or with "auto" lpips if its weights are present, else structure.
+_WINDOW_PX = 7
+_SAMPLE = _WINDOW_PX**2 / (_WINDOW_PX**2 - 1)  # of a sample's covariance
+_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang, section III.B
 
-    Raises `SettingsError` for an unknown name and `WeightsError` where lpips lacks its weights.
+
+def create_perceptual(name: str, device: str = "auto") -> PerceptualDistance:
+    """Return the distance "lpips" or "structure".
+
+    Raises `SettingsError` for an unknown name or without lpips' packages, `WeightsError` where lpips lacks its weights.
     """
-    if name == "auto":
-        name = "lpips" if weights.is_present(*CHECKPOINTS) else "structure"
     match name:
         case "lpips":
             return LpipsAlex(device=device)
         case "structure":
             return StructureDistance()
-    raise SettingsError(f"unknown perceptual distance '{name}': choose one of auto, lpips, structure")
+    raise SettingsError(f"unknown perceptual distance '{name}': choose one of lpips, structure")
+
+
+def structural_similarity(grey_a: np.ndarray, grey_b: np.ndarray) -> np.ndarray:
+    """Return the structural similarity (H, W) float64, -1..1, of two (H, W) uint8 images in 7 x 7 px (Wang, eq. 13)."""
+    a, b = grey_a.astype(np.float64), grey_b.astype(np.float64)
+    mean_a, mean_b, square_a, square_b, product = (_box_mean(image) for image in (a, b, a * a, b * b, a * b))
+    variances = _SAMPLE * (square_a + square_b - mean_a**2 - mean_b**2)
+    covariance = _SAMPLE * (product - mean_a * mean_b)
+    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
+    similarity: np.ndarray = luminance * (2 * covariance + _C2) / (variances + _C2)
+    return similarity
+
+
+def _box_mean(image: np.ndarray) -> np.ndarray:
+    return cv2.blur(image, (_WINDOW_PX, _WINDOW_PX), borderType=cv2.BORDER_REFLECT)
 
 
 class StructureDistance:
@@ -50,14 +67,13 @@ class StructureDistance:
         """Compare two (H, W, 3) uint8 images of one size, 7 px or more on each side."""
         check_shape("rgb_a", rgb_a, (None, None, 3))
         check_shape("rgb_b", rgb_b, rgb_a.shape)
-        grey_a, grey_b = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for rgb in (rgb_a, rgb_b))
-        _, similarity = structural_similarity(grey_a, grey_b, full=True, data_range=255.0)
-        distance = np.clip(1.0 - similarity, 0.0, 1.0).astype(np.float32)
+        grey_a, grey_b = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_a, rgb_b))
+        distance = np.clip(1.0 - structural_similarity(grey_a, grey_b), 0.0, 1.0).astype(np.float32)
         return PerceptualResult(distance, float(distance.mean(dtype=np.float64)))
 
     def provenance(self) -> dict[str, str]:
-        """Return the name and scikit-image's version."""
-        return {"perceptual": self.name, "scikit-image": version("scikit-image")}
+        """Return the name."""
+        return {"perceptual": self.name}
 
 
 class LpipsAlex:
@@ -70,6 +86,7 @@ class LpipsAlex:
     name = "lpips"
 
     def __init__(self, *, device: str = "auto", checkpoint: Path | None = None) -> None:
+        need_packages("LPIPS", *PACKAGES)
         import lpips
         import torch
 

@@ -3,20 +3,17 @@
 from scopemap.errors import SettingsError
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, NoFlow
-from scopemap.flow.raft import CHECKPOINTS, RaftFlow
-from scopemap.io import weights
+from scopemap.flow.raft import RaftFlow
 
-FLOWS = ("auto", "raft-small", "raft-large", "dis", "none")
+FLOWS = ("raft-small", "raft-large", "dis", "none")
 
 
 def create_flow(name: str, device: str = "auto") -> FlowEstimator:
     """Return the estimator `name` (one of `FLOWS`); device matters to RAFT only.
 
-    "auto" is RAFT small where its weights are present, else DIS. Raises `SettingsError` for an unknown name and
-    `WeightsError` where RAFT is named and its weights are missing.
+    Raises `SettingsError` for an unknown name, or RAFT without its packages, and `WeightsError` where RAFT's weights
+    are missing.
     """
-    if name == "auto":
-        name = "raft-small" if weights.is_present(*CHECKPOINTS["small"]) else "dis"
     match name:
         case "raft-small":
             return RaftFlow("small", device=device)

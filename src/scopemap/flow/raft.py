@@ -12,7 +12,7 @@ import numpy as np
 from scopemap.errors import WeightsError, check_shape
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.io import weights
-from scopemap.io.device import choose_device
+from scopemap.io.device import choose_device, need_packages
 
 if TYPE_CHECKING:
     import torch
@@ -57,10 +57,11 @@ class RaftFlow(FlowEstimator):
     def __init__(
         self, size: Size = "small", *, iterations: int = 12, device: str = "auto", checkpoint: Path | None = None
     ) -> None:
+        self.name = f"raft-{size}"
+        need_packages(f"the flow {self.name}", "torch", "torchvision")
         import torch
         from torchvision.models import optical_flow
 
-        self.name = f"raft-{size}"
         self.iterations = iterations
         self._checkpoint = checkpoint or weights.locate(*CHECKPOINTS[size])
         self._device = choose_device(device)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import trimesh
-from skimage.metrics import structural_similarity
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.estimate import PerceptualDistance
+from scopemap.depth.perceptual import structural_similarity
 from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
 
@@ -75,7 +75,7 @@ def compare_rendering(
     seen = known & np.isfinite(rendering.depth_mm)
     error = np.abs(np.log(rendering.depth_mm[seen] / depth_mm[seen]))
     grey, shown = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (rgb, rendering.rgb))
-    _, similarity = structural_similarity(grey, shown, full=True)
+    similarity = structural_similarity(grey, shown)
     lpips = float("nan")
     if perceptual is not None and known.any():
         frame, view = (np.where(known[..., None], image, np.uint8(0)) for image in (rgb, rendering.rgb))

@@ -1,8 +1,31 @@
-"""Where networks run."""
+"""Where networks run, and what they need to be installed."""
 
 from __future__ import annotations
 
+import os
+from importlib.util import find_spec
+
 from scopemap.errors import SettingsError
+
+
+def cpu_threads() -> int:
+    """Return how many threads a network gets on the CPU: OMP_NUM_THREADS, else the cores that this process may use."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdecimal() and int(wanted):
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def missing_packages(what: str, *packages: str) -> str:
+    """Return which of the packages that `what` needs are not installed and how to install them; "" where all are."""
+    missing = [package for package in packages if find_spec(package) is None]
+    return f"{what} needs {' and '.join(missing)}: pip install 'scopemap[networks]'" if missing else ""
+
+
+def need_packages(what: str, *packages: str) -> None:
+    """Raise `SettingsError` where one of the packages that `what` needs is not installed."""
+    if fault := missing_packages(what, *packages):
+        raise SettingsError(fault)
 
 
 def choose_device(device: str) -> str:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scopemap.errors import WeightsError, reporting
+from scopemap.io.device import need_packages
 
 State = Literal["present", "by hand", "missing", "damaged"]
 LOCK_NAME = "weights.lock.json"
@@ -229,6 +230,7 @@ def _how_to_fetch(checkpoint: Checkpoint) -> str:
 
 
 def _download_from_torchvision(checkpoint: Checkpoint, progress: bool) -> str:
+    need_packages(f"pulling {checkpoint.name}", "torch", "torchvision")
     import torch
     import torchvision
 
@@ -240,6 +242,7 @@ def _download_from_torchvision(checkpoint: Checkpoint, progress: bool) -> str:
 
 def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
     """Download a repository's configuration and safetensors and return the commit they came from."""
+    need_packages(f"pulling {checkpoint.name}", "huggingface_hub")
     from huggingface_hub import HfApi, snapshot_download
     from huggingface_hub.utils import disable_progress_bars, enable_progress_bars
 

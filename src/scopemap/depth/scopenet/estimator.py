@@ -1,8 +1,9 @@
 """ScopeNet behind the `DepthEstimator` contract: the weights that come with the package, or others of the same network.
 
-The network estimates ln of the distance along the ray and ln of the Laplace scale b of its
-error. Depth is distance times the z of the unit ray. A Laplace distribution has the standard deviation sqrt(2) b; of a
-logarithm it is, to first order, the relative one of distance, and so of depth.
+The network is an ONNX graph (`training/export.py` writes it) and runs in ONNX Runtime on the CPU, in float32. It
+estimates ln of the distance along the ray and ln of the Laplace scale b of its error. Depth is distance times the z of
+the unit ray. A Laplace distribution has the standard deviation sqrt(2) b; of a logarithm it is, to first order, the
+relative one of distance, and so of depth.
 """
 
 from __future__ import annotations
@@ -13,55 +14,40 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
+import onnxruntime
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.scopenet.network import ScopeNet
-from scopemap.depth.scopenet.planes import input_planes
+from scopemap.depth.scopenet.planes import PLANES, STRIDE, input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
-from scopemap.io.device import choose_device
+from scopemap.io.device import cpu_threads
 
-WEIGHTS_NAME = "scopenet.safetensors"
+WEIGHTS_NAME = "scopenet.onnx"
+_INPUT = "planes"
 _AS_THEY_COME = "that come with the package"
 
 
 class ScopeNetDepth:
     """Depth estimator around a ScopeNet.
 
-    network : is changed: its batch normalisation goes into its convolutions.
-    device : "auto", "cpu" or "cuda".
+    model : the network, a .onnx file; "": that of the package.
     rays_known : whether the frames' camera is calibrated. False: the network gets no ray directions, as in
         part of its training; depth is still distance times the z of the assumed camera's ray.
-    origin : where the weights came from, for the provenance.
+    threads : of the network; 0: one for each core.
+
+    Raises `WeightsError` where the file is missing, cannot be read, or holds another network.
     """
 
     name = "scopenet"
 
-    def __init__(
-        self, network: ScopeNet, *, device: str = "auto", rays_known: bool = True, origin: dict[str, str] | None = None
-    ) -> None:
-        self._device = choose_device(device)
-        # At 320 x 256 this memory format halves the time on 2 cores; folding saves a quarter on one.
-        self._network = folded(network.eval().to(self._device)).to(memory_format=torch.channels_last)
+    def __init__(self, model: str = "", *, rays_known: bool = True, threads: int = 0) -> None:
         self._rays_known = rays_known
-        self._origin = origin or {}
-
-    @classmethod
-    def from_file(cls, model: str = "", device: str = "auto", *, rays_known: bool = True) -> ScopeNetDepth:
-        """Return the estimator with the weights in `model`, a .safetensors file; "" = those of the package.
-
-        Raises `WeightsError` where the file is missing, cannot be read, or does not fit the network.
-        """
         with resources.as_file(resources.files(__package__) / WEIGHTS_NAME) as embedded:
             file = Path(model).expanduser() if model else embedded
-            network = load_network(file)
-            origin = {"model": model or _AS_THEY_COME, f"sha256 {file.name}": weights.sha256_of(file)}
-        return cls(network, device=device, rays_known=rays_known, origin=origin)
+            self._session = load_network(file, threads)
+            self._origin = {"model": model or _AS_THEY_COME, f"sha256 {file.name}": weights.sha256_of(file)}
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth, mm, of the frame's size, with its standard deviation, mm; every pixel has both.
@@ -70,75 +56,56 @@ class ScopeNetDepth:
         """
         unit_rays = _unit_rays(frame.camera)
         planes = input_planes(frame.rgb, unit_rays if self._rays_known else None, frame.valid)
-        with torch.inference_mode():
-            log_distance, log_spread = self._network(self._batch(planes))[0].cpu().numpy()
+        log_distance, log_spread = _answer(self._session, planes)
         depth_mm = np.exp(log_distance) * unit_rays[..., 2]
         sigma_mm = depth_mm * np.float32(math.sqrt(2.0)) * np.exp(log_spread)
         return DepthEstimate(depth_mm, "depth", sigma=sigma_mm)
 
     def provenance(self) -> dict[str, str]:
-        """Return the name, the weights with their hash, and whether the rays were given."""
-        return {"depth": self.name, **self._origin, "rays": "known" if self._rays_known else "assumed"}
-
-    def _batch(self, planes: np.ndarray) -> Tensor:
-        return torch.from_numpy(planes)[None].to(self._device, memory_format=torch.channels_last)
+        """Return the name, the weights with their hash, the runtime, and whether the rays were given."""
+        rays = "known" if self._rays_known else "assumed"
+        return {"depth": self.name, **self._origin, "runtime": f"onnxruntime {onnxruntime.__version__}", "rays": rays}
 
 
-def load_network(file: Path) -> ScopeNet:
-    """Return the shipped architecture with the weights (float16 or float32) in a .safetensors file.
+def load_network(file: Path, threads: int = 0) -> onnxruntime.InferenceSession:
+    """Return a network that takes planes (1, 8, H, W) to (1, 2, H, W), float32, H and W multiples of `STRIDE`.
 
-    Raises `WeightsError` where the file is missing, cannot be read, or does not fit the network.
+    threads : 0: one for each core. Raises `WeightsError` where the file is missing, cannot be read, or holds another
+    network or weights that are not finite.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
     if not file.is_file():
         raise WeightsError(_missing(file))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or cpu_threads()
+    # Threads that wait must sleep: the tracker needs the cores.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # what is wrong is raised, not printed
     try:
-        state = load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise WeightsError(f"cannot load ScopeNet from {file}: {error}. Name another file in depth.model") from error
-    network = ScopeNet()
-    amiss = _amiss(network.state_dict(), state)
-    if amiss:
-        raise WeightsError(f"the weights in {file} do not fit ScopeNet: {amiss}. Name another file in depth.model")
-    network.load_state_dict(state, strict=False)
-    return network
+        session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+        answer = _answer(session, np.zeros((PLANES, STRIDE, STRIDE), np.float32))
+    except Exception as error:  # the runtime raises a dozen kinds that share no other root
+        reason = " ".join(str(error).split())
+        raise WeightsError(f"cannot load ScopeNet from {file}: {reason}. Name another file in depth.model") from None
+    if answer.shape != (2, STRIDE, STRIDE) or not np.isfinite(answer).all():
+        raise WeightsError(f"the network in {file} is not a ScopeNet that can be used. Name another in depth.model")
+    return session
 
 
-def folded(network: ScopeNet) -> ScopeNet:
-    """Return the network, which must be in evaluation mode, with each batch normalisation folded into its convolution.
-
-    Jacob et al., CVPR 2018, section 3.2: the same function, two passes over memory fewer per convolution.
-    """
-    for part in network.modules():
-        if isinstance(part, nn.Sequential):
-            for index in range(len(part) - 1):
-                first, second = part[index], part[index + 1]
-                if isinstance(first, nn.Conv2d) and isinstance(second, nn.BatchNorm2d):
-                    part[index], part[index + 1] = fuse_conv_bn_eval(first, second), nn.Identity()
-    return network
+def _answer(session: onnxruntime.InferenceSession, planes: np.ndarray) -> np.ndarray:
+    """Return the network's (2, H, W) for planes (8, H, W) of any H and W."""
+    height, width = planes.shape[1:]
+    padded = np.pad(planes, ((0, 0), (0, -height % STRIDE), (0, -width % STRIDE)))
+    answer: np.ndarray = session.run(None, {_INPUT: padded[None]})[0]
+    return answer[0, :, :height, :width]
 
 
 def _missing(file: Path) -> str:
     if file.name == WEIGHTS_NAME and file.parent == Path(__file__).parent:
         return (
             f"loading ScopeNet: this installation lacks {file}, which the package comes with; install it again, name a "
-            ".safetensors file in depth.model, or choose depth.backend=shading"
+            ".onnx file in depth.model, or choose depth.backend=shading"
         )
-    return f"loading ScopeNet: depth.model names {file}, which is no file; it must be a .safetensors file"
-
-
-def _amiss(wanted: dict[str, Tensor], found: dict[str, Tensor]) -> str:
-    """Say how a state differs from what the network wants, "" if it fits; the counters of training are not needed."""
-    needed = {name for name in wanted if not name.endswith("num_batches_tracked")}
-    faults = {
-        "missing": needed - set(found),
-        "unknown": set(found) - set(wanted),
-        "of another shape": {name for name in needed & set(found) if found[name].shape != wanted[name].shape},
-        "not finite": {name for name in needed & set(found) if not torch.isfinite(found[name]).all()},
-    }
-    return "; ".join(f"{len(names)} {kind} ({min(names)} ...)" for kind, names in faults.items() if names)
+    return f"loading ScopeNet: depth.model names {file}, which is no file; it must be a .onnx file"
 
 
 @lru_cache(maxsize=2)

@@ -7,6 +7,7 @@ import numpy as np
 from scopemap.errors import check_shape
 
 PLANES = 8
+STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3
 _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], np.float32)

@@ -13,17 +13,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scopemap.depth.scopenet.planes import PLANES
+from scopemap.depth.scopenet.planes import PLANES, STRIDE
 
 WIDTHS = (24, 48, 80, 128, 160)
 _BLOCKS = (1, 2, 2, 3, 2)
 _HEAD = 16
-_STRIDE = 32
 TYPICAL_LOG_MM = 3.4  # 30 mm: the network starts from there
-_SPREAD_RANGE = (-5.0, 1.0)
+TYPICAL_LOG_SPREAD = -2.0
+SPREAD_RANGE = (-5.0, 1.0)
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     """Two convolutions with a short cut around them."""
 
     def __init__(self, width: int) -> None:
@@ -31,10 +31,11 @@ class _Block(nn.Module):
         self.first, self.second = _convolution(width, width), _convolution(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return features of the shape of `x` (N, width, H, W)."""
         return functional.relu(x + self.second(functional.relu(self.first(x))))
 
 
-class _Context(nn.Module):
+class Context(nn.Module):
     """Adds global image features to every pixel."""
 
     def __init__(self, width: int) -> None:
@@ -42,19 +43,21 @@ class _Context(nn.Module):
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return features of the shape of `x` (N, width, H, W)."""
         whole = self.second(functional.relu(self.first(x.mean((2, 3)))))
         return functional.relu(x + whole[:, :, None, None])
 
 
-class _Merge(nn.Module):
+class Merge(nn.Module):
     """Brings coarse features to the next finer scale, where they meet the encoder's."""
 
     def __init__(self, coarse: int, fine: int) -> None:
         super().__init__()
         self.from_coarse, self.from_fine = nn.Conv2d(coarse, fine, 1), nn.Conv2d(fine, fine, 1)
-        self.block = _Block(fine)
+        self.block = Block(fine)
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        """Return features of the shape of `fine`, which is twice as high and wide as `coarse`."""
         # The short side first: a 1x1 convolution and the enlargement commute.
         enlarged = functional.interpolate(self.from_coarse(coarse), scale_factor=2.0, mode="bilinear")
         return self.block(functional.relu(enlarged + self.from_fine(fine)))
@@ -70,11 +73,11 @@ class ScopeNet(nn.Module):
         super().__init__()
         entries = [_convolution(a, b, 2) for a, b in pairwise((PLANES, *widths))]
         self.stages = nn.ModuleList(
-            nn.Sequential(entry, nn.ReLU(), *(_Block(width) for _ in range(count)))
+            nn.Sequential(entry, nn.ReLU(), *(Block(width) for _ in range(count)))
             for entry, width, count in zip(entries, widths, blocks, strict=True)
         )
-        self.context = _Context(widths[-1])
-        self.merges = nn.ModuleList(_Merge(coarse, fine) for fine, coarse in reversed(list(pairwise(widths))))
+        self.context = Context(widths[-1])
+        self.merges = nn.ModuleList(Merge(coarse, fine) for fine, coarse in reversed(list(pairwise(widths))))
         self.from_coarse, self.from_planes = nn.Conv2d(widths[0], _HEAD, 1), _convolution(PLANES, _HEAD)
         self.detail = _convolution(_HEAD, _HEAD)
         self.head = nn.Conv2d(_HEAD, 2, 3, padding=1)
@@ -87,7 +90,7 @@ class ScopeNet(nn.Module):
         Channel 0: ln of the distance along the ray, mm. Channel 1: ln of the Laplace scale of channel 0's error.
         """
         height, width = planes.shape[-2:]
-        x = functional.pad(planes, (0, -width % _STRIDE, 0, -height % _STRIDE))
+        x = functional.pad(planes, (0, -width % STRIDE, 0, -height % STRIDE))
         full, scales = x, []
         for stage in self.stages:
             x = stage(x)
@@ -98,7 +101,7 @@ class ScopeNet(nn.Module):
         x = functional.interpolate(self.from_coarse(x), scale_factor=2.0, mode="bilinear")
         x = functional.relu(self.detail(functional.relu(x + self.from_planes(full))))
         x = self.head(x)[..., :height, :width].float()
-        return torch.stack([x[:, 0] + TYPICAL_LOG_MM, (x[:, 1] - 2.0).clamp(*_SPREAD_RANGE)], 1)
+        return torch.stack([x[:, 0] + TYPICAL_LOG_MM, (x[:, 1] + TYPICAL_LOG_SPREAD).clamp(*SPREAD_RANGE)], 1)
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
