@@ -294,7 +294,7 @@ def test_bad_input_is_one_line(
         (("--near-far", "80:10"), "nearest must be positive and smaller"),
         (("--depth", "sonar"), "unknown depth 'sonar'"),
         (("--depth", "files:/nowhere"), "/nowhere is no folder"),
-        (("--flow", "farneback"), "unknown flow 'farneback': choose one of auto"),
+        (("--flow", "farneback"), "unknown flow 'farneback': choose one of dis"),
         (("--dataset", "endomopper"), "unknown data set 'endomopper': choose one of"),
         (("--dataset", "video"), "it is a folder"),
         (("--camera", "/nowhere.yaml"), "cannot read the calibration"),

@@ -163,6 +163,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         f"camera: {facts['camera']['source']}",
         f"size: {facts['camera']['size']}",
         f"depth: {facts['estimators']['depth']}; scale: {facts['estimators']['anchor']}",
+        f"flow: {facts['estimators']['flow']}; perceptual distance: {facts['estimators']['perceptual']}",
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
         f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s",
     ]

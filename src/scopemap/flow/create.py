@@ -5,7 +5,7 @@ from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, NoFlow
 from scopemap.flow.raft import RaftFlow
 
-FLOWS = ("raft-small", "raft-large", "dis", "none")
+FLOWS = ("dis", "raft-small", "raft-large", "none")
 
 
 def create_flow(name: str, device: str = "auto") -> FlowEstimator:
