@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import cv2
@@ -20,9 +21,9 @@ from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, FrameCorrection, TrackedPose
 from scopemap.mapping.backend import contradiction
 from scopemap.mapping.bundle_adjustment import BundleSolution
-from scopemap.mapping.depth_correction import DepthCorrectionField
+from scopemap.mapping.depth_correction import DepthCorrectionField, depth_disagreement, depth_grid
 from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.reprojection import Points, State
+from scopemap.mapping.reprojection import Observations, Points, State
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -269,6 +270,44 @@ def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
         correction = backend.adjust()
         assert bool(correction.refused) == refused
         assert ("depth would have to change by" in correction.description) == refused
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.04])
+def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    def biased(self: FeatureTracks, keyframes: Collection[int] | None = None) -> tuple[Points, Observations]:
+        """Return observations like those of a camera that comes nearer, which a rigid scene explains."""
+        points, observations = collected(self, keyframes)
+        later = observations.keyframe - points.host[observations.point]
+        return points, replace(observations, pixel=observations.pixel * np.exp(zoom * later)[:, None])
+
+    collected = FeatureTracks.collected
+    monkeypatch.setattr(FeatureTracks, "collected", biased)
+    drift = [se3_exp(0.003 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
+    tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
+    backend = Backend(MappingSettings(), DisFlow())
+    for number in range(6):
+        backend.add(_frame(number, tracked[number]))
+    correction = backend.adjust()
+    assert correction.sigma_px < 0.8
+    assert ("depths of keyframes would disagree" in correction.refused) == bool(zoom)
+    before = _errors(tracked, POSES)
+    after = _errors([correction.pose(10 * n, T) for n, T in enumerate(tracked)], POSES)
+    assert after == before if zoom else after < (0.3 * before[0], 0.3 * before[1])
+
+
+def test_disagreement_of_depth_is_that_of_keyframes_that_see_the_same() -> None:
+    T = np.stack([plane_scene.pose(at_mm=(x, 0.0, 0.0)) for x in (0.0, 4.0, 8.0)])
+    views = [plane_scene.see(pose) for pose in T]
+    grids = [depth_grid(view.depth_mm, plane_scene.EVERYWHERE) for view in views]
+    assert max(depth_disagreement(CAMERA, T, grids, (1, 2))) < 1e-3
+    grids[2] = grids[2] * np.float32(1.1)
+    every, far = depth_disagreement(CAMERA, T, grids, (1, 2))
+    assert far == pytest.approx(np.log(1.1), abs=0.01)
+    assert 0.01 < every < 0.1
+    # Keyframes that look elsewhere, and a single one, are not compared.
+    T[:, :3, 3] += [[0, 0, 0], [500, 0, 0], [1000, 0, 0]]
+    assert np.isnan(depth_disagreement(CAMERA, T, grids, (1, 2))).all()
+    assert np.isnan(depth_disagreement(CAMERA, T[:1], grids[:1], (1, 2))).all()
 
 
 def test_adjusting_without_keyframes_raises() -> None:

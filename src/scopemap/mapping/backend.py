@@ -20,7 +20,12 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px
-from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_correction
+from scopemap.mapping.depth_correction import (
+    DepthCorrectionField,
+    depth_disagreement,
+    depth_grid,
+    fit_depth_correction,
+)
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.map_merging import merge_maps
@@ -30,6 +35,8 @@ from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
 
 # Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
 _TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
+# Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
+_DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
 _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
 
@@ -64,6 +71,7 @@ class Backend:
         self.settings = settings.advanced
         self._frames: list[int] = []
         self._tracked: list[TrackedPose] = []
+        self._depth_grids: list[np.ndarray] = []
         self._tracks = FeatureTracks(settings, flow)
         self._finder = LoopFinder(settings) if settings.min_loop_inliers > 0 else None
         self._loops: list[Loop] = []
@@ -79,15 +87,16 @@ class Backend:
         """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
 
         tracked : pose as tracked; None: in map 0, from the keyframe before. Raises an error of an earlier keyframe's
-        feature tracks, and ValueError without a pose.
+        feature tracks, and ValueError without a pose or a depth.
         """
-        if keyframe.T_world_camera is None:
-            raise ValueError("a keyframe needs a pose")
+        if keyframe.T_world_camera is None or keyframe.depth_mm is None:
+            raise ValueError("a keyframe needs a pose and a depth")
         if tracked is None:
             reference = self._frames[-1] if self._frames else keyframe.index
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
         self._tracked.append(tracked)
+        self._depth_grids.append(depth_grid(keyframe.depth_mm, keyframe.valid))
         while self._pending and self._pending[0].done():
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map))
@@ -101,8 +110,8 @@ class Backend:
         """Return the correction of all frames of a map and of the maps merged with it, after the last keyframe.
 
         tracked : poses as tracked by number of the frame; needed for several maps. among : numbers of the maps that may
-        be merged; None: all. The correction changes nothing where a rigid scene does not explain the observations.
-        Raises ValueError where the map has no keyframe.
+        be merged; None: all. The correction changes nothing where a rigid scene does not explain the observations, or
+        where the depths of keyframes agree less than before. Raises ValueError where the map has no keyframe.
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
@@ -155,7 +164,7 @@ class Backend:
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
         length_px = errors_px(problem, found)
         within = {number: _sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds}
-        correction = self._correction(np.array([self._frames[k] for k in chosen]), problem, found, loops)
+        correction = self._correction(chosen, problem, found, loops, worlds)
         # A map of one keyframe has no observations: NaN.
         largest_px = np.fmax.reduce(list(within.values()))
         return _Adjusted(correction, within[main], largest_px, _sigma_px(length_px[host != observer]))
@@ -190,11 +199,19 @@ class Backend:
         return replace(problem, start=start), graph.accepted_loops
 
     def _correction(
-        self, index: np.ndarray, problem: BundleProblem, found: BundleSolution, loops: int
+        self,
+        chosen: list[int],
+        problem: BundleProblem,
+        found: BundleSolution,
+        loops: int,
+        worlds: Mapping[int, Similarity],
     ) -> FrameCorrection:
-        """Return the correction by a solution; one that changes nothing where a rigid scene does not explain it."""
-        points, state = problem.points, found.state
-        if refused := contradiction(points, found, self.settings):
+        """Return the correction by a solution; one that changes nothing where the solution is refused."""
+        points, state, index = problem.points, found.state, np.array([self._frames[k] for k in chosen])
+        refused = contradiction(points, found, self.settings)
+        fields = self._depth_fields(points, found) if self.settings.depth_step_sigma > 0 and not refused else ()
+        refused = refused or self._depth_contradiction(chosen, problem, found, fields, worlds)
+        if refused:
             identity = np.tile(np.eye(4), (len(index), 1, 1))
             return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)
         return FrameCorrection(
@@ -203,9 +220,32 @@ class Backend:
             state.log_scale,
             found.sigma_px,
             loops=loops,
-            depth_fields=self._depth_fields(points, found) if self.settings.depth_step_sigma > 0 else (),
+            depth_fields=fields,
             depth_mm=_median_depth_mm(points) if len(points.log_depth) else 1.0,
         )
+
+    def _depth_contradiction(
+        self,
+        chosen: list[int],
+        problem: BundleProblem,
+        found: BundleSolution,
+        fields: tuple[DepthCorrectionField, ...],
+        worlds: Mapping[int, Similarity],
+    ) -> str:
+        """Return that the depths of keyframes agree less than as tracked, "" where they agree."""
+        assert self._camera is not None
+        before = [np.float32(worlds[self._tracked[k].map].scale) * self._depth_grids[k] for k in chosen]
+        after = [np.exp(scale) * grid for scale, grid in zip(found.state.log_scale, before, strict=True)]
+        if fields:
+            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
+            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
+        both = ((problem.T_camera_world, before), (found.state.T_camera_world, after))
+        gaps = self.settings.keyframe_gaps
+        tracked, adjusted = (depth_disagreement(self._camera, inverse(T), grids, gaps) for T, grids in both)
+        for was, now in zip(tracked, adjusted, strict=True):
+            if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
+                return f"depths of keyframes would disagree by {100 * now:.0f} %, as tracked by {100 * was:.0f} %"
+        return ""
 
     def _depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
         """Fit the depth correction field of each keyframe to its adjusted points."""

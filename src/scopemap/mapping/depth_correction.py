@@ -1,17 +1,24 @@
-"""Depth correction field: a smooth factor of a keyframe's depth over the image and over depth.
+"""Depth correction field: a smooth factor of a keyframe's depth over the image and over depth; whether it helps.
 
 Errors of predicted depth vary over the image: a bright organ is too near, a far wall too far. Triangulated points
 measure them, but only at corners. A coarse grid interpolates between the points. Its axes are row, column and ln depth,
 because errors change abruptly at depth edges: a bilateral grid (Chen, Paris and Durand, SIGGRAPH 2007) of corrections.
+
+Whether an adjustment helps is judged by depth that it has not used, away from the corners: keyframes that see the same
+surface must agree on it (`depth_disagreement`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy import sparse
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.geometry.se3 import inverse, transform
 
 ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
 MAX_LOG_FACTOR = 0.7
@@ -28,6 +35,7 @@ _ITERATIONS = 3
 _MIN_POINTS = 10
 # The first and the last level are these percentiles of the points' ln depths.
 _LEVEL_PERCENTILES = (1, 99)
+_GRID_PX = 8  # between the pixels whose depth is compared between keyframes
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,49 @@ def fit_depth_correction(
         residual = at @ values - target
         weight = 1 / (variance + (residual / _CAUCHY) ** 2)
     return DepthCorrectionField(np.clip(values, -MAX_LOG_FACTOR, MAX_LOG_FACTOR).reshape(_SHAPE), nearest, farthest)
+
+
+def depth_grid(depth_mm: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return a keyframe's depth (H, W) mm at every eighth usable pixel, (h, w) float32; NaN elsewhere."""
+    some = (slice(_GRID_PX // 2, None, _GRID_PX),) * 2
+    return np.where(valid[some], depth_mm[some], np.nan).astype(np.float32)
+
+
+def depth_disagreement(
+    camera: PinholeCamera, T_world_camera: np.ndarray, grids: Sequence[np.ndarray], gaps: Collection[int]
+) -> tuple[float, float]:
+    """Return how much the depths of keyframes disagree: of all compared keyframes, and of the farthest compared.
+
+    T_world_camera : (K, 4, 4). grids : K depths, mm, as `depth_grid` gives them. gaps : keyframes so many apart are
+    compared. A disagreement is the median of |ln(depth / transformed depth of the other keyframe)| over their pixels;
+    NaN where none sees what another sees. Neighbours share the depth of the frames between them: only far ones tell
+    whether the scale drifts.
+    """
+    errors = [
+        np.concatenate([_log_ratios(camera, T_world_camera, grids, k, k + step) for k, step in pairs])
+        for gap in sorted(set(gaps))
+        if (pairs := [(k, s) for s in (gap, -gap) for k in range(len(grids)) if 0 <= k + s < len(grids)])
+    ]
+    compared = [np.abs(error) for error in errors if error.size]
+    if not compared:
+        return float("nan"), float("nan")
+    return float(np.median(np.concatenate(compared))), float(np.median(compared[-1]))
+
+
+def _log_ratios(
+    camera: PinholeCamera, T_world_camera: np.ndarray, grids: Sequence[np.ndarray], one: int, other: int
+) -> np.ndarray:
+    """Return ln of a keyframe's depth over that of another one's points there, (n,), where both are known."""
+    rows, columns = np.nonzero(grids[one] > 0)
+    rays = camera.unproject(_GRID_PX * np.column_stack([columns, rows]) + _GRID_PX // 2)
+    points = transform(inverse(T_world_camera[other]) @ T_world_camera[one], grids[one][rows, columns, None] * rays)
+    x, y = ((camera.project(points).T[:, None] - _GRID_PX // 2) / _GRID_PX).astype(np.float32)
+    # Beyond the border, behind the camera and beside unknown depth there is nothing to compare with.
+    there_mm = cv2.remap(grids[other], x, y, cv2.INTER_LINEAR, borderValue=float("nan"))[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = np.log(there_mm / points[:, 2])
+    known: np.ndarray = ratios[np.isfinite(ratios)]
+    return known
 
 
 def _node_coordinates(size: int, nodes: int) -> np.ndarray:
