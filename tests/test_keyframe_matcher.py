@@ -13,7 +13,7 @@ from plane_scene import CAMERA
 from scopemap.config import TrackingSettings
 from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowEstimator, NoFlow
+from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.tracking.track import Track
@@ -55,6 +55,30 @@ def test_corners_of_masked_or_unknown_tissue_are_not_matched() -> None:
     assert matcher.match(_frame(1, THERE)) is None
 
 
+class _Started(NoFlow):
+    """Notes the starts that it is given."""
+
+    def __init__(self) -> None:
+        self.starts: list[FlowPair | None] = []
+
+    def estimate_checked(
+        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        self.starts.append(start)
+        return super().estimate_checked(rgb_from, rgb_to)
+
+
+def test_flow_begins_at_that_of_the_frame_before_unless_this_matched_few_corners() -> None:
+    flow, frame = _Started(), _frame(0, HERE)
+    matcher, nothing = KeyframeMatcher(flow), np.zeros_like(plane_scene.EVERYWHERE)
+    matcher.set_keyframe(frame)
+    for valid in (plane_scene.EVERYWHERE, nothing, plane_scene.EVERYWHERE):
+        matcher.match(replace(frame, valid=valid))
+    matcher.set_keyframe(frame)
+    matcher.match(frame)
+    assert [start is not None for start in flow.starts] == [False, True, False, False]
+
+
 class _Shifted(DisFlow):
     """DIS flow with a bias along x, px, that both directions share, so that they stay consistent."""
 
@@ -62,8 +86,8 @@ class _Shifted(DisFlow):
         super().__init__()
         self._bias_px = np.float32([bias_px, 0])
 
-    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        forth, back = super().estimate_both(rgb_a, rgb_b)
+    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> tuple[np.ndarray, np.ndarray]:
+        forth, back = super().estimate_checked(rgb_from, rgb_to, start)
         return forth + self._bias_px, back - self._bias_px
 
 

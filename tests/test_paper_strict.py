@@ -25,6 +25,7 @@ from scopemap.depth.estimate import DepthEstimate, PerceptualResult
 from scopemap.depth.mapis import Mapis
 from scopemap.depth.shading import ShadingDepth
 from scopemap.flow.create import create_flow
+from scopemap.flow.estimator import FlowPair
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3, so3_exp
@@ -133,8 +134,10 @@ class _Inconsistent:
 
     name: str = "stub"
 
-    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        flow = np.zeros((*rgb_a.shape[:2], 2), np.float32)
+    def estimate_checked(
+        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        flow = np.zeros((*rgb_from.shape[:2], 2), np.float32)
         flow[..., 0] = 3.0
         return flow, flow
 

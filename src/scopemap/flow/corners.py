@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 
 from scopemap.errors import check_shape
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame
 
 _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
 _CELL_PX = 12
 _CONSISTENCY_PX = 1.0
+_START_COVERAGE = 0.3  # of the corners that must be matched for the flow to be the next frame's start
 # Refinement.
 _SURROUND_PX, _DARKEST = 8.0, 8.0  # of the local mean and contrast; grey levels added to the mean
 _CONTRAST, _LEAST_CONTRAST = 50.0, 0.02  # grey levels of one local standard deviation; smaller contrast is noise
@@ -51,17 +52,21 @@ class Correspondences2D3D:
 
 
 class KeyframeMatcher:
-    """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow."""
+    """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow.
+
+    The flow to a frame is searched from that to the frame before.
+    """
 
     def __init__(self, flow: FlowEstimator) -> None:
         self._flow = flow
         self._keyframe: Frame | None = None
+        self._flows: FlowPair | None = None
         self._corners = np.zeros((0, 2), dtype=int)
         self._points_mm = np.zeros((0, 3))
 
     def set_keyframe(self, keyframe: Frame | None) -> None:
         """Detect the corners of a frame with depth, which replace those of the last keyframe; None: no keyframe."""
-        self._keyframe = keyframe
+        self._keyframe, self._flows = keyframe, None
         if keyframe is None:
             return
         assert keyframe.depth_mm is not None
@@ -74,9 +79,10 @@ class KeyframeMatcher:
         """Return the corners of the keyframe that are matched in a frame; None where the keyframe has none."""
         if self._keyframe is None or not len(self._corners):
             return None
-        flows = self._flow.estimate_both(self._keyframe.rgb, frame.rgb)
+        flows = self._flow.estimate_checked(self._keyframe.rgb, frame.rgb, self._flows)
         matched, pixels = match_corners(self._corners, flows, frame.valid, _CONSISTENCY_PX)
         coverage = len(matched) / len(self._corners)
+        self._flows = flows if coverage >= _START_COVERAGE else None
         return Correspondences2D3D(self._points_mm[matched], pixels, coverage, self._keyframe.index)
 
 

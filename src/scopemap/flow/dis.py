@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.estimator import FlowEstimator, FlowPair
 
 
 class DisFlow(FlowEstimator):
@@ -19,24 +19,41 @@ class DisFlow(FlowEstimator):
 
     def __init__(self, *, smooth: bool = True) -> None:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        # With patches further apart and fewer steps each, flow that begins near the truth is as good.
+        self._near, self._check = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2))
+        for dis in (self._near, self._check):
+            dis.setPatchStride(4)
+            dis.setGradientDescentIterations(12)
+        self._check.setFinestScale(2)
         if not smooth:
             self._dis.setFinestScale(0)
             self._dis.setVariationalRefinementIterations(0)
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
-        return self._estimate(rgb_from, rgb_to, np.zeros((*rgb_from.shape[:2], 2), np.float32))
+        return _computed(self._dis, rgb_from, rgb_to)
+
+    def estimate_checked(
+        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
+    ) -> FlowPair:
+        """Return the flow there, and a coarse flow back; the coarsest scale begins at `start`."""
+        there, back = (None, None) if start is None else start
+        return _computed(self._near, rgb_from, rgb_to, there), _computed(self._check, rgb_to, rgb_from, back)
 
     def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair
+    ) -> FlowPair:
         """Return the flows a to b and b to a; the coarsest scale begins at `start`."""
-        return self._estimate(rgb_a, rgb_b, start[0]), self._estimate(rgb_b, rgb_a, start[1])
-
-    def _estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: np.ndarray) -> np.ndarray:
-        grey_from, grey_to = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_from, rgb_to))
-        return np.asarray(self._dis.calc(grey_from, grey_to, start.astype(np.float32)), np.float32)
+        return _computed(self._dis, rgb_a, rgb_b, start[0]), _computed(self._dis, rgb_b, rgb_a, start[1])
 
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""
         return {"flow": self.name, "opencv": cv2.__version__}
+
+
+def _computed(
+    dis: cv2.DISOpticalFlow, rgb_from: np.ndarray, rgb_to: np.ndarray, start: np.ndarray | None = None
+) -> np.ndarray:
+    grey_from, grey_to = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_from, rgb_to))
+    # OpenCV writes the result over the start.
+    return np.asarray(dis.calc(grey_from, grey_to, None if start is None else start.astype(np.float32)), np.float32)

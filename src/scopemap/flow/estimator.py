@@ -11,6 +11,10 @@ from scopemap.errors import check_shape
 from scopemap.geometry.warp import pull
 
 
+FlowPair = tuple[np.ndarray, np.ndarray]
+"""Flow from one image to another, and back, (H, W, 2) float32 px each."""
+
+
 class FlowEstimator(Protocol):
     """Optical flow between two images: pixel p of the first is seen at p + flow(p) in the second."""
 
@@ -20,13 +24,22 @@ class FlowEstimator(Protocol):
         """Return the flow (H, W, 2) float32, px (x, y), of two (H, W, 3) uint8 images of one size."""
         ...
 
-    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> FlowPair:
         """Return the flows a to b and b to a; an estimator that can share work between them overrides this."""
         return self.estimate(rgb_a, rgb_b), self.estimate(rgb_b, rgb_a)
 
+    def estimate_checked(
+        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
+    ) -> FlowPair:
+        """Return the flow from one image to another, and one back that serves only to check it.
+
+        For images of successive frames, or with `start`, what this returned for a frame before.
+        """
+        return self.estimate_both(rgb_from, rgb_to)
+
     def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair
+    ) -> FlowPair:
         """Return the flows a to b and b to a, searched from `start`; an estimator that has no start ignores it."""
         return self.estimate_both(rgb_a, rgb_b)
 
@@ -56,26 +69,24 @@ class Flow:
     Attributes
     ----------
     to_previous : (H, W, 2) float32, px: pixel p of the current frame is seen at p + to_previous(p) in the previous.
-    to_current : (H, W, 2) float32, px: from the previous frame to the current.
     consistent : (H, W) bool on the current frame's grid: True where the forward-backward error is small.
     """
 
     to_previous: np.ndarray
-    to_current: np.ndarray
     consistent: np.ndarray
 
 
 def pair_flow(
     estimator: FlowEstimator, rgb_previous: np.ndarray, rgb_current: np.ndarray, consistency_px: float
 ) -> Flow:
-    """Return the forward and backward flow between two (H, W, 3) uint8 frames, with their consistency check.
+    """Return the flow from a frame (H, W, 3) uint8 to the previous one, with its forward-backward consistency check.
 
     consistency_px : largest forward-backward error.
     """
     check_shape("rgb_previous", rgb_previous, (None, None, 3))
     check_shape("rgb_current", rgb_current, rgb_previous.shape)
-    to_current, to_previous = estimator.estimate_both(rgb_previous, rgb_current)
-    return Flow(to_previous, to_current, agree(to_previous, to_current, consistency_px))
+    to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)
+    return Flow(to_previous, agree(to_previous, to_current, consistency_px))
 
 
 def agree(forth: np.ndarray, back: np.ndarray, consistency_px: float) -> np.ndarray:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
+from numba import njit
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
@@ -16,19 +19,55 @@ def pull(image_previous: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
     the image, and where more than half of what would be sampled is NaN; the rest is the mean of the known neighbours.
     """
     check_shape("to_previous", to_previous, (*image_previous.shape[:2], 2))
-    height, width = to_previous.shape[:2]
+    if np.issubdtype(image_previous.dtype, np.floating):
+        height, width = to_previous.shape[:2]
+        image = np.ascontiguousarray(image_previous, np.float32).reshape(height, width, -1)
+        return _sampled(image, np.ascontiguousarray(to_previous, np.float32)).reshape(image_previous.shape)
+    x, y = _pixel_grid(*to_previous.shape[:2])
+    x, y = x + to_previous[..., 0], y + to_previous[..., 1]
+    return cv2.remap(image_previous, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=4)
+def _pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    x, y = u + to_previous[..., 0], v + to_previous[..., 1]
-    if not np.issubdtype(image_previous.dtype, np.floating):
-        return cv2.remap(image_previous, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    known = np.isfinite(image_previous)
-    values = np.where(known, image_previous, 0.0).astype(np.float32)
-    sums = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    shares = cv2.remap(known.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    inside = inside.reshape(inside.shape + (1,) * (values.ndim - 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(inside & (shares >= 0.5), sums / shares, np.nan).astype(np.float32)
+    return u, v
+
+
+@njit(cache=True, nogil=True)
+def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
+    """Mean of the known ones of four values by their bilinear weights; NaN where these are below a half."""
+    total, share = np.float32(0.0), np.float32(0.0)
+    left, up = np.float32(1.0) - a, np.float32(1.0) - b
+    for value, weight in zip(neighbours, (left * up, a * up, left * b, a * b)):  # noqa: B905
+        if np.isfinite(value):
+            total += weight * value
+            share += weight
+    return total / share if share >= 0.5 else np.float32(np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
+    """Sample floats (H, W, C) as `pull` says; (H, W, C) float32."""
+    h, w, channels = image.shape
+    out = np.full((h, w, channels), np.nan, np.float32)
+    for row in range(h):
+        for column in range(w):
+            x = np.float32(column) + to_previous[row, column, 0]
+            y = np.float32(row) + to_previous[row, column, 1]
+            if not (0.0 <= x <= w - 1 and 0.0 <= y <= h - 1):
+                continue
+            i, j = int(x), int(y)
+            a, b = x - np.float32(i), y - np.float32(j)
+            right, below = min(i + 1, w - 1), min(j + 1, h - 1)
+            for c in range(channels):
+                d00, d10, d01, d11 = image[j, i, c], image[j, right, c], image[below, i, c], image[below, right, c]
+                top, bottom = d00 + a * (d10 - d00), d01 + a * (d11 - d01)
+                value = top + b * (bottom - top)
+                if not np.isfinite(value):
+                    value = _mean_of_known((d00, d10, d01, d11), a, b)
+                out[row, column, c] = value
+    return out
 
 
 def moved_depth(

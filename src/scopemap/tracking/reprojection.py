@@ -22,7 +22,8 @@ _MIN_POINTS = 50
 _SIGMA_PX = 0.5
 _MIN_SCALE = 0.1
 _MAX_RESCALES = 20
-_OPTIONS = Options(min_decrease=1e-6)
+_OPTIONS = Options()
+_SAME_SCALE = 0.01  # a relative change that is none
 
 
 def pose_from_correspondences(
@@ -47,7 +48,7 @@ def pose_from_correspondences(
         information = 1 / (_SIGMA_PX**2 + (along**2).sum(1))
         square = ((errors**2).sum(1) - information * (errors * along).sum(1) ** 2) / _SIGMA_PX**2
         scale = robust_sigma_2d(np.sqrt(square[used]), _MIN_SCALE)
-        if abs(scale - last_scale) < 1e-3 * scale:
+        if abs(scale - last_scale) < _SAME_SCALE * scale:
             break
         data = points_mm[used], pixels[used], along[used], intrinsics, 2 * scale, unit_mm
         T, last_scale = minimise(_problem(data, unit_mm), T, _OPTIONS).state, scale

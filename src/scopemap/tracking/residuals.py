@@ -211,6 +211,31 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
     return out
 
 
+@njit(cache=True, nogil=True)
+def compared_pixels(reference, current, T_current_reference):  # type: ignore[no-untyped-def]
+    """Return the last channel's expected values (N,) and residuals (N,) float32, and how many pixels are usable.
+
+    N pixels of the reference project into usable pixels of the current image; the last channel has no gain, bias or L.
+    """
+    depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
+    image, usable, G = current.channels[-1:], current.weight, current.intrinsics
+    shown = reference.channels[-1]
+    h, w = weights.shape
+    expected, residuals = np.empty(h * w, np.float32), np.empty(h * w, np.float32)
+    count = usable_count = 0
+    for row in range(h):
+        for column in range(w):
+            if not (weights[row, column] > 0.0 and np.isfinite(depth_mm[row, column])):
+                continue
+            usable_count += 1
+            _, place, there = _projected(_unprojected(depth_mm, K, row, column), T, G, usable)
+            if there > 0.0:
+                expected[count] = shown[row, column]
+                residuals[count] = _bilinear(image, 0, place)[0] - expected[count]
+                count += 1
+    return expected[:count], residuals[:count], usable_count
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
     """Cost and information of a residual."""

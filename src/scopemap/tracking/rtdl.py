@@ -14,7 +14,15 @@ import numpy as np
 from scopemap.config import TrackingSettings
 from scopemap.geometry.least_squares import DenseModel, Options, Problem, minimise, robust_sigma
 from scopemap.geometry.se3 import orthonormalised, se3_exp
-from scopemap.tracking.residuals import PARAMETERS, Loss, View, depth_residuals, normal_equations, residual_images
+from scopemap.tracking.residuals import (
+    PARAMETERS,
+    Loss,
+    View,
+    compared_pixels,
+    depth_residuals,
+    normal_equations,
+    residual_images,
+)
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
 _INLIER = 0.5
@@ -72,17 +80,14 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
         iterations += steps
     # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
-    return judge(reference, current, motion, settings, iterations)
+    return judge(reference, current, motion, iterations)
 
 
 def judge(
-    reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings, iterations: int = 0
+    reference: list[View], current: list[View], motion: Motion, iterations: int = 0
 ) -> Alignment:
     """Return how well a motion aligns two pyramids at their finest level; the other levels are not read."""
-    residuals = _residuals(reference[0], current[0], motion, settings)
-    compared = np.isfinite(residuals[-1])
-    used, expected = residuals[-1][compared], reference[0].channels[-1][compared]
-    usable = int(((reference[0].weight > 0) & np.isfinite(reference[0].depth_mm)).sum())
+    expected, used, usable = compared_pixels(reference[0], current[0], motion.T_current_reference)
     sigma = robust_sigma(used, _MIN_SIGMA)
     if not used.size:
         return Alignment(motion, sigma, 0.0, 0.0, 0.0, 0.0, iterations)

@@ -144,7 +144,7 @@ class Tracker:
         if T is None:
             return None
         finest = build_pyramid(replace(frame, depth_mm=None), self.settings, levels=1)
-        alignment = judge(keyframe.pyramid, finest, Motion(T, np.array([1.0, 0.0])), self.settings)
+        alignment = judge(keyframe.pyramid, finest, Motion(T, np.array([1.0, 0.0])))
         self._coverage = correspondences.coverage
         error_px = reprojection_error_px(correspondences, frame.camera, T)
         is_supported = correspondences.coverage >= _MIN_COVERAGE and error_px <= _MAX_SUPPORT_PX
