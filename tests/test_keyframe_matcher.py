@@ -86,7 +86,7 @@ class _Shifted(DisFlow):
         super().__init__()
         self._bias_px = np.float32([bias_px, 0])
 
-    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
         forth, back = super().estimate_checked(rgb_from, rgb_to, start)
         return forth + self._bias_px, back - self._bias_px
 

@@ -33,16 +33,12 @@ class DisFlow(FlowEstimator):
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
         return _computed(self._dis, rgb_from, rgb_to)
 
-    def estimate_checked(
-        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
-    ) -> FlowPair:
+    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
         """Return the flow there, and a coarse flow back; the coarsest scale begins at `start`."""
         there, back = (None, None) if start is None else start
         return _computed(self._near, rgb_from, rgb_to, there), _computed(self._check, rgb_to, rgb_from, back)
 
-    def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair
-    ) -> FlowPair:
+    def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
         """Return the flows a to b and b to a; the coarsest scale begins at `start`."""
         return _computed(self._dis, rgb_a, rgb_b, start[0]), _computed(self._dis, rgb_b, rgb_a, start[1])
 
@@ -56,4 +52,5 @@ def _computed(
 ) -> np.ndarray:
     grey_from, grey_to = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_from, rgb_to))
     # OpenCV writes the result over the start.
-    return np.asarray(dis.calc(grey_from, grey_to, None if start is None else start.astype(np.float32)), np.float32)
+    flow = np.zeros((*grey_from.shape, 2), np.float32) if start is None else start.astype(np.float32)
+    return np.asarray(dis.calc(grey_from, grey_to, flow), np.float32)

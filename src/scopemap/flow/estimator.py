@@ -10,7 +10,6 @@ import numpy as np
 from scopemap.errors import check_shape
 from scopemap.geometry.warp import pull
 
-
 FlowPair = tuple[np.ndarray, np.ndarray]
 """Flow from one image to another, and back, (H, W, 2) float32 px each."""
 
@@ -28,18 +27,14 @@ class FlowEstimator(Protocol):
         """Return the flows a to b and b to a; an estimator that can share work between them overrides this."""
         return self.estimate(rgb_a, rgb_b), self.estimate(rgb_b, rgb_a)
 
-    def estimate_checked(
-        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
-    ) -> FlowPair:
+    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
         """Return the flow from one image to another, and one back that serves only to check it.
 
         For images of successive frames, or with `start`, what this returned for a frame before.
         """
         return self.estimate_both(rgb_from, rgb_to)
 
-    def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair
-    ) -> FlowPair:
+    def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
         """Return the flows a to b and b to a, searched from `start`; an estimator that has no start ignores it."""
         return self.estimate_both(rgb_a, rgb_b)
 

@@ -83,9 +83,7 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
     return judge(reference, current, motion, iterations)
 
 
-def judge(
-    reference: list[View], current: list[View], motion: Motion, iterations: int = 0
-) -> Alignment:
+def judge(reference: list[View], current: list[View], motion: Motion, iterations: int = 0) -> Alignment:
     """Return how well a motion aligns two pyramids at their finest level; the other levels are not read."""
     expected, used, usable = compared_pixels(reference[0], current[0], motion.T_current_reference)
     sigma = robust_sigma(used, _MIN_SIGMA)
