@@ -22,7 +22,7 @@ class DisFlow(FlowEstimator):
         # With patches further apart and fewer steps each, flow that begins near the truth is as good.
         self._near, self._check = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2))
         for dis in (self._near, self._check):
-            dis.setPatchStride(4)
+            dis.setPatchStride(5)
             dis.setGradientDescentIterations(12)
         self._check.setFinestScale(2)
         if not smooth:
