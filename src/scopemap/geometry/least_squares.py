@@ -236,15 +236,15 @@ class SchurModel:
     def gauss_newton_step(self) -> np.ndarray:
         """Return the step (cameras + points,) to the minimum."""
         matrix, rhs = self.reduced()
-        free, step = self.free, np.zeros(self.cameras + self.points)
-        step[free] = splu(matrix[free][:, free].tocsc()).solve(rhs[free])
+        step = np.zeros(self.cameras + self.points)
+        step[self.free] = splu(matrix).solve(rhs)
         for block in self.blocks[0]:
             points = slice(self.cameras + block.points.start, self.cameras + block.points.stop)
             step[points] = -(block.g + block.E @ step[block.columns]) / block.h
         return step
 
     def reduced(self) -> tuple[sparse.csc_matrix, np.ndarray]:
-        """Return the matrix of the camera unknowns without the points, and the right-hand side (cameras,)."""
+        """Return the matrix (F, F) of the free camera unknowns without the points, and the right-hand side (F,)."""
         rhs = np.zeros(self.cameras)
         parts = [(prior.columns, prior.A) for prior in self.blocks[1]]
         for prior in self.blocks[1]:
@@ -253,11 +253,15 @@ class SchurModel:
             shrunk = block.E / block.h[:, None]
             parts.append((block.columns, block.A - block.E.T @ shrunk))
             rhs[block.columns] -= block.scores.sum(0) - shrunk.T @ block.g
-        rows = np.concatenate([np.repeat(columns, len(columns)) for columns, _ in parts])
-        columns = np.concatenate([np.tile(columns, len(columns)) for columns, _ in parts])
+        place = np.full(self.cameras, -1)
+        place[self.free] = np.arange(len(self.free))
+        rows = place[np.concatenate([np.repeat(columns, len(columns)) for columns, _ in parts])]
+        columns = place[np.concatenate([np.tile(columns, len(columns)) for columns, _ in parts])]
         values = np.concatenate([A.ravel() for _, A in parts])
-        matrix = sparse.coo_matrix((values, (rows, columns)), shape=(self.cameras,) * 2).tocsc()
-        return matrix + sparse.diags(_RIDGE * matrix.diagonal()), rhs
+        values *= np.where(rows == columns, 1 + _RIDGE, 1.0)
+        kept = (rows >= 0) & (columns >= 0)
+        shape = (len(self.free),) * 2
+        return sparse.coo_matrix((values[kept], (rows[kept], columns[kept])), shape=shape).tocsc(), rhs[self.free]
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from scopemap.frame import is_constant
@@ -78,10 +79,10 @@ def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
     All pixels are compared where both images are black.
     """
     step = max(1, min(one.shape[:2]) // _LONGEST_SIDE_PX)
-    one, other = one[::step, ::step], other[::step, ::step]
-    difference = np.abs(one.astype(np.int16) - other)
-    lit = np.maximum(one, other).max(-1) > _BLACK_LEVEL
-    return float(difference[lit].mean() if lit.any() else difference.mean())
+    one, other = (np.ascontiguousarray(rgb[::step, ::step]) for rgb in (one, other))
+    difference, (red, green, blue) = cv2.absdiff(one, other), cv2.split(cv2.max(one, other))
+    lit = (cv2.max(cv2.max(red, green), blue) > _BLACK_LEVEL).astype(np.uint8)
+    return float(np.mean(cv2.mean(difference, lit if lit.any() else None)[:3]))
 
 
 def is_repeat(one: np.ndarray, other: np.ndarray) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,13 +105,16 @@ def focal_from_motion(sequence: Sequence, config: Config) -> FocalEstimate:
 
     The principal point is the camera's.
     """
-    camera, fits, scale = sequence.camera, [], 1.0
-    for window in windows_of(sequence, config):
-        # All windows have one size, which may be smaller than the sequence's.
-        scale = 2 * window.half_width_px / camera.width
-        fit = adjust_window(window, camera.fx * scale)
-        if fit is not None and fit.residual_px <= _MAX_RESIDUAL * scale * camera.width:
-            fits.append(fit)
+    camera, scale = sequence.camera, 1.0
+    # Flow, of the next window, and the adjustment of this one take about equally long.
+    with ThreadPoolExecutor(max_workers=1) as adjusting:
+        pending = []
+        for window in windows_of(sequence, config):
+            # All windows have one size, which may be smaller than the sequence's.
+            scale = 2 * window.half_width_px / camera.width
+            pending.append(adjusting.submit(adjust_window, window, camera.fx * scale))
+    found = [fit for fit in (one.result() for one in pending) if fit is not None]
+    fits = [fit for fit in found if fit.residual_px <= _MAX_RESIDUAL * scale * camera.width]
     estimate = combine(fits, scale * camera.width)
     return replace(estimate, focal_px=estimate.focal_px / scale)
 
