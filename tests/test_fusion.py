@@ -16,7 +16,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.frame import Frame
-from scopemap.fusion.tsdf import _sample, pack, unpack
+from scopemap.fusion.tsdf import _sample, _whole_cells, pack, unpack
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
@@ -203,11 +203,15 @@ def test_depth_is_not_interpolated_across_an_edge() -> None:
     smooth = np.float32([[1.0, 1.1], [1.2, 1.3]]) / 50
     edge, hole = smooth.copy(), smooth.copy()
     edge[:, 1], hole[1, 1] = 1 / 80, np.nan
-    assert _sample(smooth, 0.25, 0.5, 0.2) == pytest.approx((1 + 0.025 + 0.1) / 50, rel=1e-6)
-    assert _sample(smooth, -0.4, 0.0, 0.2) == pytest.approx((1 - 0.04) / 50, rel=1e-6)
-    assert _sample(edge, 0.25, 0.6, 0.2) == edge[1, 0]
-    assert _sample(edge, 0.75, 0.4, 0.2) == edge[0, 1]
-    assert _sample(hole, 0.6, 0.2, 0.2) == hole[0, 1]
+
+    def sample(inverse_depth: np.ndarray, u: float, v: float) -> float:
+        return _sample(inverse_depth, _whole_cells(inverse_depth, 0.2), u, v)
+
+    assert sample(smooth, 0.25, 0.5) == pytest.approx((1 + 0.025 + 0.1) / 50, rel=1e-6)
+    assert sample(smooth, -0.4, 0.0) == pytest.approx((1 - 0.04) / 50, rel=1e-6)
+    assert sample(edge, 0.25, 0.6) == edge[1, 0]
+    assert sample(edge, 0.75, 0.4) == edge[0, 1]
+    assert sample(hole, 0.6, 0.2) == hole[0, 1]
 
 
 def test_far_from_the_origin_nothing_changes(sphere: TsdfVolume) -> None:

@@ -133,37 +133,63 @@ def _blocks_between(a: float, b: float, wide: float, per_mm: float) -> tuple[int
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _depth_ranges(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
+    """Return the nearest and the farthest depth of each 2 by 2 pixels, (4, rows, columns, 2), mm; 0: none.
+
+    The first of the four holds the range of all of them where they are one surface; else each has its own depth.
+    """
+    height, width = inverse_depth.shape
+    ranges = np.zeros((4, (height + 1) // 2, (width + 1) // 2, 2))
+    for row in range(ranges.shape[1]):
+        for col in range(ranges.shape[2]):
+            low, high = np.inf, 0.0
+            for n in range(4):
+                i, j = 2 * row + n // 2, 2 * col + n % 2
+                if i < height and j < width and inverse_depth[i, j] > 0:
+                    low, high = min(low, inverse_depth[i, j]), max(high, inverse_depth[i, j])
+                    ranges[n, row, col] = 1.0 / inverse_depth[i, j]
+            if 0 < high <= (1.0 + 2.0 * largest_step) * low:
+                ranges[:, row, col] = 0.0
+                ranges[0, row, col, 0], ranges[0, row, col, 1] = 1.0 / high, 1.0 / low
+    return ranges
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) -> np.ndarray:
     """Return keys, some of them repeated, of all blocks within the truncation of a measured pixel (H, W).
 
-    Each ray is cut into pieces of half a block; the box around a piece, widened by the pixel's footprint, names the
-    blocks. The boxes overlap from pixel to pixel, so no voxel that the frame can see near the surface is missed.
+    The rays of 2 by 2 pixels are cut into pieces of half a block; the box around a piece, widened by the footprint of
+    these pixels, names the blocks: no voxel that the frame can see near the surface is missed.
     """
     block_mm = BLOCK * grid.voxel_mm
+    # From the middle of the four pixels to the corner of one of them.
     footprint = 1.5 / min(camera.fx, camera.fy)
     # Outside the loop: numba counts references of arrays that are read from a tuple.
     R, per_mm = camera.R, 1.0 / grid.voxel_mm
     origin = -R.T @ camera.t
     recent = np.full(_RECENT, -1, np.int64)
     keys, count = np.empty(4096, np.int64), 0
-    # By piece: the blocks of the pixel before, which are most often this one's as well. At first, none.
+    # By piece: the blocks of the pixels before, which are most often these pixels' as well. At first, none.
     last_box = [(0, -1, 0, -1, 0, -1)]
-    for row in range(inverse_depth.shape[0]):
-        for col in range(inverse_depth.shape[1]):
-            if not inverse_depth[row, col] > 0:
+    ranges = _depth_ranges(inverse_depth, grid.largest_step)
+    for row in range(ranges.shape[1]):
+        for n in range(4 * ranges.shape[2]):
+            col = n // 4
+            nearest, farthest = ranges[n % 4, row, col, 0], ranges[n % 4, row, col, 1]
+            if nearest == 0:
                 continue
-            depth = 1.0 / inverse_depth[row, col]
-            x, y = (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+            x, y = (2 * col + 0.5 - camera.cx) / camera.fx, (2 * row + 0.5 - camera.cy) / camera.fy
             dx, dy = R[0, 0] * x + R[1, 0] * y + R[2, 0], R[0, 1] * x + R[1, 1] * y + R[2, 1]
             dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
-            truncation_mm = max(grid.truncation_mm, grid.truncation_share * depth)
-            pieces = int(np.ceil(4.0 * truncation_mm / block_mm))
-            piece_mm = 2.0 * truncation_mm / pieces
+            first_mm = nearest - max(grid.truncation_mm, grid.truncation_share * nearest)
+            last_mm = farthest + max(grid.truncation_mm, grid.truncation_share * farthest)
+            pieces = int(np.ceil(2.0 * (last_mm - first_mm) / block_mm))
+            piece_mm = (last_mm - first_mm) / pieces
             for piece in range(pieces):
                 if piece == len(last_box):
                     last_box.append((0, -1, 0, -1, 0, -1))
-                near = max(depth - truncation_mm + piece * piece_mm, 0.0)
-                far = max(near, depth - truncation_mm + (piece + 1) * piece_mm)
+                near = max(first_mm + piece * piece_mm, 0.0)
+                far = max(near, first_mm + (piece + 1) * piece_mm)
                 wide = footprint * far
                 first_x, last_x = _blocks_between(origin[0] + near * dx, origin[0] + far * dx, wide, per_mm)
                 first_y, last_y = _blocks_between(origin[1] + near * dy, origin[1] + far * dy, wide, per_mm)
@@ -186,70 +212,87 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     return keys[:count]
 
 
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def _whole_cells(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
+    """Return whether a pixel, its right, its lower and its diagonal neighbour are one surface, (H, W) bool."""
+    height, width = inverse_depth.shape
+    whole = np.zeros((height, width), np.bool_)
+    for row in prange(height - 1):
+        for col in range(width - 1):
+            a, b = inverse_depth[row, col], inverse_depth[row, col + 1]
+            c, d = inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
+            low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+            known = a > 0 and b > 0 and c > 0 and d > 0
+            # A cell's diagonal is sqrt(2) px long.
+            whole[row, col] = known and high - low <= 1.5 * largest_step * low
+    return whole
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sample(inverse_depth: np.ndarray, u: float, v: float, largest_step: float) -> float:
+def _sample(inverse_depth: np.ndarray, whole: np.ndarray, u: float, v: float) -> float:
     """Bilinear inverse depth where the four neighbours are one surface, else the nearest pixel's (NaN: none)."""
     # Clamped, so that the outer half of a border pixel continues the cell inside it.
-    col = min(max(int(np.floor(u)), 0), inverse_depth.shape[1] - 2)
-    row = min(max(int(np.floor(v)), 0), inverse_depth.shape[0] - 2)
-    a, b = inverse_depth[row, col], inverse_depth[row, col + 1]
-    c, d = inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
-    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-    known = a > 0 and b > 0 and c > 0 and d > 0
-    # A cell's diagonal is sqrt(2) px long.
-    if known and high - low <= 1.5 * largest_step * low:
+    col = min(max(int(u), 0), inverse_depth.shape[1] - 2)
+    row = min(max(int(v), 0), inverse_depth.shape[0] - 2)
+    if whole[row, col]:
         s, t = u - col, v - row
-        return (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
-    return inverse_depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))]
+        upper = (1 - s) * inverse_depth[row, col] + s * inverse_depth[row, col + 1]
+        return (1 - t) * upper + t * ((1 - s) * inverse_depth[row + 1, col] + s * inverse_depth[row + 1, col + 1])
+    return inverse_depth[int(v + 0.5), int(u + 0.5)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _integrate_block(
     voxels: Voxels,
-    slot: int,
     corner: np.ndarray,
     surface: MeasuredSurface,
+    whole: np.ndarray,
     picture: np.ndarray,
-    camera: TsdfCamera,
+    projection: np.ndarray,
     grid: Grid,
 ) -> None:
+    """Fuse a frame into the voxels of one block; the pixel of a point (x, y, z) mm is `projection` @ (x, y, z, 1)."""
     # Outside the loop: numba counts references of arrays that are read from a tuple.
     tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
     inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
-    R, t = camera.R, camera.t
     height, width = inverse_depths.shape
-    for i in range(BLOCK):
-        for j in range(BLOCK):
-            for k in range(BLOCK):
-                x, y = (corner[0] + i) * grid.voxel_mm, (corner[1] + j) * grid.voxel_mm
-                z = (corner[2] + k) * grid.voxel_mm
-                depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-                if depth <= 0:
-                    continue
-                u = camera.fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth + camera.cx
-                v = camera.fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth + camera.cy
-                if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-                    continue
-                row, col = int(v + 0.5), int(u + 0.5)
-                weight = pixel_weight[row, col]
-                if weight == 0:
-                    continue
-                inverse_depth = _sample(inverse_depths, u, v, grid.largest_step)
-                truncation = max(grid.truncation_mm, grid.truncation_share / inverse_depth)
-                gap = 1.0 - depth * inverse_depth
-                behind = -gap / (inverse_depth * truncation)
-                if behind >= 1.0:
-                    continue
-                weight *= min(1.0, (1.0 - behind) / (1.0 - grid.full_weight_share))
-                distance = min(max(gap * plane_mm[row, col], -truncation), truncation)
-                total = weights[slot, i, j, k] + weight
-                tsdf[slot, i, j, k] += (distance - tsdf[slot, i, j, k]) * weight / total
-                weights[slot, i, j, k] = total
-                if abs(distance) <= _COLOUR_BAND_VOXELS * grid.voxel_mm:
-                    weight *= picture[row, col, 3]
-                    for channel in range(3):
-                        colour[slot, i, j, k, channel] += weight * picture[row, col, channel]
-                    colour[slot, i, j, k, 3] += weight
+    p, voxel_mm = projection, grid.voxel_mm
+    step_u, step_v, step_depth = voxel_mm * p[0, 2], voxel_mm * p[1, 2], voxel_mm * p[2, 2]
+    z = corner[2] * voxel_mm
+    for line in range(BLOCK * BLOCK):
+        i, j = line // BLOCK, line % BLOCK
+        x, y = (corner[0] + i) * voxel_mm, (corner[1] + j) * voxel_mm
+        first_u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
+        first_v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
+        first_depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+        for k in range(BLOCK):
+            depth = first_depth + k * step_depth
+            if depth <= 0:
+                continue
+            u, v = (first_u + k * step_u) / depth, (first_v + k * step_v) / depth
+            if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                continue
+            row, col = int(v + 0.5), int(u + 0.5)
+            weight = pixel_weight[row, col]
+            if weight == 0:
+                continue
+            inverse_depth = _sample(inverse_depths, whole, u, v)
+            # Relative to the depth of the voxel's pixel: how far in front of the surface, and the truncation.
+            gap, share = 1.0 - depth * inverse_depth, max(grid.truncation_mm * inverse_depth, grid.truncation_share)
+            if gap <= -share:
+                continue
+            if gap < 0:
+                weight *= min(1.0, (1.0 + gap / share) / (1.0 - grid.full_weight_share))
+            truncation = share / inverse_depth
+            distance = min(max(gap * plane_mm[row, col], -truncation), truncation)
+            total = weights[i, j, k] + weight
+            tsdf[i, j, k] += (distance - tsdf[i, j, k]) * weight / total
+            weights[i, j, k] = total
+            if abs(distance) <= _COLOUR_BAND_VOXELS * voxel_mm:
+                weight *= picture[row, col, 3]
+                for channel in range(3):
+                    colour[i, j, k, channel] += weight * picture[row, col, channel]
+                colour[i, j, k, 3] += weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
@@ -271,8 +314,14 @@ def integrate_blocks(
     the weight falls to 0 (Oleynikova et al., IROS 2017, eq. 6), so that views past a thin fold outweigh views of
     its front. Changes `voxels`.
     """
+    whole = _whole_cells(surface.inverse_depth, grid.largest_step)
+    projection = np.empty((3, 4))
+    projection[:, :3], projection[:, 3] = camera.R, camera.t
+    projection[0] = camera.fx * projection[0] + camera.cx * projection[2]
+    projection[1] = camera.fy * projection[1] + camera.cy * projection[2]
     for n in prange(len(slots)):
-        _integrate_block(voxels, slots[n], corners[n], surface, picture, camera, grid)
+        block = Voxels(voxels.tsdf[slots[n]], voxels.weight[slots[n]], voxels.colour[slots[n]])
+        _integrate_block(block, corners[n], surface, whole, picture, projection, grid)
 
 
 class VoxelBlocks:

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from numba import njit
 from scipy import sparse
 
 from scopemap.cameras.camera import PinholeCamera
@@ -54,14 +56,11 @@ class DepthCorrectionField:
 
     def log_factor(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return ln of the factor (H, W) float32 for estimated depth (H, W) mm; NaN where that is unknown."""
-        height, width = depth_mm.shape
-        x, y = np.meshgrid(_node_coordinates(width, COLUMNS), _node_coordinates(height, ROWS))
+        x, y = _pixel_coordinates(*depth_mm.shape)
         flat = cv2.remap(self.values.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         with np.errstate(divide="ignore", invalid="ignore"):
-            level = _level(np.log(depth_mm), self.nearest, self.farthest).astype(np.float32)
-        below = np.minimum(np.nan_to_num(level), LEVELS - 2).astype(int)
-        low, high = (np.take_along_axis(flat, n[..., None], -1)[..., 0] for n in (below, below + 1))
-        return low + (level - below.astype(np.float32)) * (high - low)
+            log_depth = np.log(depth_mm, dtype=np.float32)
+        return _between_levels(flat, log_depth, self.nearest, self.farthest)
 
 
 def fit_depth_correction(
@@ -135,6 +134,28 @@ def _log_ratios(
         ratios = np.log(there_mm / points[:, 2])
     known: np.ndarray = ratios[np.isfinite(ratios)]
     return known
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _between_levels(flat: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
+    """Interpolate values (H, W, levels) at ln depth (H, W), (H, W) float32; NaN where that is NaN."""
+    height, width = log_depth.shape
+    found, per_level = np.full((height, width), np.nan, np.float32), (LEVELS - 1) / (farthest - nearest)
+    for row in range(height):
+        for col in range(width):
+            if not np.isnan(log_depth[row, col]):
+                level = min(max((log_depth[row, col] - nearest) * per_level, 0.0), LEVELS - 1.0)
+                below = min(int(level), LEVELS - 2)
+                low, high = flat[row, col, below], flat[row, col, below + 1]
+                found[row, col] = low + (level - below) * (high - low)
+    return found
+
+
+@lru_cache(4)
+def _pixel_coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return column and row of each pixel, in nodes, (H, W) float32 each."""
+    x, y = np.meshgrid(_node_coordinates(width, COLUMNS), _node_coordinates(height, ROWS))
+    return x, y
 
 
 def _node_coordinates(size: int, nodes: int) -> np.ndarray:
