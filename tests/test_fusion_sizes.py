@@ -69,9 +69,9 @@ def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
     store.put(wall(30.0))
     assert list(tmp_path.iterdir()) == []
     store.close()
-    gone = FrameStore(tmp_path / "gone")
-    with pytest.raises(InputError, match=r"cannot store frames in .*gone: No such file"):
-        gone.put(wall(30.0))
+    for advice, said in (("", "free space there"), ("or fuse at once", "free space there, or fuse at once")):
+        with pytest.raises(InputError, match=rf"cannot store frames in .*gone: No such file.*; {said}$"):
+            FrameStore(tmp_path / "gone", advice).put(wall(30.0))
 
 
 def test_depth_beyond_the_range_is_unknown() -> None:

@@ -94,6 +94,15 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
+def test_a_surface_fused_frame_by_frame_is_compared_with_some_of_its_frames(tmp_path: Path) -> None:
+    source = write_tiny(tmp_path / "phantom", frames=18)
+    at_once = with_true_depth(source, fusion__voxel_mm=1.0, mapping__method="none")
+    figures = reconstruct(open_sequence(source), at_once).provenance["surface"]
+    # At most 16 frames: every second one.
+    assert figures["frames"] == 9
+    assert figures["coverage_mean"] > 0.75
+
+
 def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,7 +38,8 @@ from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, pr
 from scopemap.tracking.track import FrameTracker
 
 Observer = Callable[[Step], None]
-_CHECKED_FRAMES = 16  # of a submap, at which its surface is rendered again
+_CHECKED_FRAMES = 16  # most frames of a submap at which its surface is rendered again
+_NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 _VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
 _VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
 
@@ -81,7 +82,7 @@ def reconstruct(
     if exponent_notes:
         # Some estimators remember the first frame that they saw, and the anchor holds the settings.
         estimators = create_estimators(config, sequence)
-    with closing(FrameStore(folder)) as store:
+    with closing(FrameStore(folder, _NO_STORE)) as store:
         run = _Run(sequence, config, Pipeline(config, estimators, store, tracker), clock, write)
         run.track(observers)
         result = run.result(camera_notes + exponent_notes)
@@ -101,6 +102,7 @@ class _Run:
     write: DepthWriter | None
     records: list[FrameRecord] = field(default_factory=list)
     median_depths_mm: list[float] = field(default_factory=list)
+    checked: _SpreadFrames = field(default_factory=lambda: _SpreadFrames())
 
     def track(self, observers: tuple[Observer, ...]) -> None:
         """Pass all frames through the pipeline. Raises `InputError` where no frame is tracked."""
@@ -110,6 +112,8 @@ class _Run:
                 self.median_depths_mm.append(float(np.nanmedian(some_mm)))
             if self.write is not None and not self.pipeline.fusion.at_end:
                 self.write(step.frame)
+            if self.pipeline.fusion.at_once:
+                self.checked.put(step.frame)
             for observer in observers:
                 observer(step)
             self.records.append(FrameRecord.of(step))
@@ -132,19 +136,21 @@ class _Run:
         sequence, pipeline = self.sequence, self.pipeline
         store = pipeline.fusion.store
         final = FinalFrames(submap, store.poses(submap.frames), store.frame)
-        depths, checked = self._triangulated_depths(final), list[Frame]()
+        depths = self._triangulated_depths(final)
         with closing(depths) if depths is not None else nullcontext():
-            frames = self._written(final.frames(None if depths is None else depths.depth), submap, checked)
+            frames = self._written(final.frames(None if depths is None else depths.depth))
             fused: FusedSurface = self.clock.timed("fuse", pipeline.fusion.fuse, frames, submap.main_frames)
         fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
-        agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
+        agreement = self.clock.timed("check surface", _surface_agreement, fused, self.checked.frames)
+        self.checked = _SpreadFrames()
         records = records_of(submap, self.records)
         provenance = _provenance(sequence, pipeline.estimators, self.clock, records)
         correction = [] if submap.correction is None else [submap.correction.description]
         provenance["notes"] += notes + correction + ([] if depths is None else [depths.description]) + fused.notes
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
-        median_mm = store.median_depth_mm(submap.frames)
+        # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
+        median_mm = store.median_depth_mm(submap.main_frames)
         medians_mm = self.median_depths_mm if median_mm is None else [median_mm]
         provenance["warnings"] += _depth_warnings(medians_mm, fused.settings)
         provenance["surface"] = agreement
@@ -162,12 +168,10 @@ class _Run:
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
 
-    def _written(self, frames: Iterator[Frame], submap: Submap, checked: list[Frame]) -> Iterator[Frame]:
+    def _written(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked."""
-        every = -(-len(submap.frames) // _CHECKED_FRAMES)
-        for number, frame in enumerate(frames):
-            if number % every == 0:
-                checked.append(frame)
+        for frame in frames:
+            self.checked.put(frame)
             yield self._write_depth(frame)
 
     def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
@@ -192,6 +196,24 @@ def _surface_agreement(fused: FusedSurface, frames: list[Frame]) -> dict[str, fl
             found, _ = compare_with_frame(fused.mesh, *seen, albedo=fused.settings.colours == "albedo")
             agreements.append(found)
     return agreement_figures(agreements) if agreements else {}
+
+
+class _SpreadFrames:
+    """Every n-th of the frames with a pose that are put in, at most `_CHECKED_FRAMES`; n doubles as they grow more."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self._every, self._count = 1, 0
+
+    def put(self, frame: Frame) -> None:
+        """Keep or skip a frame."""
+        if frame.T_world_camera is None:
+            return
+        if self._count % self._every == 0:
+            self.frames.append(frame)
+        self._count += 1
+        if len(self.frames) > _CHECKED_FRAMES:
+            self.frames, self._every = self.frames[::2], 2 * self._every
 
 
 class _Clock:

@@ -41,11 +41,12 @@ class _Entry:
 class FrameStore:
     """Stores frames with depth in one unnamed file, which is created with the first frame and deleted with the store.
 
-    folder : where that file is; None: the system's temporary folder.
+    folder : where that file is; None: the system's temporary folder. advice : what else helps where that is full.
     """
 
-    def __init__(self, folder: Path | None = None) -> None:
+    def __init__(self, folder: Path | None = None, advice: str = "") -> None:
         self._folder = Path(tempfile.gettempdir() if folder is None else folder)
+        self._advice = f", {advice}" if advice else ""
         self._file: IO[bytes] | None = None
         self._entries: list[_Entry] = []
         self._place: dict[int, int] = {}
@@ -71,8 +72,7 @@ class FrameStore:
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"cannot store frames in {self._folder}: {error.strerror or error}; free space there, or set "
-                "mapping.method=none and fusion.voxel_mm: then no frame is stored"
+                f"cannot store frames in {self._folder}: {error.strerror or error}; free space there{self._advice}"
             ) from None
         sizes = [len(part) for part in parts]
         offset = self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
