@@ -43,8 +43,7 @@ _FLOW_SIGMA_PX, PRIOR_SIGMA = 0.3, 0.3
 MAX_SIGMA = 0.08
 _MAX_LOG_FACTOR = 0.5
 _MIN_SPREAD = 4.0  # grey levels of normalised contrast, standard deviation
-# Neighbours are warped and compared at half of the size first, where flow costs a quarter.
-_SHARES = (0.5, 1.0)
+_WARPS = 2
 _CARRIED_EVERY = 2  # pixels of a row and a column are compared with keyframes; what depth is off by is smooth
 _CACHED_VIEWS = 24
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
@@ -62,11 +61,6 @@ class StereoView(NamedTuple):
     contrast: np.ndarray
     depth_mm: np.ndarray
     T_world_camera: np.ndarray
-
-    def resized(self, width: int, height: int) -> StereoView:
-        """Return the view at a smaller size; depth is unknown where part of a pixel's is."""
-        contrast, depth_mm = (cv2.resize(i, (width, height), interpolation=cv2.INTER_AREA) for i in self[:2])
-        return StereoView(contrast, depth_mm, self.T_world_camera)
 
 
 class TriangulatedDepth(NamedTuple):
@@ -127,22 +121,19 @@ def triangulate_depth(
 ) -> TriangulatedDepth | None:
     """Return the triangulated depth of a view; None where its neighbours disagree or are fewer than two."""
     neighbours, total = list(neighbours), np.zeros_like(view.depth_mm)
-    for share in _SHARES:
-        size = round(share * camera.width), round(share * camera.height)
-        at, others = (view, neighbours) if share == 1 else (view.resized(*size), [n.resized(*size) for n in neighbours])
-        total = cv2.resize(total, size, interpolation=cv2.INTER_LINEAR)
-        start = at._replace(depth_mm=at.depth_mm * np.exp(total))
-        estimates = _estimates(start, others, camera.resized(*size), flow)
+    for _ in range(_WARPS):
+        start = view._replace(depth_mm=view.depth_mm * np.exp(total))
+        estimates = _estimates(start, neighbours, camera, flow)
         if len(estimates) < 2:
             return None
         log_factor, information, scatter, compared = combine(*(np.stack(part) for part in zip(*estimates, strict=True)))
         known, few = _blurred(compared, _DISAGREEMENT_PX), np.float32(0.01)  # where few can be compared depth stays
         with np.errstate(divide="ignore"):
             variance = (_blurred(scatter, _DISAGREEMENT_PX) + few * PRIOR_SIGMA**2) / (known + few) + 1 / information
+        if not np.sqrt(np.median(variance[np.isfinite(view.depth_mm)])) <= MAX_SIGMA:
+            return None
         shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
         total = _smoothed(shrunk, information)
-    if not np.sqrt(np.median(variance[np.isfinite(view.depth_mm)])) <= MAX_SIGMA:
-        return None
     sigma = np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2))
     return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
 
