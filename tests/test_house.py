@@ -183,7 +183,7 @@ def test_networks_are_imported_by_their_adapters_alone() -> None:
 
 @pytest.mark.parametrize("name", ["scopemap", "scopemap.cli"])
 def test_importing_does_not_wait_for_networks(name: str) -> None:
-    heavy = NETWORKS | {"onnxruntime", "numba", "matplotlib"}
+    heavy = NETWORKS | {"onnxruntime", "numba", "matplotlib", "numpy"}
     code = f"import sys, {name}; print(*sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

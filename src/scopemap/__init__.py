@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 # Networks share the cores with the tracker. Threads that wait for each other must sleep then: spinning, torch's were
@@ -15,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
+    __version__: str
+
     from scopemap.config import Config
     from scopemap.errors import ScopemapError
     from scopemap.frame import Frame, Truth
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from scopemap.trajectory.formats.opening import read_trajectory
     from scopemap.trajectory.trajectory import Trajectory
 
-__version__ = version("scopemap")
 __all__ = [
     "Config",
     "Frame",
@@ -53,6 +53,10 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for: `scopemap --help` must not wait for compilers and networks."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("scopemap")
     if name not in _HOMES:
         raise AttributeError(f"module 'scopemap' has no attribute '{name}'")
     from importlib import import_module

@@ -9,8 +9,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class ScopemapError(Exception):
@@ -39,7 +41,7 @@ class AlignmentError(ScopemapError):
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
     """Raise `ValueError` unless `array` has `shape`; `None` in `shape` stands for any length."""
-    found = np.shape(array)
+    found = array.shape
     fits = len(found) == len(shape) and all(want in (None, have) for want, have in zip(shape, found, strict=True))
     if not fits:
         wanted = ", ".join("any" if n is None else str(n) for n in shape)

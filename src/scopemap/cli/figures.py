@@ -10,9 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from scopemap.benchmark.result import without_nan
 
@@ -126,6 +123,10 @@ def print_table(
     heads: Sequence[str], rows: Iterable[Iterable[str]], *, numbers: Sequence[str] = (), title: str | None = None
 ) -> None:
     """Print a table with columns `heads`, then those of `numbers`, which are aligned right."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
     table = Table(*heads, title=title, title_justify="left")
     for head in numbers:
         table.add_column(head, justify="right")
@@ -141,6 +142,10 @@ def print_values(values: Mapping[str, Any], *, title: str | None = None, head: s
 
 def print_findings(findings: Sequence[tuple[str, str, str]]) -> None:
     """Print a table of (severity, code, message), if there are any."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
     if findings:
         table = Table("severity", "code", "what was found")
         for severity, code, message in findings:

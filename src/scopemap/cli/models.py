@@ -9,7 +9,6 @@ import typer
 from scopemap.cli.figures import print_json, print_table
 from scopemap.cli.options import AsJson, Quiet
 from scopemap.errors import WeightsError
-from scopemap.io import weights
 
 app = typer.Typer(help="Weights of the networks: list, pull, verify.", no_args_is_help=True)
 
@@ -17,6 +16,8 @@ app = typer.Typer(help="Weights of the networks: list, pull, verify.", no_args_i
 @app.command("list")
 def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the known weights and whether they are there."""
+    from scopemap.io import weights
+
     rows = weights.overview()
     if as_json:
         fields = ("name", "purpose", "licence", "size_mb", "state")
@@ -34,6 +35,8 @@ def pull(
     quiet: Quiet = False,
 ) -> None:
     """Download weights into the weights folder (SCOPEMAP_WEIGHTS_DIR, or the user's cache)."""
+    from scopemap.io import weights
+
     path = weights.pull(name, progress=not (quiet or as_json))
     if as_json:
         print_json({"name": name, "path": str(path)})
@@ -48,6 +51,8 @@ def verify(
     quiet: Quiet = False,
 ) -> None:
     """Hash weights again and compare them with the pinned or recorded hashes."""
+    from scopemap.io import weights
+
     states = {row.name: row.state for row in weights.overview() if row.state != "missing"}
     names, faults = [name] if name else list(states), dict[str, str]()
     for each in names:
