@@ -25,12 +25,13 @@ from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
+from scopemap.mapping.map_merging import split_maps
 from scopemap.mapping.reprojection import BundleProblem
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import RELOCALISED, Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FIRST, SECOND, LOST_BEFORE_NEW = 10, 13, 2
@@ -217,6 +218,56 @@ def test_the_submap_with_most_frames_comes_first(monkeypatch: pytest.MonkeyPatch
         assert [(submap.maps, len(submap.frames)) for submap in submaps] == expected
         assert f"{expected[0][1]} of 45 tracked frames are in the result" in warnings[0]
         assert warnings[0].startswith("5 submaps" if method == "none" else "4 submaps")
+
+
+@pytest.mark.parametrize(
+    ("elsewhere", "reason", "split"), [(True, "", True), (True, RELOCALISED, False), (False, "", False)]
+)
+def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(
+    elsewhere: bool, reason: str, split: bool
+) -> None:
+    mapper = Mapper(MappingSettings(), DisFlow())
+    for number in range(10):
+        after = number >= 4
+        at_mm = ((40.0 if elsewhere and after else -60.0) + 2 * number, 0.0, 0.0)
+        frame, pose = _keyframe(number, at_mm, Similarity.identity(), 1.0)
+        if number == 4:
+            mapper.observe(Track(10 * number - 5, "lost", "blur", frame.T_world_camera, 30))
+        # After the loss, too, the frame is aligned to the keyframe before it.
+        keyframe = 10 * max(number - 1, 0)
+        track = Track(frame.index, "ok", reason if number == 4 else "", pose.T_world_camera, keyframe)
+        mapper.add_keyframe(frame, track)
+        mapper.observe(track)
+    submaps, warnings = mapper.submaps()
+    assert sorted(submaps[0].frames) == ([*range(40, 100, 10)] if split else [*range(0, 100, 10)])
+    assert [text[:9] for text in warnings] == (["2 submaps"] if split else [])
+    assert submaps[0].main == int(split)
+    if split:
+        correction = submaps[0].correction
+        assert correction is not None
+        poses = np.stack([correction.pose(n, plane_scene.pose(at_mm=(40 + n / 5, 0, 0))) for n in (40, 60)])
+        np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
+        np.testing.assert_allclose(poses[1, :3, 3], [4, 0, 0], atol=0.1)
+
+
+def test_parts_of_maps_stay_together_by_what_they_observe_in_common() -> None:
+    segments = ((0, 0), (0, 0), (0, 3), (1, 3), (0, 4), (0, 9))
+    tracked = [TrackedPose(number, 0, np.eye(4), segment) for number, segment in segments]
+    few, half = [(1, 2)] * 19, [(1, 4), (4, 2)] * 10
+    own = [(0, 1), (1, 0), (2, 3), (3, 5)] * 50  # within a part, and of other maps
+    parts = [(0, 0), (0, 3), (1, 3), (0, 4), (0, 9)]
+    for pairs, relocalised, expected in (
+        ([], (), [0, 2, 1, 3, 4]),
+        (few + own, (), [0, 2, 1, 3, 4]),
+        ([*few, (2, 0), *own], (), [0, 0, 1, 2, 3]),
+        # The last part but one ties two others together.
+        ([(4, 0)] * 20 + [(4, 2)] * 20, (), [0, 0, 1, 0, 2]),
+        (half, (), [0, 2, 1, 3, 4]),
+        ([(0, 2)] * 20 + half, (), [0, 0, 1, 0, 2]),
+        ([], (((0, 9), (0, 0)), ((0, 8), (0, 0))), [0, 2, 1, 3, 0]),
+    ):
+        found = split_maps(tracked, np.array(pairs, int).reshape(-1, 2), relocalised)
+        assert [found[part] for part in parts] == expected, pairs
 
 
 def test_dirt_on_the_lens_merges_no_maps() -> None:

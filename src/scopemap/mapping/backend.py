@@ -28,7 +28,7 @@ from scopemap.mapping.depth_correction import (
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import Loop, LoopFinder
-from scopemap.mapping.map_merging import merge_maps
+from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
@@ -37,6 +37,8 @@ from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
 _TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
 # Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
 _DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
+# Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
+_MAX_PART_ERROR = 0.05
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
 _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
 
@@ -101,6 +103,30 @@ class Backend:
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map))
 
+    def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
+        """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`.
+
+        Nothing is returned where the camera was not lost within a map.
+        """
+        self._finish()
+        parts = {(pose.map, pose.segment) for pose in self._tracked}
+        if self._camera is None or len(parts) == len({number for number, _ in parts}):
+            return {}
+        points, observations = self._tracks.collected()
+        T = np.stack([pose.T_world_camera for pose in self._tracked])
+        problem = BundleProblem(inverse(T), points, observations, Priors(), np.zeros((0, 2), int), self._camera.fx)
+        pairs = np.column_stack([points.host[observations.point], observations.keyframe])
+        pairs = pairs[errors_px(problem, problem.tracked) < _MAX_PART_ERROR * self._camera.fx]
+        maps = split_maps(self._tracked, pairs, relocalised)
+        self._tracked = [pose._replace(map=maps[pose.map, pose.segment]) for pose in self._tracked]
+        return maps
+
+    def _finish(self) -> None:
+        """Wait for the features of all keyframes."""
+        while self._pending:
+            self._pending.popleft().result()
+        self._worker.shutdown()
+
     def adjust(
         self,
         map_number: int = 0,
@@ -115,9 +141,7 @@ class Backend:
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
-        while self._pending:
-            self._pending.popleft().result()
-        self._worker.shutdown()
+        self._finish()
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
         found = alone = self._adjusted(worlds, map_number)
@@ -162,7 +186,7 @@ class Backend:
             # Loop closures may be wrong: adjust without them.
             found, loops = adjust(replace(problem, start=None)), 0
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
-        length_px = errors_px(problem, found)
+        length_px = errors_px(problem, found.state)
         within = {number: _sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds}
         correction = self._correction(chosen, problem, found, loops, worlds)
         # A map of one keyframe has no observations: NaN.

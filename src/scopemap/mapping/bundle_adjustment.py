@@ -80,11 +80,11 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
-def errors_px(problem: BundleProblem, found: BundleSolution) -> np.ndarray:
-    """Return the lengths of the reprojection errors (N,), px; infinite behind a camera."""
+def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
+    """Return the lengths of the reprojection errors (N,) of a state, px; infinite behind a camera."""
     if not len(problem.observations.point):
         return np.zeros(0)
-    reprojection = reproject(problem, found.state)
+    reprojection = reproject(problem, state)
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 

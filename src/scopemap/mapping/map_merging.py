@@ -1,4 +1,4 @@
-"""Map merging: Sim(3) from each map's world to a common world, by the loop closures between maps.
+"""Map merging and splitting: which keyframes share a world, and Sim(3) from each map's world to a common one.
 
 Each map has a world and a unit of length of its own. A loop closure between keyframe p of one map and n of another
 gives T_n_p, in the millimetres of p's depth, and the ratio exp(r) of n's depth to p's. So Sim(3) from the world of n's
@@ -7,12 +7,16 @@ map to the world of p's has
     scale exp(-r),    rotation R_p R_n_p^T R_n^T,    and takes the position of n to the position of T_p T_n_p^-1
 
 A loop closure is accepted only if loop closures of other keyframes agree with it.
+
+Where the camera was lost and aligned again to a keyframe from before, the alignment may be wrong. If keyframes from
+before and after the loss observe no points in common, nothing supports it, and the map is split there.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +24,17 @@ import numpy as np
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.loop_closure import Loop
+from scopemap.mapping.pose_interpolation import TrackedPose
 
 _MIN_SUPPORT = 2  # agreeing keyframes in either map
 # Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
 _MAX_DIFFERENCE = (0.2, 0.3, 0.3)
 _MAX_LOG_SCALE = 1.0  # between maps of one video
+# Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
+_MIN_COMMON = 20
+
+Part = tuple[int, int]
+"""A part of a map between two losses: number of the map, and segment as in `TrackedPose`."""
 
 
 class _Hypothesis(NamedTuple):
@@ -34,6 +44,36 @@ class _Hypothesis(NamedTuple):
     T_map_camera: np.ndarray
     own: int
     other: int
+
+
+def split_maps(
+    tracked: Sequence[TrackedPose], pairs: np.ndarray, relocalised: Collection[tuple[Part, Part]]
+) -> dict[Part, int]:
+    """Return the map of each part of the maps that has a keyframe: parts stay together where something supports it.
+
+    tracked : poses of the K keyframes. pairs : (N, 2) int, keyframes that observe the same point. relocalised : pairs
+    of parts between which features found the camera again. The first part of a map keeps its number.
+    """
+    parts = list(dict.fromkeys((pose.map, pose.segment) for pose in tracked))
+    part_of = np.array([parts.index((pose.map, pose.segment)) for pose in tracked], dtype=int)
+    common = np.zeros((len(parts), len(parts)), int)
+    np.add.at(common, tuple(part_of[pairs].T), 1)
+    common += common.T
+    for one, other in relocalised:
+        if one in parts and other in parts:
+            common[parts.index(one), parts.index(other)] = common[parts.index(other), parts.index(one)] = _MIN_COMMON
+    groups: list[list[int]] = []
+    for k, (number, _) in enumerate(parts):
+        near = [group for group in groups if parts[group[0]][0] == number and common[k, group].sum() >= _MIN_COMMON]
+        groups = [group for group in groups if group not in near] + [[*chain(*near), k]]
+    found: dict[Part, int] = {}
+    unused = max(number for number, _ in parts) + 1 if parts else 0
+    for group in sorted(groups, key=min):
+        number = parts[min(group)][0]
+        if number in found.values():
+            number, unused = unused, unused + 1
+        found |= dict.fromkeys((parts[k] for k in group), number)
+    return found
 
 
 def merge_maps(

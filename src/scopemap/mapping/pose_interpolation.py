@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +69,15 @@ class FrameCorrection:
             typical = np.median([np.abs(depth_field.values).mean() for depth_field in self.depth_fields])
             text += f"; depth corrected by {100 * np.expm1(typical):.0f} % on average"
         return text
+
+    def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
+        """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""
+        moved = Similarity(1.0, T_new_world[:3, :3], T_new_world[:3, 3])
+        return replace(
+            self,
+            T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
+            S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
+        )
 
     def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the corrected pose (4, 4) of the frame with this number."""

@@ -1,13 +1,14 @@
 """Submaps: the frames that share a world, sorted, adjusted and merged after the last frame.
 
-The tracker starts a new map where the camera is lost for good. Maps that loop closures tie together are merged into one
+The tracker starts a new map where the camera is lost for good. Where it only seems to have found the camera again, the
+map is split. Maps that loop closures tie together are merged into one
 submap; the relative pose of the others stays unknown, and each is a result of its own.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,11 @@ import numpy as np
 from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
+from scopemap.mapping.map_merging import Part
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import RELOCALISED, Track
 
 TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
 """Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
@@ -55,13 +58,17 @@ class Mapper:
         self._backend = Backend(settings, flow) if links else None
         self._tracked: dict[int, TrackedPose] = {}
         self._lost_frames = 0
+        self._relocalised: set[tuple[Part, Part]] = set()
 
     def observe(self, track: Track) -> None:
         """Note where a frame was tracked, or that it was lost."""
         if track.status == "lost":
             self._lost_frames += 1
-        else:
-            self._tracked[track.index] = self._pose(track)
+            return
+        self._tracked[track.index] = self._pose(track)
+        if track.reason == RELOCALISED and track.keyframe in self._tracked:
+            part, found_in = (self._tracked[index] for index in (track.index, track.keyframe))
+            self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
 
     def add_keyframe(self, keyframe: Frame, track: Track) -> None:
         """Take a keyframe with refined depth and pose, to be adjusted with the others; before it is observed."""
@@ -74,6 +81,7 @@ class Mapper:
         All keyframes are adjusted together here: poses and depths that were handed on before need the submap's
         correction. Small submaps, but for the first, are left out.
         """
+        split_off = self._split_maps()
         frames = Counter(pose.map for pose in self._tracked.values())
         found: list[Submap] = []
         while frames:
@@ -81,6 +89,7 @@ class Mapper:
             correction = None
             if self._backend is not None and self._backend.keyframes(main):
                 correction = self._backend.adjust(main, self._tracked, among=frames)
+                correction = self._from_first_frame(correction, split_off)
             maps = (main,) if correction is None else tuple(sorted(correction.S_common_map))
             found.append(Submap(main, maps, self._frames_of(maps), self._frames_of((main,)), correction))
             for number in maps:
@@ -94,6 +103,26 @@ class Mapper:
             f"{len(self._tracked)} tracked frames are in the result; the relative pose of the others is unknown; "
             f"{len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
         ]
+
+    def _split_maps(self) -> set[int]:
+        """Give parts of maps that nothing ties to the others numbers of their own; return these."""
+        maps = {} if self._backend is None else self._backend.split(self._relocalised)
+
+        def number(pose: TrackedPose) -> int:
+            # A part without a keyframe is in the map that it was aligned to.
+            aligned_to = self._tracked.get(pose.keyframe, pose)
+            return maps.get((pose.map, pose.segment), maps.get((aligned_to.map, aligned_to.segment), pose.map))
+
+        before = {pose.map for pose in self._tracked.values()}
+        self._tracked = {index: pose._replace(map=number(pose)) for index, pose in self._tracked.items()}
+        return {pose.map for pose in self._tracked.values()} - before
+
+    def _from_first_frame(self, correction: FrameCorrection, split_off: Collection[int]) -> FrameCorrection:
+        """Return the correction to the world of its first frame: that of a part that was split off is another one."""
+        first = min(self._frames_of(tuple(correction.S_common_map)))
+        if self._tracked[first].map not in split_off:
+            return correction
+        return correction.in_world(inverse(correction.pose(first, self._tracked[first].T_world_camera)))
 
     def _frames_of(self, maps: tuple[int, ...]) -> frozenset[int]:
         return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)

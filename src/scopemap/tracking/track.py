@@ -12,6 +12,9 @@ from scopemap.geometry.se3 import inverse
 
 Status = Literal["initial", "ok", "lost"]
 
+RELOCALISED = "relocalised"
+"""Reason of the track of a frame where features found the lost camera again."""
+
 
 @dataclass(frozen=True)
 class Track:

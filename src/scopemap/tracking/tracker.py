@@ -18,7 +18,7 @@ from scopemap.tracking.reprojection import pose_from_correspondences, reprojecti
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
-from scopemap.tracking.track import Status, Track
+from scopemap.tracking.track import RELOCALISED, Status, Track
 
 _MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and more
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
@@ -80,7 +80,7 @@ class Tracker:
             if found is not None and (rejected or found[1].agreement > alignment.agreement):
                 keyframe, alignment = found
                 self._use_keyframe(keyframe)
-                rejected, reason = "", "relocalised"
+                rejected, reason = "", RELOCALISED
         if rejected:
             self._sharp_frames_lost += 1
             if self._sharp_frames_lost > self.settings.new_map_after > 0 and not self._is_unsharp:
