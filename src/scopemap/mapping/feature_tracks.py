@@ -25,6 +25,8 @@ from scopemap.mapping.reprojection import Observations, Points
 
 _CELL_PX = 16  # one corner in each cell of that size
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
+# Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
+_MOST_OBSERVATIONS = 1_000_000
 
 
 @dataclass
@@ -123,6 +125,8 @@ class FeatureTracks:
     def collected(self, keyframes: Collection[int] | None = None) -> tuple[Points, Observations]:
         """Return all points, sorted by host, and their observations, sorted by point.
 
+        Of a long video every n-th point only has observations, so that the adjustment's memory stays bounded.
+
         keyframes : increasing numbers of the keyframes that are used, None: all. The result numbers keyframes by their
         place in it.
         """
@@ -138,6 +142,8 @@ class FeatureTracks:
         place[by_host] = np.arange(len(by_host))
         order = np.argsort(place[point], kind="stable")
         order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
+        every = max(-(-len(order) // _MOST_OBSERVATIONS), 1)
+        order = order[place[point][order] % every == 0]
         sorted_points = Points(host[by_host], points.pixel[by_host], points.log_depth[by_host], points.sigma[by_host])
         return sorted_points, Observations(place[point][order], keyframe[order], self._centred(pixel[order]))
 
