@@ -1,10 +1,10 @@
-"""`scopemap bench`: methods side by side on the sequences of a plan."""
+"""`scopemap bench`: methods side by side on the sequences of a plan; `scopemap bench speed`: the time of each stage."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,14 +14,23 @@ from scopemap.cli.options import AsJson, Quiet
 if TYPE_CHECKING:
     from scopemap.benchmark.entry import Entry
     from scopemap.benchmark.result import RunResult
+    from scopemap.benchmark.speed import Speed
+
+_Preset = Literal["default", "paper", "paper-strict", "realtime"]
+_TOLERANCE = 0.25  # share by which a stage may be slower: measurements of one machine differ by a tenth
 
 
 def bench(
     plan: Annotated[
         str | None,
         typer.Argument(
-            metavar="PLAN", help="A TOML file, or one of the plans of the package; without it these are listed."
+            metavar="PLAN|speed",
+            help="A TOML file, or one of the plans of the package; without it these are listed. speed: the processor "
+            "time of each stage.",
         ),
+    ] = None,
+    video: Annotated[
+        Path | None, typer.Argument(metavar="[VIDEO]", help="What speed measures; by default a phantom.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for runs, tables and figures; continues an earlier call.")
@@ -36,10 +45,19 @@ def bench(
         float | None, typer.Option("--timeout", min=1, help="Seconds after which a run is ended.")
     ] = None,
     paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
+    frames: Annotated[int | None, typer.Option(min=2, help="speed: frames of the video, from the first.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="speed: names the stages that are slower than in FILE, printed by --json."),
+    ] = None,
+    preset: Annotated[_Preset, typer.Option(help="speed: preset of the run.")] = "default",
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a benchmark's plan, or the rest of it, and write its tables and figures."""
+    if plan == "speed":
+        _print_speed(video, frames, preset, compare, as_json)
+        return
     from scopemap.benchmark.plan import read_plan
 
     if plan is None:
@@ -73,6 +91,37 @@ def bench(
         print_json([asdict(result) for result in benchmark.results])
     elif not quiet:
         typer.echo(f"{len(files)} tables and figures in {out}; results.md holds the tables")
+
+
+def _print_speed(video: Path | None, frames: int | None, preset: _Preset, compare: Path | None, as_json: bool) -> None:
+    """Measure and print; ends with code 1 where a stage is slower than in the file to compare with."""
+    from scopemap.benchmark.speed import measure_speed, read_speed
+    from scopemap.config import Config
+
+    before = None if compare is None else read_speed(compare)
+    speed = measure_speed(video, Config.load(preset), frames)
+    if as_json:
+        print_json(speed.json())
+    else:
+        _print_stages(speed)
+    slower = [] if before is None else speed.slower_than(before, _TOLERANCE)
+    for line in slower:
+        typer.echo(f"slower: {line}", err=True)
+    if slower:
+        raise typer.Exit(1)
+    if before is not None and not as_json:
+        typer.echo(f"no stage is more than {_TOLERANCE:.0%} slower than in {compare}")
+
+
+def _print_stages(speed: Speed) -> None:
+    width, height = speed.size
+    typer.echo(f"{speed.clip}: {speed.frames} frames of {width}x{height} px, processor time per frame")
+    typer.echo(f"calibration (one DIS flow at 320x256 px): {speed.calibration_ms:.1f} ms\n")
+    typer.echo(f"{'stage':28s}{'ms':>8s}{'ratio':>8s}{'share':>8s}  thread")
+    for name, stage in speed.stages.items():
+        typer.echo(f"{name:28s}{stage.ms:8.2f}{stage.ratio:8.2f}{stage.share:8.1%}  {stage.thread}")
+    passed = f"{speed.passed_ms:.1f} ms passed, {1e3 / speed.passed_ms:.1f} frames/s"
+    typer.echo(f"\nwhole process, start and compilers too: {speed.cpu_ms:.1f} ms of processor time, {passed}")
 
 
 def _list_plans() -> None:

@@ -70,7 +70,11 @@ class Alignment:
 
 
 def align(reference: list[View], current: list[View], T_start: np.ndarray, settings: TrackingSettings) -> Alignment:
-    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4)."""
+    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4).
+
+    Finer levels are left out where a coarser one correlates too little for the alignment to be accepted: on finer
+    levels images that fit correlate less.
+    """
     motion, iterations = Motion(T_start, np.array([1.0, 0.0])), 0
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
@@ -78,9 +82,17 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
         rotation_only = settings.paper.rotation_first and level == len(reference) - 1 and len(reference) > 1
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps
+        if not rotation_only and _is_hopeless(reference[level:], current[level:], motion, settings):
+            break
     # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
     return judge(reference, current, motion, iterations)
+
+
+def _is_hopeless(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> bool:
+    """Whether a motion correlates too little at the finest of these levels; never where measured depth takes part."""
+    by_shape = settings.advanced.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
+    return not by_shape and judge(reference, current, motion).correlation < settings.advanced.min_correlation
 
 
 def judge(reference: list[View], current: list[View], motion: Motion, iterations: int = 0) -> Alignment:
