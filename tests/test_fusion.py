@@ -304,3 +304,33 @@ def test_fusing_is_repeatable() -> None:
         meshes.append(volume.extract_mesh())
     assert (meshes[0].vertices == meshes[1].vertices).all()
     assert (meshes[0].faces == meshes[1].faces).all()
+
+
+def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
+    frame = frame_of(VIEW, np.eye(4), np.full((VIEW.height, VIEW.width), 40.0))
+    valid, shown = frame.valid.copy(), frame.rgb.copy()
+    row, col = VIEW.height // 2, VIEW.width // 2
+    valid[row - 5 : row + 5, col - 5 : col + 5] = False
+    shown[row - 5 : row + 5, col - 5 : col + 5] = 255
+    valid[:, :30] = False
+    x_mm, y_mm = (40 * VIEW.rays[[row - 3, row + 3], [col - 3, col + 3], axis] for axis in (0, 1))
+
+    def fused(**advanced: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices, their confidence, colours, and whether they are under the highlight."""
+        volume = TsdfVolume(_lenient(**advanced))
+        for _ in range(5):
+            volume.integrate(replace(frame, valid=valid, rgb=shown))
+        mesh = volume.extract_mesh()
+        x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
+        under = (x > x_mm[0]) & (x < x_mm[1]) & (y > y_mm[0]) & (y < y_mm[1])
+        colours = np.asarray(mesh.visual.vertex_colors)[:, :3]
+        return np.asarray(mesh.vertices), np.asarray(mesh.vertex_attributes["confidence"]), colours, under
+
+    vertices, confidence, colours, under = fused()
+    assert under.sum() >= 1
+    assert np.abs(vertices[under, 2] - 40).max() < 0.1
+    assert confidence[under].max() < 0.4 * np.median(confidence[~under])
+    np.testing.assert_allclose(colours[under], np.broadcast_to(np.median(colours, axis=0), (under.sum(), 3)), atol=12)
+    # What is masked at the picture's border is no highlight.
+    assert vertices[:, 0].min() > 40 * VIEW.rays[row, 27, 0]
+    assert not fused(weighted=False)[3].any()

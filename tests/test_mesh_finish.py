@@ -93,6 +93,35 @@ def test_a_ball_with_pricks_is_whole_again() -> None:
     assert finished(ball, settings.model_copy(update={"holes": "none"})) is ball
 
 
+def test_an_open_tube_becomes_a_watertight_lumen() -> None:
+    tube = trimesh.creation.cylinder(10.0, 40.0, sections=64).subdivide_to_size(1.0)
+    tube.update_faces(np.abs(tube.triangles_center[:, 2]) < 19.0)
+    tube.remove_unreferenced_vertices()
+    tube.invert()
+    tube.vertex_attributes["confidence"] = np.ones(len(tube.vertices), np.float32)
+    whole = finished(tube, FusionSettings(voxel_mm=1.0, holes="watertight"))
+    assert whole.is_watertight
+    assert -whole.volume > np.pi * 10**2 * 36
+    seen = whole.vertex_attributes["confidence"] == 1
+    wall = np.abs(whole.vertices[:, 2]) < 17
+    assert seen[wall].all()
+    assert np.abs(np.hypot(*whole.vertices[wall, :2].T) - 10).max() < 0.5
+    middle = np.hypot(*whole.vertices[:, :2].T) < 5
+    assert middle.any()
+    assert not seen[middle].any()
+    assert (np.asarray(whole.visual.vertex_colors)[middle, :3] == 128).all()
+
+
+def test_a_plate_gets_its_back_closed_and_its_front_stays_in_view() -> None:
+    plate = _plate()
+    whole = finished(plate, FusionSettings(voxel_mm=1.0, holes="watertight"))
+    assert whole.is_watertight
+    side = np.asarray(plate.face_normals)[0, 2]
+    assert (side * whole.vertices[:, 2]).max() < 0.5
+    ahead = np.asarray(whole.vertex_attributes["confidence"]) == 1
+    assert (side * whole.vertices[~ahead, 2]).min() < -3
+
+
 def test_a_simplified_mesh_keeps_its_shape_colours_and_confidence() -> None:
     plate = _cut(_plate(60), (30.0, 30.0, 10.0))
     plate.vertices[:, 2] = 5 * np.sin(plate.vertices[:, 0] / 10)

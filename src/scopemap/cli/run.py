@@ -94,6 +94,9 @@ def run(
     mesh_smooth: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Smooth the mesh, so many iterations of Taubin's filter.")
     ] = None,
+    mesh_watertight: Annotated[
+        bool, typer.Option("--mesh-watertight", help="Close the mesh where no frame saw anything, too; grey there.")
+    ] = False,
     frames: Frames = None,
     fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
     size: Annotated[
@@ -121,6 +124,7 @@ def run(
         "fusion.colours": colours,
         "fusion.mesh_faces": mesh_faces,
         "fusion.mesh_smooth": mesh_smooth,
+        "fusion.holes": "watertight" if mesh_watertight else None,
     }
     chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)

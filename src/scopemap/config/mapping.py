@@ -99,10 +99,11 @@ class FusionSettings(Settings):
         description="colours of the mesh; albedo: the tissue's, without the lamp's fall-off, in one exposure for all "
         "frames; raw: the video's",
     )
-    holes: Literal["small", "none"] = Field(
+    holes: Literal["small", "none", "watertight"] = Field(
         "small",
         description="holes of the mesh that are closed; small: those within the surface with a border of up to 20 "
-        "voxels' edges, their new vertices with confidence 0; what no frame saw stays open",
+        "voxels' edges, their new vertices with confidence 0; what no frame saw stays open; watertight: all, smoothly, "
+        "what no frame saw grey and with confidence 0",
     )
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
     mesh_faces: int | None = Field(

@@ -1,4 +1,4 @@
-"""What becomes of the fused mesh: small holes closed; on request smoothed (Taubin) and simplified (quadrics)."""
+"""What becomes of the fused mesh: small holes closed, or all; on request smoothed (Taubin), simplified (quadrics)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from scopemap.config import FusionSettings
 from scopemap.fusion.holes import LARGEST_PERIMETER_VOXELS, without_small_holes
+from scopemap.fusion.watertight import watertight
 from scopemap.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
@@ -20,6 +21,8 @@ def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh
     """Return the mesh of a fusion as the settings, with the voxel size that was used, want it."""
     if settings.holes == "small" and settings.voxel_mm is not None:
         mesh = without_small_holes(mesh, LARGEST_PERIMETER_VOXELS * settings.voxel_mm)
+    elif settings.holes == "watertight" and settings.voxel_mm is not None:
+        mesh = watertight(mesh, settings.voxel_mm)
     mesh = smoothed(mesh, settings.mesh_smooth)
     return mesh if settings.mesh_faces is None else simplified(mesh, settings.mesh_faces)
 

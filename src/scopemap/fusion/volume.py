@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 
@@ -37,6 +38,13 @@ VOXELS_PER_MEDIAN_DEPTH = 60
 _VOXELS_PER_TRUNCATION = 5
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
 _VOXELS_PER_MAX_DEPTH = 200
+# Weight of what is masked within the picture, such as highlights, where depth is interpolated.
+_MASKED_WEIGHT = 0.1
+# Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of that surroundings over the
+# picture's.
+_MASKED_COLOUR, _SURROUNDINGS = 0.01, 1 / 12
+# Share of the picture up to which a masked region is that small.
+_LARGEST_MASKED = 0.02
 # No endoscope resolves less; memory would be spent on noise.
 _MIN_VOXEL_MM = 0.01
 
@@ -95,7 +103,9 @@ class TsdfVolume:
     def integrate(self, frame: Frame) -> None:
         """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
-        Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less.
+        Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less. Small
+        masked regions within the picture, such as highlights, weigh a tenth, in the colour of what is around them,
+        unless weights are off.
 
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
@@ -109,17 +119,20 @@ class TsdfVolume:
         # A share of 1: voxels have the full weight up to the truncation.
         ramp = {} if advanced.weighted else {"full_weight_share": 1.0}
         grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, advanced.truncation_share, **ramp)
+        masked = _masked_within(frame.valid) if advanced.weighted else np.zeros_like(frame.valid)
         with np.errstate(invalid="ignore"):
-            usable = frame.valid & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
+            usable = (frame.valid | masked) & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
         surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
-        weight = surface.weight * np.minimum(trust, np.float32(1.0))
+        weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
         surface = surface._replace(weight=weight if advanced.weighted else (weight > 0).astype(np.float32))
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
         else:
             picture = raw_picture(frame.rgb)
+        if masked.any():
+            _paint_masked(picture, masked)
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
@@ -142,6 +155,27 @@ class TsdfVolume:
                 "leave out lost frames or use a larger voxel"
             )
         return depth_mm, T_world_camera
+
+
+def _masked_within(valid: np.ndarray) -> np.ndarray:
+    """Return the small regions of pixels that are not valid and do not touch the image's border, (H, W) bool."""
+    _, regions, stats, _ = cv2.connectedComponentsWithStats((~valid).astype(np.uint8))
+    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_MASKED * valid.size
+    small[0] = False
+    for border in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
+        small[np.unique(border)] = False
+    found: np.ndarray = small[regions]
+    return found
+
+
+def _paint_masked(picture: np.ndarray, masked: np.ndarray) -> None:
+    """Give the masked pixels (H, W) bool of a picture (H, W, 4), r g b and weight, the mean colour around them."""
+    picture[masked, 3] = 0
+    window = (2 * round(_SURROUNDINGS * masked.shape[1] / 2) + 1,) * 2
+    weight = cv2.blur(picture[..., 3], window)
+    colour = cv2.blur(picture[..., :3] * picture[..., 3:], window)[masked]
+    picture[masked, :3] = colour / np.maximum(weight[masked, None], np.float32(1e-12))
+    picture[masked, 3] = np.float32(_MASKED_COLOUR) * weight[masked]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,109 @@
+"""A watertight mesh: the surface that was seen stays in place, and what no frame saw is closed smoothly.
+
+On a grid around the mesh the signed distance is known near its vertices; the Laplace equation continues it, negative at
+the grid's border (the volumetric diffusion of Davis et al., 3DPVT 2002, to its end). Its zero level encloses the free
+space in front of the surface where that surrounds it, as in a colon; else the tissue behind it, so that the front stays
+in view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numba import njit, prange
+from scipy.ndimage import binary_dilation, label
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from scopemap.geometry.rendering import vertex_colours
+
+_MOST_CELLS = 160  # along the longest side of the mesh
+_MARGIN_CELLS = 10
+# The distance is known so far from the surface, in cells, and is the mean over the planes of so many vertices.
+_BAND_CELLS, _PLANES = 2, 4
+_SEEN_CELLS = 1.5  # vertices farther from the mesh than this were not seen
+_LEVELS = (8, 4, 2, 1)  # cell sizes over the finest; each level starts from the one before
+_SWEEPS, _OVER_RELAXATION = 40, 1.7
+# Length of the mean normal above which a surface faces one way: that of a cavity as deep as its radius.
+_ONE_WAY = 1 / 3
+_SMALLEST_CELLS = 1e-3  # no vertex on a grid corner, where its edge would be ambiguous
+_UNSEEN_GREY = 128
+
+
+def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
+    """Return a closed mesh around the free space in front of a mesh, or around the tissue behind; normals stay.
+
+    Cells are voxels, or larger where more than 160 would be along a side. Vertices that no frame saw are grey, and 0 in
+    all vertex attributes, such as `confidence`; the others have colour and attributes of the mesh's nearest vertex.
+    """
+    if not len(mesh.faces):
+        return mesh
+    low, high = np.asarray(mesh.bounds)
+    cell_mm = max(voxel_mm, float((high - low).max()) / _MOST_CELLS)
+    coarse = np.ceil(((high - low) / cell_mm + 2 * _MARGIN_CELLS) / _LEVELS[0]).astype(int)
+    corner = (low + high - _LEVELS[0] * cell_mm * coarse) / 2
+    facing = np.linalg.norm(mesh.area_faces @ mesh.face_normals) / mesh.area
+    side, direction = (-1, "ascent") if facing > _ONE_WAY else (1, "descent")
+    planes, tree = (np.asarray(mesh.vertices), side * np.asarray(mesh.vertex_normals)), cKDTree(mesh.vertices)
+    field = np.full(coarse, -float(_BAND_CELLS))
+    for level in _LEVELS:
+        if level != _LEVELS[0]:
+            field = field.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+        fixed = _set_distances(field, planes, tree, corner, level * cell_mm)
+        _relax(field, fixed, _SWEEPS)
+    field = _one_space(np.where(np.abs(field) < _SMALLEST_CELLS, np.copysign(_SMALLEST_CELLS, field), field))
+    vertices, faces, _, _ = marching_cubes(field.astype(np.float32), 0.0, gradient_direction=direction)
+    vertices = corner + (vertices + 0.5) * cell_mm
+    distance_mm, nearest = tree.query(vertices)
+    seen = distance_mm <= _SEEN_CELLS * cell_mm
+    colours = vertex_colours(mesh)[nearest]
+    colours[~seen, :3] = _UNSEEN_GREY
+    attributes = {name: np.asarray(values)[nearest].copy() for name, values in mesh.vertex_attributes.items()}
+    for values in attributes.values():
+        values[~seen] = 0
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, vertex_attributes=attributes, process=False)
+
+
+def _set_distances(
+    field: np.ndarray, planes: tuple[np.ndarray, np.ndarray], tree: cKDTree, corner: np.ndarray, cell_mm: float
+) -> np.ndarray:
+    """Set the cells near the surface to their signed distance, in cells; return which are set, with the border's.
+
+    planes : vertices (V, 3) mm and their normals. corner : (3,) mm, of the grid, whose cells are `cell_mm` wide.
+    """
+    vertices, normals = planes
+    near = np.zeros(field.shape, bool)
+    near[tuple(((vertices - corner) / cell_mm).astype(int).T)] = True
+    near = binary_dilation(near, iterations=_BAND_CELLS)
+    points = corner + (np.argwhere(near) + 0.5) * cell_mm
+    index = tree.query(points, k=min(_PLANES, len(vertices)))[1].reshape(len(points), -1)
+    distance = np.einsum("nkc,nkc->nk", points[:, None] - vertices[index], normals[index]).mean(axis=1)
+    field[near] = np.clip(distance / cell_mm, -_BAND_CELLS, _BAND_CELLS)
+    for axis in range(3):
+        for side in (0, -1):
+            border = np.moveaxis(field, axis, 0), np.moveaxis(near, axis, 0)
+            border[0][side], border[1][side] = -_BAND_CELLS, True
+    return near
+
+
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def _relax(field: np.ndarray, fixed: np.ndarray, sweeps: int) -> None:
+    """Solve the Laplace equation where the field (l, m, n) is not fixed: successive over-relaxation, red and black."""
+    for half in range(2 * sweeps):
+        for i in prange(1, field.shape[0] - 1):
+            for j in range(1, field.shape[1] - 1):
+                for k in range(1 + (i + j + half) % 2, field.shape[2] - 1, 2):
+                    if not fixed[i, j, k]:
+                        total = field[i - 1, j, k] + field[i + 1, j, k] + field[i, j - 1, k]
+                        total += field[i, j + 1, k] + field[i, j, k - 1] + field[i, j, k + 1]
+                        field[i, j, k] += _OVER_RELAXATION * (total / 6 - field[i, j, k])
+
+
+def _one_space(field: np.ndarray) -> np.ndarray:
+    """Return the field with the largest positive region alone, and without negative bubbles in it."""
+    regions = label(field > 0)[0]
+    sizes = np.bincount(regions.ravel())
+    sizes[0] = 0
+    outside = label(regions != np.argmax(sizes))[0]
+    inside = outside != outside[0, 0, 0]
+    return np.where(inside, np.abs(field), -np.abs(field))
