@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from scopemap.errors import check_shape
@@ -10,10 +11,10 @@ PLANES = 8
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3
-_CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], np.float32)
 _LEVEL = np.arange(256) / 255
 # IEC 61966-2-1, one entry for each 8-bit level.
-_LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4).astype(np.float32)
+_LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
+_HALF_LINEAR = (0.5 * _LINEAR).astype(np.float32)
 
 
 def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarray) -> np.ndarray:
@@ -30,7 +31,8 @@ def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarra
     check_shape("rgb", rgb, (height, width, 3))
     planes = np.zeros((PLANES, height, width), np.float32)
     planes[:3] = rgb.transpose(2, 0, 1) * np.float32(1 / 255) - np.float32(0.5)
-    brightness = np.log(np.maximum(_LINEAR[rgb] @ _CHANNEL_WEIGHTS, _DARKEST))
+    linear = cv2.LUT(rgb[..., 0], _HALF_LINEAR) + cv2.LUT(rgb[..., 1], _HALF_LINEAR)
+    brightness = np.log(np.maximum(linear, np.float32(_DARKEST)))
     planes[3] = 0.5 * (brightness - (np.median(brightness[valid]) if valid.any() else 0.0))
     if unit_rays is not None:
         check_shape("unit_rays", unit_rays, (height, width, 3))
