@@ -86,5 +86,5 @@ def pair_flow(
 
 def agree(forth: np.ndarray, back: np.ndarray, consistency_px: float) -> np.ndarray:
     """Return (H, W) bool: True where the flow `forth` (H, W, 2) stays in the image and is consistent with `back`."""
-    error_px = np.linalg.norm(forth + pull(back, forth), axis=-1)
-    return error_px <= consistency_px
+    x_px, y_px = np.moveaxis(forth + pull(back, forth), -1, 0)
+    return x_px * x_px + y_px * y_px <= consistency_px**2
