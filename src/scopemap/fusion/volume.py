@@ -40,9 +40,9 @@ _VOXELS_PER_TRUNCATION = 5
 _VOXELS_PER_MAX_DEPTH = 200
 # Weight of what is masked within the picture, such as highlights, where depth is interpolated.
 _MASKED_WEIGHT = 0.1
-# Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of that surroundings over the
-# picture's.
-_MASKED_COLOUR, _SURROUNDINGS = 0.01, 1 / 12
+# Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
+# picture's, and the step of the pixels looked at.
+_MASKED_COLOUR, _SURROUNDINGS, _EVERY_PX = 0.01, 1 / 12, 4
 # Share of the picture up to which a masked region is that small.
 _LARGEST_MASKED = 0.02
 # No endoscope resolves less; memory would be spent on noise.
@@ -171,11 +171,13 @@ def _masked_within(valid: np.ndarray) -> np.ndarray:
 def _paint_masked(picture: np.ndarray, masked: np.ndarray) -> None:
     """Give the masked pixels (H, W) bool of a picture (H, W, 4), r g b and weight, the mean colour around them."""
     picture[masked, 3] = 0
-    window = (2 * round(_SURROUNDINGS * masked.shape[1] / 2) + 1,) * 2
-    weight = cv2.blur(picture[..., 3], window)
-    colour = cv2.blur(picture[..., :3] * picture[..., 3:], window)[masked]
-    picture[masked, :3] = colour / np.maximum(weight[masked, None], np.float32(1e-12))
-    picture[masked, 3] = np.float32(_MASKED_COLOUR) * weight[masked]
+    some = np.ascontiguousarray(picture[::_EVERY_PX, ::_EVERY_PX])
+    window = (2 * round(_SURROUNDINGS * some.shape[1] / 2) + 1,) * 2
+    weight, colour = cv2.blur(some[..., 3], window), cv2.blur(some[..., :3] * some[..., 3:], window)
+    rows, columns = np.nonzero(masked)
+    near = rows // _EVERY_PX, columns // _EVERY_PX
+    picture[rows, columns, :3] = colour[near] / np.maximum(weight[near], np.float32(1e-12))[:, None]
+    picture[rows, columns, 3] = np.float32(_MASKED_COLOUR) * weight[near]
 
 
 @dataclass(frozen=True)
