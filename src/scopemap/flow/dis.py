@@ -19,11 +19,11 @@ class DisFlow(FlowEstimator):
 
     def __init__(self, *, smooth: bool = True) -> None:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        # With patches further apart and fewer steps each, flow that begins near the truth is as good.
+        # Flow that begins near the truth needs fewer steps; flow that only checks another may be coarse.
         self._near, self._check = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2))
         for dis in (self._near, self._check):
-            dis.setPatchStride(5)
             dis.setGradientDescentIterations(12)
+        self._check.setPatchStride(4)
         self._check.setFinestScale(2)
         if not smooth:
             self._dis.setFinestScale(0)
