@@ -11,6 +11,7 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
 from scopemap.flow.corners import detect_corners, sample_flow
@@ -274,9 +275,11 @@ def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
 
 @pytest.mark.parametrize("zoom", [0.0, 0.04])
 def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    def biased(self: FeatureTracks, keyframes: Collection[int] | None = None) -> tuple[Points, Observations]:
+    def biased(
+        self: FeatureTracks, keyframes: Collection[int] | None = None, most: int | None = None
+    ) -> tuple[Points, Observations]:
         """Return observations like those of a camera that comes nearer, which a rigid scene explains."""
-        points, observations = collected(self, keyframes)
+        points, observations = collected(self, keyframes, most)
         later = observations.keyframe - points.host[observations.point]
         return points, replace(observations, pixel=observations.pixel * np.exp(zoom * later)[:, None])
 
@@ -308,6 +311,15 @@ def test_disagreement_of_depth_is_that_of_keyframes_that_see_the_same() -> None:
     T[:, :3, 3] += [[0, 0, 0], [500, 0, 0], [1000, 0, 0]]
     assert np.isnan(depth_disagreement(CAMERA, T, grids, (1, 2))).all()
     assert np.isnan(depth_disagreement(CAMERA, T[:1], grids[:1], (1, 2))).all()
+    unknown = np.full_like(grids[0], np.nan)
+    assert np.isnan(depth_disagreement(CAMERA, T, [unknown] * len(T), (1,))).all()
+
+
+def test_disagreement_of_depth_takes_large_images() -> None:
+    # 43,200 compared pixels: OpenCV takes no image of more than 32,767 columns.
+    camera = PinholeCamera(1920, 1440, 900.0, 900.0, 959.5, 719.5)
+    grid = depth_grid(np.full((1440, 1920), 50.0, np.float32), np.ones((1440, 1920), bool))
+    assert max(depth_disagreement(camera, np.tile(np.eye(4), (2, 1, 1)), [grid, grid], (1,))) < 1e-5
 
 
 def test_adjusting_without_keyframes_raises() -> None:

@@ -129,19 +129,17 @@ def test_less_than_one_observation_is_refused() -> None:
         MappingAdvanced(correlated_observations=0.5)
 
 
-def test_of_a_long_video_only_some_points_have_observations(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
     for number in range(4):
         view = plane_scene.see(pose := plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)))
         tracks.add(Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose))
     points, observations = tracks.collected()
     most = len(observations.point) // 3 + 1
-    monkeypatch.setattr("scopemap.mapping.feature_tracks._MOST_OBSERVATIONS", most)
-    fewer_points, fewer = tracks.collected()
-    assert np.array_equal(fewer_points.pixel, points.pixel)
-    assert 0.8 * most < len(fewer.point) <= 1.1 * most
-    kept = np.unique(fewer.point)
+    fewer_points, fewer = tracks.collected(most_observations=most)
+    every = -(-len(observations.point) // most)
+    assert np.array_equal(fewer_points.pixel, points.pixel[::every])
+    assert 0.6 * most < len(fewer.point) <= 1.1 * most
     counts = np.bincount(observations.point, minlength=len(points.host))
-    assert np.array_equal(np.bincount(fewer.point)[kept], counts[kept])
+    assert np.array_equal(np.bincount(fewer.point, minlength=len(fewer_points.host)), counts[::every])
+    assert np.array_equal(tracks.collected(None, len(observations.point))[1].pixel, observations.pixel)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import plane_scene
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
@@ -94,6 +94,8 @@ def test_points_of_equal_depth_do_not_divide_by_zero() -> None:
     np.testing.assert_allclose(field.log_factor(np.full((8, 8), np.exp(3.7), np.float32)), 0.2, atol=0.01)
 
 
+# The first example compiles a kernel.
+@settings(deadline=None)
 @given(st.floats(-3, 3), st.floats(0.01, 1.0), st.integers(0, 2**32 - 1))
 def test_factors_are_bounded_and_unknown_depth_stays_unknown(error: float, step: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -315,11 +315,11 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
     valid[:, :30] = False
     x_mm, y_mm = (40 * VIEW.rays[[row - 3, row + 3], [col - 3, col + 3], axis] for axis in (0, 1))
 
-    def fused(**advanced: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def fused(*, highlights: bool = True, **advanced: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Vertices, their confidence, colours, and whether they are under the highlight."""
         volume = TsdfVolume(_lenient(**advanced))
         for _ in range(5):
-            volume.integrate(replace(frame, valid=valid, rgb=shown))
+            volume.integrate(replace(frame, valid=valid, rgb=shown, highlights=~valid if highlights else None))
         mesh = volume.extract_mesh()
         x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
         under = (x > x_mm[0]) & (x < x_mm[1]) & (y > y_mm[0]) & (y < y_mm[1])
@@ -334,3 +334,5 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
     # What is masked at the picture's border is no highlight.
     assert vertices[:, 0].min() > 40 * VIEW.rays[row, 27, 0]
     assert not fused(weighted=False)[3].any()
+    # Nor is what is masked for another reason, such as an instrument.
+    assert not fused(highlights=False)[3].any()

@@ -73,7 +73,7 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost(result: Reco
     assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (
         SECOND - LOST_BEFORE_NEW - 1
     )
-    assert result.records[0].track.reason == "tracked in another submap, map 0"
+    assert result.records[0].track.reason == "tracked in another submap"
     assert "keyframe" in result.records[FIRST].track.reason
     note = next(text for text in result.provenance["warnings"] if "submaps" in text)
     assert note.startswith("2 submaps")

@@ -41,7 +41,11 @@ class AlignmentError(ScopemapError):
 
 def check_shape(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
     """Raise `ValueError` unless `array` has `shape`; `None` in `shape` stands for any length."""
-    found = array.shape
+    found = getattr(array, "shape", None)
+    if found is None:  # a list: without numpy where none comes, which `scopemap --help` waits for
+        import numpy as np
+
+        found = np.shape(array)
     fits = len(found) == len(shape) and all(want in (None, have) for want, have in zip(shape, found, strict=True))
     if not fits:
         wanted = ", ".join("any" if n is None else str(n) for n in shape)

@@ -44,8 +44,11 @@ def create_estimators(config: Config, sequence: Sequence) -> Estimators:
     )
 
 
-def missing_weights(config: Config) -> list[str]:
-    """Return the names of the weights that the settings need and this machine does not have; nothing is loaded."""
+def missing_weights(config: Config, *other_flows: str) -> list[str]:
+    """Return the names of the weights that the settings need and this machine does not have; nothing is loaded.
+
+    other_flows : names of flows that are needed besides.
+    """
     depth, networks = config.depth, config.networks
     models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
     if depth.anchor == "depth-pro":
@@ -53,7 +56,7 @@ def missing_weights(config: Config) -> list[str]:
     needed: list[tuple[str, ...]] = [
         (model or name,) for name, model in models.items() if not (model and Path(model).is_dir())
     ]
-    flows = {networks.flow, networks.keyframe_flow}
+    flows = {networks.flow, networks.keyframe_flow, *other_flows}
     needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
     if networks.perceptual == "lpips":
         needed.append(PERCEPTUAL_CHECKPOINTS)

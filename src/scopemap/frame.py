@@ -35,6 +35,7 @@ class Frame:
     T_world_camera : (4, 4) float64, takes a point in the camera to the world; None until tracked.
     name : the file's own name, or "".
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: not estimated.
+    highlights : (H, W) bool, True where `valid` is False for a specular highlight alone; None: not looked for.
     """
 
     index: int
@@ -46,6 +47,7 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
+    highlights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -55,6 +57,8 @@ class Frame:
             check_shape("Frame.depth_mm", self.depth_mm, size)
         if self.depth_sigma_mm is not None:
             check_shape("Frame.depth_sigma_mm", self.depth_sigma_mm, size)
+        if self.highlights is not None:
+            check_shape("Frame.highlights", self.highlights, size)
         if self.T_world_camera is not None:
             check_shape("Frame.T_world_camera", self.T_world_camera, (4, 4))
 

@@ -102,7 +102,7 @@ def records_of(submap: Submap, records: list[FrameRecord]) -> list[FrameRecord]:
     for record in records:
         track = record.track
         if record.index not in submap.frames:
-            reason = track.reason if track.status == "lost" else f"tracked in another submap, map {track.map}"
+            reason = track.reason if track.status == "lost" else "tracked in another submap"
             record = replace(record, track=replace(track, status="lost", reason=reason), T_world_camera=last)
         else:
             if track.status == "initial" and started:

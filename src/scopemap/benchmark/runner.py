@@ -29,7 +29,9 @@ from scopemap.benchmark.methods.method import Method, PipelineMethod, create_met
 from scopemap.benchmark.plan import Plan, found_sequences
 from scopemap.benchmark.result import FILE_NAME, RunResult
 from scopemap.benchmark.scoring import score
+from scopemap.config import Config
 from scopemap.errors import InputError, ScopemapError, SettingsError
+from scopemap.estimators import missing_weights
 from scopemap.io.sequence import Sequence
 
 Listener = Callable[[Entry, RunResult, bool], None]
@@ -155,6 +157,8 @@ def kept_result(entry: Entry, *, retry: bool = False) -> RunResult | None:
 def what_is_missing(entry: Entry) -> str:
     """Return what an entry needs and this machine does not have, in one line; "" where it can run."""
     try:
+        if entry.protocol.consistency and (names := missing_weights(Config(), entry.protocol.flow)):
+            return f"its measure needs weights: {', '.join(names)} (scopemap models pull NAME)"
         return method_of(entry).missing(entry.shared_settings())
     except ScopemapError:  # the run reports it
         return ""

@@ -78,8 +78,8 @@ class StageTime:
 
     Attributes
     ----------
-    ms : per frame of the clip: median of a call, times calls per frame. ratio : the same over the calibration.
-    share : of all stages. thread : the thread that most of it ran in.
+    ms : per frame of the clip: median of a call times calls per frame, summed over the stage's functions.
+    ratio : the same over the calibration. share : of all stages. thread : the thread that most of it ran in.
     """
 
     ms: float
@@ -94,18 +94,23 @@ class Speed:
 
     Attributes
     ----------
-    clip : name of the input. frames : how many. size : (width, height) of the working images, px.
+    clip : name of the input. frames : how many. preset : of the run. size : (width, height) of the working images, px.
     calibration_ms : processor time of the calibration. cpu_ms : of the whole process, per frame.
     passed_ms : time that passed, per frame. stages : by name.
     """
 
     clip: str
     frames: int
+    preset: str
     size: tuple[int, int]
     calibration_ms: float
     cpu_ms: float
     passed_ms: float
     stages: dict[str, StageTime]
+
+    @property
+    def _measured(self) -> str:
+        return f"{self.frames} frames of {self.clip} at {self.size[0]}x{self.size[1]} px, preset {self.preset}"
 
     def json(self) -> dict[str, Any]:
         """Return the figures as `read_speed` reads them."""
@@ -115,13 +120,11 @@ class Speed:
     def slower_than(self, before: Speed, tolerance: float) -> list[str]:
         """Return a line for each stage whose ratio to the calibration has grown by more than the share `tolerance`.
 
-        Stages below a twentieth of the calibration are within the noise. Raises `InputError` for another clip.
+        Stages below a twentieth of the calibration are within the noise. Raises `InputError` for another clip,
+        number of frames or preset.
         """
-        if (before.clip, before.size) != (self.clip, self.size):
-            raise InputError(
-                f"cannot compare {self.clip} at {self.size[0]}x{self.size[1]} px with {before.clip} at "
-                f"{before.size[0]}x{before.size[1]} px: measure the same clip"
-            )
+        if before._measured != self._measured:
+            raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
         lines = []
         for name, stage in self.stages.items():
             then = before.stages[name].ratio if name in before.stages else 0.0
@@ -172,6 +175,7 @@ def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Spee
     return Speed(
         sequence.name,
         count,
+        config.preset,
         (sequence.camera.width, sequence.camera.height),
         calibration_ms,
         cpu_ms,
@@ -184,7 +188,8 @@ class _Stopwatch:
     """Notes the processor time of calls of the stages' functions, without that of the stages within them."""
 
     def __init__(self) -> None:
-        self._seconds: dict[tuple[str, str], list[float]] = defaultdict(list)
+        # By stage, thread and function: functions of a stage may take very different times.
+        self._seconds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
         self._local = threading.local()
 
     @contextmanager
@@ -202,12 +207,13 @@ class _Stopwatch:
             replaced.enter_context(patch.object(clock, method, timed))
             for (owner, name), stage in places:
                 function = getattr(owner, name)
-                replaced.enter_context(patch.object(owner, name, wraps(function)(self.noted(stage)(function))))
+                timed_function = wraps(function)(self.noted(stage, function.__qualname__)(function))
+                replaced.enter_context(patch.object(owner, name, timed_function))
             yield
 
     @contextmanager
-    def noted(self, stage: str) -> Iterator[None]:
-        """Note the processor time of what is within as that of a stage; usable as a decorator."""
+    def noted(self, stage: str, function: str = "") -> Iterator[None]:
+        """Note the processor time of what is within as that of a function of a stage; usable as a decorator."""
         # Open calls of this thread: stage, seconds of the stages within.
         calls: list[tuple[str, list[float]]] = self._local.__dict__.setdefault("calls", [])
         name, within = _named(stage, [call for call, _ in calls]), [0.0]
@@ -220,13 +226,14 @@ class _Stopwatch:
             calls.pop()
             if calls:
                 calls[-1][1][0] += seconds
-            self._seconds[name, _thread_name()].append(seconds - within[0])
+            self._seconds[name, _thread_name(), function].append(seconds - within[0])
 
     def stages(self, frames: int, calibration_ms: float) -> dict[str, StageTime]:
         """Return the stages that ran, the slowest first."""
         ms: dict[str, dict[str, float]] = defaultdict(dict)
-        for (stage, thread), seconds in self._seconds.items():
-            ms[stage][thread] = 1e3 * float(np.median(seconds)) * len(seconds) / frames
+        for (stage, thread, _), seconds in self._seconds.items():
+            own_ms = 1e3 * float(np.median(seconds)) * len(seconds) / frames
+            ms[stage][thread] = ms[stage].get(thread, 0.0) + own_ms
         total = sum(sum(parts.values()) for parts in ms.values())
         found = {}
         for stage, threads in sorted(ms.items(), key=lambda item: -sum(item[1].values())):

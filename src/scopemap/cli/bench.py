@@ -50,13 +50,19 @@ def bench(
         Path | None,
         typer.Option(metavar="FILE", help="speed: names the stages that are slower than in FILE, printed by --json."),
     ] = None,
-    preset: Annotated[_Preset, typer.Option(help="speed: preset of the run.")] = "default",
+    preset: Annotated[_Preset | None, typer.Option(help="speed: preset of the run, by default default.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a benchmark's plan, or the rest of it, and write its tables and figures."""
+    of_plans = {"--out": out, "--data": data, "--timeout": timeout_s}
+    of_plans |= {"--dry-run": dry_run or None, "--retry": retry or None, "--paper-units": paper_units or None}
+    of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset}
+    unused = of_plans if plan == "speed" else of_speed
+    if given := [name for name, value in unused.items() if value is not None]:
+        raise typer.BadParameter(f"is not for {'speed' if plan == 'speed' else 'a plan'}", param_hint=given[0])
     if plan == "speed":
-        _print_speed(video, frames, preset, compare, as_json)
+        _print_speed(video, frames, preset or "default", compare, as_json)
         return
     from scopemap.benchmark.plan import read_plan
 

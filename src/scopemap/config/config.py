@@ -53,7 +53,7 @@ REMOVED = {
 }
 """Settings of earlier versions that are constants now or that nothing reads: a file may still name them, the command
 line may not."""
-REMOVED_VALUES = {"networks.flow": "auto", "networks.perceptual": "auto"}
+REMOVED_VALUES = {"networks.flow": "auto", "networks.keyframe_flow": "auto", "networks.perceptual": "auto"}
 """Values of earlier versions that depended on the weights of the machine: in a file they mean what the preset names."""
 
 

@@ -168,5 +168,7 @@ class NetworkSettings(Settings):
         "extra `networks` and its weights)",
     )
     device: str = Field(
-        "auto", description="where the networks of the extra `networks` run: auto | cpu | cuda; scopenet: on the CPU"
+        "auto",
+        pattern=r"^(auto|cpu|cuda(:\d+)?|mps|xpu)$",
+        description="where the networks of the extra `networks` run: auto | cpu | cuda; scopenet: on the CPU",
     )

@@ -62,6 +62,7 @@ class FrameStore:
         parts = [
             cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _COLOUR_QUALITY)[1].tobytes(),
             np.packbits(frame.valid).tobytes(),
+            np.packbits(np.zeros_like(frame.valid) if frame.highlights is None else frame.highlights).tobytes(),
             *(_encoded(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
         ]
         try:
@@ -111,16 +112,18 @@ class FrameStore:
         shape = (entry.camera.height, entry.camera.width)
         with self._reading:
             self._file.seek(entry.offset)
-            colours, valid, depth, *sigma = [np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes]
+            parts = [np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes]
+        colours, valid, highlights, depth, *sigma = parts
         return Frame(
             entry.index,
             entry.time_s,
             cv2.cvtColor(np.asarray(cv2.imdecode(colours, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB),
             entry.camera,
-            np.unpackbits(valid, count=shape[0] * shape[1]).reshape(shape).astype(bool),
+            _bits(valid, shape),
             _decoded(depth, shape),
             entry.T_world_camera,
             depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
+            highlights=_bits(highlights, shape),
         )
 
 
@@ -137,6 +140,10 @@ def _encoded(mm: np.ndarray) -> np.ndarray:
         code = np.float32(1.5 - np.log(_MIN_MM) / _LOG_STEP) + np.log(mm) * np.float32(1 / _LOG_STEP)
     # Beyond the range is unknown, not at its end.
     return np.where(np.isfinite(code) & (code < _MAX_CODE + 1), np.maximum(code, 1), 0).astype(np.uint16)
+
+
+def _bits(packed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return np.unpackbits(packed, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
 
 def _decoded(code: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

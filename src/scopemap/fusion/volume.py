@@ -38,12 +38,12 @@ VOXELS_PER_MEDIAN_DEPTH = 60
 _VOXELS_PER_TRUNCATION = 5
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
 _VOXELS_PER_MAX_DEPTH = 200
-# Weight of what is masked within the picture, such as highlights, where depth is interpolated.
+# Weight of small highlights, where depth is interpolated.
 _MASKED_WEIGHT = 0.1
 # Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
 # picture's, and the step of the pixels looked at.
 _MASKED_COLOUR, _SURROUNDINGS, _EVERY_PX = 0.01, 1 / 12, 4
-# Share of the picture up to which a masked region is that small.
+# Share of the picture up to which a highlight is that small.
 _LARGEST_MASKED = 0.02
 # No endoscope resolves less; memory would be spent on noise.
 _MIN_VOXEL_MM = 0.01
@@ -104,8 +104,7 @@ class TsdfVolume:
         """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
         Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less. Small
-        masked regions within the picture, such as highlights, weigh a tenth, in the colour of what is around them,
-        unless weights are off.
+        highlights within the picture weigh a tenth, in the colour of what is around them, unless weights are off.
 
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
@@ -119,7 +118,9 @@ class TsdfVolume:
         # A share of 1: voxels have the full weight up to the truncation.
         ramp = {} if advanced.weighted else {"full_weight_share": 1.0}
         grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, advanced.truncation_share, **ramp)
-        masked = _masked_within(frame.valid) if advanced.weighted else np.zeros_like(frame.valid)
+        masked = np.zeros_like(frame.valid)
+        if advanced.weighted and frame.highlights is not None:
+            masked = _small_regions(frame.highlights)
         with np.errstate(invalid="ignore"):
             usable = (frame.valid | masked) & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
@@ -157,10 +158,10 @@ class TsdfVolume:
         return depth_mm, T_world_camera
 
 
-def _masked_within(valid: np.ndarray) -> np.ndarray:
-    """Return the small regions of pixels that are not valid and do not touch the image's border, (H, W) bool."""
-    _, regions, stats, _ = cv2.connectedComponentsWithStats((~valid).astype(np.uint8))
-    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_MASKED * valid.size
+def _small_regions(highlights: np.ndarray) -> np.ndarray:
+    """Return the highlights, (H, W) bool, that are small and do not touch the image's border."""
+    _, regions, stats, _ = cv2.connectedComponentsWithStats(highlights.astype(np.uint8))
+    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_MASKED * highlights.size
     small[0] = False
     for border in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
         small[np.unique(border)] = False

@@ -38,11 +38,11 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
     """
     if not len(mesh.faces):
         return mesh
-    low, high = np.asarray(mesh.bounds)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     cell_mm = max(voxel_mm, float((high - low).max()) / _MOST_CELLS)
     coarse = np.ceil(((high - low) / cell_mm + 2 * _MARGIN_CELLS) / _LEVELS[0]).astype(int)
     corner = (low + high - _LEVELS[0] * cell_mm * coarse) / 2
-    facing = np.linalg.norm(mesh.area_faces @ mesh.face_normals) / mesh.area
+    facing = np.linalg.norm(mesh.area_faces @ mesh.face_normals) / max(float(mesh.area), 1e-12)
     side, direction = (-1, "ascent") if facing > _ONE_WAY else (1, "descent")
     planes, tree = (np.asarray(mesh.vertices), side * np.asarray(mesh.vertex_normals)), cKDTree(mesh.vertices)
     field = np.full(coarse, -float(_BAND_CELLS))

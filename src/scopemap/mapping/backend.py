@@ -39,6 +39,8 @@ _TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
 _DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
 _MAX_PART_ERROR = 0.05
+# Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
+_MOST_OBSERVATIONS = 1_000_000
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
 _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
 
@@ -182,13 +184,16 @@ class Backend:
         problem, loops = self._problem(chosen, worlds, self._camera)
         points, observations = problem.points, problem.observations
         found = adjust(problem)
-        if problem.start is not None and contradiction(points, found, self.settings):
+        refused, fields = self._judged(chosen, problem, found, worlds)
+        if problem.start is not None and refused:
             # Loop closures may be wrong: adjust without them.
             found, loops = adjust(replace(problem, start=None)), 0
+            refused, fields = self._judged(chosen, problem, found, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
         length_px = errors_px(problem, found.state)
         within = {number: _sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds}
-        correction = self._correction(chosen, problem, found, loops, worlds)
+        index = np.array([self._frames[k] for k in chosen])
+        correction = _correction(index, problem, found, loops, fields) if not refused else _none(index, found, refused)
         # A map of one keyframe has no observations: NaN.
         largest_px = np.fmax.reduce(list(within.values()))
         return _Adjusted(correction, within[main], largest_px, _sigma_px(length_px[host != observer]))
@@ -200,7 +205,7 @@ class Backend:
         settings, own = self.settings, [self._tracked[k] for k in chosen]
         T_world_camera = np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
         log_unit = np.log([worlds[pose.map].scale for pose in own])
-        points, observations = self._tracks.collected(chosen)
+        points, observations = self._tracks.collected(chosen, _MOST_OBSERVATIONS)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
@@ -222,31 +227,14 @@ class Backend:
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted_loops
 
-    def _correction(
-        self,
-        chosen: list[int],
-        problem: BundleProblem,
-        found: BundleSolution,
-        loops: int,
-        worlds: Mapping[int, Similarity],
-    ) -> FrameCorrection:
-        """Return the correction by a solution; one that changes nothing where the solution is refused."""
-        points, state, index = problem.points, found.state, np.array([self._frames[k] for k in chosen])
-        refused = contradiction(points, found, self.settings)
-        fields = self._depth_fields(points, found) if self.settings.depth_step_sigma > 0 and not refused else ()
-        refused = refused or self._depth_contradiction(chosen, problem, found, fields, worlds)
-        if refused:
-            identity = np.tile(np.eye(4), (len(index), 1, 1))
-            return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)
-        return FrameCorrection(
-            index,
-            inverse(state.T_camera_world) @ problem.T_camera_world,
-            state.log_scale,
-            found.sigma_px,
-            loops=loops,
-            depth_fields=fields,
-            depth_mm=_median_depth_mm(points) if len(points.log_depth) else 1.0,
-        )
+    def _judged(
+        self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
+    ) -> tuple[str, tuple[DepthCorrectionField, ...]]:
+        """Return why a solution is refused, "" where it is not, and its depth correction fields."""
+        if refused := contradiction(problem.points, found, self.settings):
+            return f"the scene is not rigid or the focal length is wrong: {refused}", ()
+        fields = self._depth_fields(problem.points, found) if self.settings.depth_step_sigma > 0 else ()
+        return self._depth_contradiction(chosen, problem, found, fields, worlds), fields
 
     def _depth_contradiction(
         self,
@@ -283,6 +271,32 @@ class Backend:
             data = (position[own], points.log_depth[own], error[own], found.log_depth_sigma[own])
             fields.append(fit_depth_correction(*data, self.settings.depth_step_sigma))
         return tuple(fields)
+
+
+def _correction(
+    index: np.ndarray,
+    problem: BundleProblem,
+    found: BundleSolution,
+    loops: int,
+    fields: tuple[DepthCorrectionField, ...],
+) -> FrameCorrection:
+    """Return the correction by a solution of the keyframes with these numbers of frames, (K,)."""
+    points, state = problem.points, found.state
+    return FrameCorrection(
+        index,
+        inverse(state.T_camera_world) @ problem.T_camera_world,
+        state.log_scale,
+        found.sigma_px,
+        loops=loops,
+        depth_fields=fields,
+        depth_mm=_median_depth_mm(points) if len(points.log_depth) else 1.0,
+    )
+
+
+def _none(index: np.ndarray, found: BundleSolution, refused: str) -> FrameCorrection:
+    """Return the correction that changes nothing."""
+    identity = np.tile(np.eye(4), (len(index), 1, 1))
+    return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)
 
 
 def contradiction(points: Points, found: BundleSolution, settings: MappingAdvanced) -> str:

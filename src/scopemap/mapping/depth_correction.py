@@ -125,11 +125,14 @@ def _log_ratios(
 ) -> np.ndarray:
     """Return ln of a keyframe's depth over that of another one's points there, (n,), where both are known."""
     rows, columns = np.nonzero(grids[one] > 0)
+    if not len(rows):
+        return np.zeros(0)
     rays = camera.unproject(_GRID_PX * np.column_stack([columns, rows]) + _GRID_PX // 2)
     points = transform(inverse(T_world_camera[other]) @ T_world_camera[one], grids[one][rows, columns, None] * rays)
-    x, y = ((camera.project(points).T[:, None] - _GRID_PX // 2) / _GRID_PX).astype(np.float32)
     # Beyond the border, behind the camera and beside unknown depth there is nothing to compare with.
-    there_mm = cv2.remap(grids[other], x, y, cv2.INTER_LINEAR, borderValue=float("nan"))[0]
+    x, y = (np.full(grids[one].shape, -_GRID_PX, np.float32) for _ in range(2))
+    x[rows, columns], y[rows, columns] = (camera.project(points).T - _GRID_PX // 2) / _GRID_PX
+    there_mm = cv2.remap(grids[other], x, y, cv2.INTER_LINEAR, borderValue=float("nan"))[rows, columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = np.log(there_mm / points[:, 2])
     known: np.ndarray = ratios[np.isfinite(ratios)]

@@ -25,8 +25,6 @@ from scopemap.mapping.reprojection import Observations, Points
 
 _CELL_PX = 16  # one corner in each cell of that size
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
-# Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
-_MOST_OBSERVATIONS = 1_000_000
 
 
 @dataclass
@@ -122,13 +120,13 @@ class FeatureTracks:
             number = first + np.arange(known.sum())
             self._matches.append(_Matches(number, np.full(len(number), other), observed[known]))
 
-    def collected(self, keyframes: Collection[int] | None = None) -> tuple[Points, Observations]:
+    def collected(
+        self, keyframes: Collection[int] | None = None, most_observations: int | None = None
+    ) -> tuple[Points, Observations]:
         """Return all points, sorted by host, and their observations, sorted by point.
 
-        Of a long video every n-th point only has observations, so that the adjustment's memory stays bounded.
-
         keyframes : increasing numbers of the keyframes that are used, None: all. The result numbers keyframes by their
-        place in it.
+        place in it. most_observations : above about so many only every n-th point is returned.
         """
         new_number = np.full(self._keyframe_count, -1)
         chosen = np.arange(self._keyframe_count) if keyframes is None else np.array(keyframes, dtype=int)
@@ -138,12 +136,13 @@ class FeatureTracks:
         point, keyframe, pixel = (np.concatenate(parts) for parts in zip(empty, *self._matches, strict=True))
         host, keyframe = new_number[points.host], new_number[keyframe]
         by_host = np.argsort(host, kind="stable")[np.count_nonzero(host < 0) :]
+        if most_observations is not None:
+            found = np.count_nonzero((host[point] >= 0) & (keyframe >= 0))
+            by_host = by_host[:: max(-(-found // most_observations), 1)]
         place = np.full(len(host), -1)
         place[by_host] = np.arange(len(by_host))
         order = np.argsort(place[point], kind="stable")
         order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
-        every = max(-(-len(order) // _MOST_OBSERVATIONS), 1)
-        order = order[place[point][order] % every == 0]
         sorted_points = Points(host[by_host], points.pixel[by_host], points.log_depth[by_host], points.sigma[by_host])
         return sorted_points, Observations(place[point][order], keyframe[order], self._centred(pixel[order]))
 

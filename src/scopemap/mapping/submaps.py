@@ -99,9 +99,9 @@ class Mapper:
         if len(found) < 2:
             return kept, []
         return kept, [
-            f"{len(found)} submaps: the camera was lost and not found again; {len(kept[0].frames)} of "
-            f"{len(self._tracked)} tracked frames are in the result; the relative pose of the others is unknown; "
-            f"{len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
+            f"{len(found)} submaps: the camera was lost, and nothing connects what it saw before and after; "
+            f"{len(kept[0].frames)} of {len(self._tracked)} tracked frames are in the result; the relative pose of the "
+            f"others is unknown; {len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
         ]
 
     def _split_maps(self) -> set[int]:

@@ -106,17 +106,19 @@ class Masker:
         lit = is_lit(frame.rgb, self.settings.advanced.dark_level)
         valid = frame.valid & lit & ~clipped if self.settings.advanced.exposure else frame.valid
         field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
+        highlights = np.zeros_like(valid)
         if self.settings.highlights:
             bright = clipped | specular(darkest, field)
-            valid &= cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) == 0
+            highlights = frame.valid & field & (cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) > 0)
+            valid &= ~highlights
         overlays = None if self._overlays is None else self._overlays(frame.rgb, field)
         files = None if self._files is None else self._files.covered(frame.index)
         for covered in (overlays, files):
             if covered is not None:
-                valid &= ~covered
+                valid, highlights = valid & ~covered, highlights & ~covered
         if is_constant(frame.rgb):
             valid = np.zeros_like(valid)
-        return replace(frame, valid=valid & field)
+        return replace(frame, valid=valid & field, highlights=highlights)
 
 
 def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ paper's formula lifts with the tracked frame's depth, which is not known yet whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,24 +76,28 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
     Finer levels are left out where a coarser one correlates too little for the alignment to be accepted: on finer
     levels images that fit correlate less.
     """
-    motion, iterations = Motion(T_start, np.array([1.0, 0.0])), 0
+    motion, iterations, coarse = Motion(T_start, np.array([1.0, 0.0])), 0, math.inf
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
     for level in reversed(range(len(reference))):
         rotation_only = settings.paper.rotation_first and level == len(reference) - 1 and len(reference) > 1
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps
-        if not rotation_only and _is_hopeless(reference[level:], current[level:], motion, settings):
+        coarse = math.inf if rotation_only else _correlation(reference[level:], current[level:], motion, settings)
+        if coarse < settings.advanced.min_correlation:
             break
     # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
-    return judge(reference, current, motion, iterations)
+    found = judge(reference, current, motion, iterations)
+    # What ended at a coarse level is not to be accepted, however well it happens to correlate at the finest.
+    ended = coarse < settings.advanced.min_correlation
+    return replace(found, correlation=min(found.correlation, coarse)) if ended else found
 
 
-def _is_hopeless(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> bool:
-    """Whether a motion correlates too little at the finest of these levels; never where measured depth takes part."""
+def _correlation(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> float:
+    """Return the correlation at the finest of these levels; infinite where measured depth takes part."""
     by_shape = settings.advanced.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
-    return not by_shape and judge(reference, current, motion).correlation < settings.advanced.min_correlation
+    return math.inf if by_shape else judge(reference, current, motion).correlation
 
 
 def judge(reference: list[View], current: list[View], motion: Motion, iterations: int = 0) -> Alignment:
