@@ -107,3 +107,10 @@ def test_the_command_prints_compares_and_fails(
     slower = CliRunner().invoke(app, ["bench", "speed", "--compare", str(file)])
     assert slower.exit_code == 1
     assert "slower: depth network" in slower.stderr
+
+
+@pytest.mark.parametrize("words", [("speed", "--dry-run"), ("speed", "--out", "x"), ("scared", "--frames", "5")])
+def test_options_that_would_be_ignored_are_refused(words: tuple[str, ...]) -> None:
+    answer = CliRunner().invoke(app, ["bench", *words])
+    assert answer.exit_code == 2
+    assert f"Invalid value for {words[1]}: only" in answer.output

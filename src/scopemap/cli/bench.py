@@ -60,7 +60,7 @@ def bench(
     of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset}
     unused = of_plans if plan == "speed" else of_speed
     if given := [name for name, value in unused.items() if value is not None]:
-        raise typer.BadParameter(f"is not for {'speed' if plan == 'speed' else 'a plan'}", param_hint=given[0])
+        raise typer.BadParameter(f"only {'plans take' if plan == 'speed' else 'speed takes'} it", param_hint=given[0])
     if plan == "speed":
         _print_speed(video, frames, preset or "default", compare, as_json)
         return

@@ -193,7 +193,9 @@ class Backend:
         length_px = errors_px(problem, found.state)
         within = {number: _sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds}
         index = np.array([self._frames[k] for k in chosen])
-        correction = _correction(index, problem, found, loops, fields) if not refused else _none(index, found, refused)
+        correction = (
+            _correction(index, problem, found, loops, fields) if not refused else _no_correction(index, found, refused)
+        )
         # A map of one keyframe has no observations: NaN.
         largest_px = np.fmax.reduce(list(within.values()))
         return _Adjusted(correction, within[main], largest_px, _sigma_px(length_px[host != observer]))
@@ -293,7 +295,7 @@ def _correction(
     )
 
 
-def _none(index: np.ndarray, found: BundleSolution, refused: str) -> FrameCorrection:
+def _no_correction(index: np.ndarray, found: BundleSolution, refused: str) -> FrameCorrection:
     """Return the correction that changes nothing."""
     identity = np.tile(np.eye(4), (len(index), 1, 1))
     return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)
