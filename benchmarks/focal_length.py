@@ -63,8 +63,9 @@ def row(name: str, known: Sequence, unknown: Sequence) -> str:
     """Measure one clip; return its line of the table."""
     true_deg = 2 * math.degrees(math.atan(known.camera.width / 2 / known.camera.fx))
     estimate = focal_from_motion(unknown, Config())
-    found, notes = with_focal_from_motion(unknown, Config())
-    decision = "taken" if found is not unknown else notes[0].removeprefix("focal length: ").split(":")[0]
+    found, _ = with_focal_from_motion(unknown, Config())
+    kept = found.camera is unknown.camera
+    decision = "kept, " + found.camera_source.partition("; ")[2].split(":")[0] if kept else "taken"
     if estimate.reason:
         return f"| {name} | {true_deg:.1f} | - | - | {decision}: {estimate.reason} |"
     off = math.log(estimate.focal_px / known.camera.fx)

@@ -1,4 +1,5 @@
-"""Damaged inputs: does every reader and every parser of calibrations end in success or in one clear sentence?
+"""Damaged inputs: does every reader of data sets, calibrations, trajectories, settings and results end in success or in
+one clear sentence?
 
     python benchmarks/fuzz.py [--count 20000] [--seed 0] [--only NAME ...] [--again NUMBER]
 
@@ -6,7 +7,7 @@ Takes the made-up copies of all layouts from the tests, damages one to three of 
 emptied, numbers replaced, lines doubled or swapped, files taken away, exchanged or renamed; every other time a file
 inside an archive, which is closed again), opens what is left as a user would and reads all of it: frames, truth, depth
 files, masks, and what `datasets check` looks at. Anything that is neither success nor a `ScopemapError`, takes over
-10 s or over 1 GB of memory is a finding, printed with the number that makes it again.
+10 s of the processor or over 1 GB of memory is a finding, printed with the number that makes it again.
 """
 
 from __future__ import annotations
@@ -32,26 +33,31 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
-from typing import TypeAlias
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 from drawn_datasets import WRITERS, write_cameras  # noqa: E402
+from drawn_run import draw_run  # noqa: E402
+from drawn_trajectories import write_settings, write_trajectories  # noqa: E402
 
+from scopemap.benchmark.plan import read_plan  # noqa: E402
 from scopemap.cameras.formats.reading import read_calibration  # noqa: E402
-from scopemap.config import DepthSettings  # noqa: E402
+from scopemap.config import Config, DepthSettings  # noqa: E402
 from scopemap.depth.files import FilesDepth  # noqa: E402
 from scopemap.errors import ScopemapError  # noqa: E402
+from scopemap.io.checksums import verify_result, write_checksums  # noqa: E402
 from scopemap.io.datasets.checking import check  # noqa: E402
 from scopemap.io.datasets.reference import reference_trajectory  # noqa: E402
 from scopemap.io.datasets.survey import survey  # noqa: E402
 from scopemap.io.opening import open_sequence  # noqa: E402
 from scopemap.masking.mask_files import MaskFiles  # noqa: E402
+from scopemap.reconstruction import DepthReader  # noqa: E402
+from scopemap.report.kept_run import read_run  # noqa: E402
+from scopemap.trajectory.formats.opening import read_trajectory  # noqa: E402
 
 SLOWEST_S = 10
 MOST_MEMORY_KB = 1 << 20
-CALIBRATIONS = "calibrations"
 _STRANGE = ("nan", "inf", "-inf", "-1", "0", "1e308", "1e-320", "9" * 20, "", "x", "1,5", "0x10", "\u0661")
 _HOLLOW = (b"", b"\0" * 64, b"\n\n\n", b"%YAML:1.0\n---\n", b"<?xml version='1.0'?>", b"{}", b"[]")
 _TARS, _ZIPS = (".gz", ".tgz", ".tar"), (".zip", ".xlsx")
@@ -62,7 +68,7 @@ class TooSlowError(BaseException):
     """Time is up; no reader that catches what damaged bytes end in may take this for a damage."""
 
 
-Damage: TypeAlias = Callable[[random.Random, Path], None]
+Damage = Callable[[random.Random, Path], None]
 
 
 def cut_off(chance: random.Random, file: Path) -> None:
@@ -222,15 +228,50 @@ def read_all(path: Path) -> None:
 
 
 def read_cameras(folder: Path) -> None:
-    """Read every calibration in a folder; the first that is refused does not hide the others."""
+    """Read every calibration in a folder."""
+    _each(lambda file: read_calibration(file, (640, 480)), folder)
+
+
+def read_trajectories(folder: Path) -> None:
+    """Read every trajectory in a folder."""
+    _each(lambda file: read_trajectory(file, kind="open3d" if file.suffix == ".log" else "auto"), folder)
+
+
+def read_settings(folder: Path) -> None:
+    """Read every file of settings in a folder, plans too."""
+    # A pipe is waited for: a shell may write the settings to it.
+    read = {True: read_plan, False: lambda file: Config.load(file=file)}
+    _each(lambda file: file.is_fifo() or read["plan" in file.name](file), folder)
+
+
+def read_result(folder: Path) -> None:
+    """Read a run's folder as its report and `verify` do."""
+    depth = DepthReader(folder)
+    for index in range(3):
+        depth.read_sigma(index)
+    read_run(folder)
+    verify_result(folder)
+
+
+def _each(read: Callable[[Path], object], folder: Path) -> None:
+    """Read every file or folder; the first that is refused does not hide the others."""
     refused = None
     for file in sorted(folder.iterdir()):
         try:
-            read_calibration(file, (640, 480))
+            read(file)
         except ScopemapError as error:
             refused = error
     if refused is not None:
         raise refused
+
+
+# What is opened by other doors than `open_sequence`: its writer and its reader.
+OTHERS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
+    "calibrations": (write_cameras, read_cameras),
+    "trajectories": (write_trajectories, read_trajectories),
+    "settings": (write_settings, read_settings),
+    "result": (lambda folder: write_checksums(draw_run(folder, pictures=False)), read_result),
+}
 
 
 def work(connection: Connection, templates: Path, names: list[str], numbers: range) -> None:
@@ -240,7 +281,8 @@ def work(connection: Connection, templates: Path, names: list[str], numbers: ran
     def too_slow(signum: int, frame: FrameType | None) -> None:
         raise TooSlowError
 
-    signal.signal(signal.SIGALRM, too_slow)
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, too_slow)
     with tempfile.TemporaryDirectory() as folder:
         for number in numbers:
             name = names[number % len(names)]
@@ -248,15 +290,18 @@ def work(connection: Connection, templates: Path, names: list[str], numbers: ran
             done = damaged(number, templates / name, scratch)
             connection.send((number, name, done))
             verdict, finding = "success", ""
-            signal.alarm(SLOWEST_S)
+            # Of the processor; who waits, for a pipe, is given longer: others may be at work on this machine.
+            signal.setitimer(signal.ITIMER_PROF, SLOWEST_S)
+            signal.alarm(6 * SLOWEST_S)
             try:
-                read_cameras(scratch) if name == CALIBRATIONS else read_all(_entry(templates / name, scratch))
+                OTHERS[name][1](scratch) if name in OTHERS else read_all(_entry(templates / name, scratch))
             except ScopemapError:
                 verdict = "refused"
             except TooSlowError:
                 verdict, finding = "finding", f"more than {SLOWEST_S} s"
             except BaseException:
                 verdict, finding = "finding", traceback.format_exc(limit=-4)
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             if peak > MOST_MEMORY_KB and not finding:
@@ -281,13 +326,10 @@ def _removed(folder: Path) -> None:
 
 def prepared(folder: Path, only: list[str]) -> list[str]:
     """Write the templates; return their names."""
-    names = [name for name in (*WRITERS, CALIBRATIONS) if not only or name in only]
+    names = [name for name in (*WRITERS, *OTHERS) if not only or name in only]
     for name in names:
         target = folder / name
-        if name == CALIBRATIONS:
-            write_cameras(target)
-            continue
-        entry = WRITERS[name](target)
+        entry = WRITERS[name](target) if name in WRITERS else OTHERS[name][0](target) or target
         (folder / f"{name}.entry").write_text("" if entry == target else str(entry.relative_to(target)))
     return names
 
@@ -305,7 +347,7 @@ def fuzz(names: list[str], templates: Path, numbers: range) -> tuple[Counter[tup
         last = None
         try:
             while True:
-                if not here.poll(3 * SLOWEST_S):
+                if not here.poll(9 * SLOWEST_S):
                     raise EOFError
                 message = here.recv()
                 if len(message) == 3:
@@ -315,6 +357,7 @@ def fuzz(names: list[str], templates: Path, numbers: range) -> tuple[Counter[tup
                 counts[name, message[0]] += 1
                 if message[0] == "finding":
                     findings.append(f"{number} ({name}: {done}):\n{message[1]}")
+                    print(f"\n{findings[-1]}", flush=True)
                 if (number + 1 - numbers.start) % 1000 == 0:
                     spent = time.monotonic() - started
                     print(f"{number + 1 - numbers.start} inputs, {len(findings)} findings, {spent:.0f} s", flush=True)
@@ -327,6 +370,7 @@ def fuzz(names: list[str], templates: Path, numbers: range) -> tuple[Counter[tup
             number, name, done = last
             counts[name, "finding"] += 1
             findings.append(f"{number} ({name}: {done}):\nthe process died or hung (exit code {process.exitcode})")
+            print(f"\n{findings[-1]}", flush=True)
             todo = range(number + 1, numbers.stop)
     return counts, findings
 
@@ -344,8 +388,6 @@ def main() -> None:
         first = options.seed * 10_000_000 if options.again is None else options.again
         numbers = range(first, first + (options.count if options.again is None else 1))
         counts, findings = fuzz(names, Path(folder), numbers)
-    for finding in findings:
-        print(f"\n{finding}")
     print("\n| input | read | refused with a sentence | findings |\n|---|---|---|---|")
     for name in names:
         print(f"| {name} | {counts[name, 'success']} | {counts[name, 'refused']} | {counts[name, 'finding']} |")

@@ -62,7 +62,7 @@ def veiled(folder: Path) -> list[str]:
         write_phantom(PhantomSpec(scene=scene, frames=200, seed=11, events=parse_events(EVENTS)), spoilt)
         for name, changes in VARIANTS.items():
             before, after = run(clean, changes), run(spoilt, changes)
-            lost = np.array([record.track.status == "lost" for record in after.records])
+            lost = np.array([record.T_world_camera is None for record in after.records])
             after_each = [lost[end + 1 :] for end in (69, 104, 139)]
             waits = ["never" if still.all() else int(np.argmin(still)) for still in after_each]
             one, other = ate_mm(before, clean), ate_mm(after, spoilt)
@@ -111,7 +111,7 @@ def cut(folder: Path) -> list[str]:
             result = run(source, changes)
             trajectory, truth = result.trajectory, read_trajectory(source)
             report = pose_report(match(trajectory, truth, "sim3"))
-            tracked = [record.track.map for record in result.records if record.track.status != "lost"]
+            tracked = [record.track.map for record in result.records if record.T_world_camera is not None]
             parts = [without(trajectory, [n for n in range(301) if (n < CUT[0]) != early]) for early in (True, False)]
             scales = [match(part, truth, "sim3").similarity.scale if part.tracked.any() else np.nan for part in parts]
             rows.append(

@@ -1,19 +1,24 @@
 """What `scopemap run` reaches by default on real clips and phantoms: the table and the speed picture of BENCHMARK.md.
 
-    python benchmarks/overview.py --data FOLDER [--out FOLDER] [--picture FILE] [--only NAME ...]
+    python benchmarks/overview.py --data FOLDER [--out FOLDER] [--picture FILE] [--only NAME ...] [--presets NAME ...]
+                                  [--repeat N]
 
-FOLDER is the real data's (README, "Tests on real data"). Every row is one run of the command line with default settings
-(and the depth files named), measured by `scopemap evaluate`. Position errors are after a Sim(3) alignment.
+FOLDER is the real data's (README, "Tests on real data"). Every row is one run of the command line with the settings of
+a preset, by default `default` (and the depth files named), measured by `scopemap evaluate`. Position errors are after a
+Sim(3) alignment. Frames per second are those of the whole command, from its start to its end, the median of `--repeat`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +32,7 @@ PHANTOMS = {
     "tube phantom, no texture": ("--scene", "tube", "--frames", "120", "--seed", "13"),
     "colon phantom, breathing": ("--scene", "colon", "--frames", "120", "--seed", "14", "--deform"),
 }
-STAGES = ("focal length", "read", "preprocess", "track and fuse", "back end", "fuse")
+STAGES = ("focal length", "read", "preprocess", "match", "track", "back end", "fuse")
 
 
 @dataclass(frozen=True)
@@ -73,14 +78,21 @@ def clips(data: Path, phantoms: Path) -> list[Clip]:
     return found
 
 
-def measure(clip: Clip, out: Path) -> tuple[str, dict[str, float]]:
-    """Run a clip; return its row of the table and its seconds per frame for each stage."""
-    scopemap("run", str(clip.source), "--out", str(out), "--quiet", *clip.arguments)
+def measure(clip: Clip, preset: str, out: Path, repeat: int = 1) -> tuple[str, dict[str, float]]:
+    """Run a clip `repeat` times; return its row of the table and its seconds per frame for each stage."""
+    elapsed_s = []
+    for _ in range(repeat):
+        started = time.perf_counter()
+        arguments = ("--preset", preset, "--quiet", "--overwrite", *clip.arguments)
+        scopemap("run", str(clip.source), "--out", str(out), *arguments)
+        elapsed_s.append(time.perf_counter() - started)
     provenance = json.loads((out / "provenance.json").read_text())
     frames, seconds = provenance["frames"], provenance["seconds"]
     submaps = 1 + len(list((out / "maps").glob("*")))
-    row = [clip.name, f"{provenance['tracked']} of {frames}", str(submaps), *_errors(clip, out)]
-    return f"| {' | '.join(row)} | {frames / seconds['total']:.1f} |", {s: seconds.get(s, 0.0) / frames for s in STAGES}
+    name = clip.name if preset == "default" else f"{clip.name}, `{preset}`"
+    row = [name, f"{provenance['tracked']} of {frames}", str(submaps), *_errors(clip, out)]
+    stages = {stage: seconds.get(stage, 0.0) / frames for stage in STAGES}
+    return f"| {' | '.join(row)} | {frames / statistics.median(elapsed_s):.1f} |", stages
 
 
 def _errors(clip: Clip, out: Path) -> list[str]:
@@ -117,7 +129,7 @@ def draw_speed(stages: dict[str, dict[str, float]], file: Path) -> None:
         axes.barh(names, width, left=left, label=stage)
         left = [a + b for a, b in zip(left, width, strict=True)]
     axes.invert_yaxis()
-    axes.set_xlabel('ms per frame, one thread; "read" and "preprocess" run beside "track and fuse"')
+    axes.set_xlabel('ms per frame, one thread; stages up to "track" run side by side')
     axes.legend(ncols=len(STAGES), loc="lower center", bbox_to_anchor=(0.35, 1.0), frameon=False, fontsize="small")
     figure.savefig(file)
 
@@ -128,16 +140,21 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, help="keep phantoms and results here")
     parser.add_argument("--picture", type=Path, help="draw the time of each stage into this PNG")
-    parser.add_argument("--only", nargs="+", help="names of clips, or their beginnings")
+    parser.add_argument("--only", nargs="+", help="names of clips; * is any text")
+    parser.add_argument("--presets", nargs="+", default=["default"])
+    parser.add_argument("--repeat", type=int, default=1, help="runs of each clip")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         out, stages = options.out or Path(scratch), {}
         print(HEADER, flush=True)
         for number, clip in enumerate(clips(options.data, out / "phantoms")):
-            if options.only and not clip.name.startswith(tuple(options.only)):
+            if options.only and not any(fnmatch(clip.name, name) for name in options.only):
                 continue
-            row, stages[clip.name] = measure(clip, out / f"{number:02d}")
-            print(row, flush=True)
+            for preset in options.presets:
+                row, stages[f"{clip.name}, {preset}"] = measure(
+                    clip, preset, out / f"{number:02d}_{preset}", options.repeat
+                )
+                print(row, flush=True)
         if options.picture:
             draw_speed(stages, options.picture)
 

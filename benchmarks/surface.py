@@ -50,6 +50,7 @@ from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.datasets.reference import read_reference
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import TRACKED
 
 PHANTOM_NAMES = dict(zip(("colon", "laparoscopy", "tube", "breathe"), PHANTOMS, strict=True))
 UNSEEN = {
@@ -165,7 +166,7 @@ def _row(name: str, *figures: float) -> str:
 def keyframe_error(found: Measured) -> float:
     """Return the mean relative error of the depth of a run's keyframes, with one scale for all of them."""
     with (found.run / "frames.csv").open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["keyframe"] and row["status"] != "lost"]
+        rows = [row for row in csv.DictReader(file) if row["keyframe"] and row["status"] in TRACKED]
     keyframes, depth = {int(row["keyframe"]) for row in rows}, DepthReader(found.run)
     sequence = open_truth(found.run, found.source)
     pairs = [

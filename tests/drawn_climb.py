@@ -68,7 +68,7 @@ def write_finished_run(folder: Path, *submaps: Trajectory, clip: str = "Seq_001_
         write_run(folder / f"maps/{number}" if number else folder, submap)
     facts = {
         "input": f"videos/{clip}.mp4",
-        "seconds": {"prepare": 1.5, "track and fuse": 3.0, "back end": 2.0, "fuse": 1.25, "total": 10.0},
+        "seconds": {"prepare": 1.5, "track": 3.0, "back end": 2.0, "fuse": 1.25, "total": 10.0},
     }
     (folder / "provenance.json").write_text(json.dumps(facts))
     return folder

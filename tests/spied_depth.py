@@ -26,12 +26,13 @@ class SpyDepth:
         self.seen: list[Frame] = []
         self.threads: set[str] = set()
         self.fails_at: int | None = None
+        self.error: Exception = RuntimeError("the network broke")
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         self.seen.append(frame)
         self.threads.add(threading.current_thread().name)
         if len(self.seen) == self.fails_at:
-            raise RuntimeError("the network broke")
+            raise self.error
         return replace(self.inner.estimate(frame), focal_px=self.focal_px)
 
     def provenance(self) -> dict[str, str]:
@@ -42,7 +43,7 @@ def spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any)
     """Put a spy into every run from here on, as its depth or as its anchor's reference; they appear in the list."""
     create, spies = create_estimators, []
 
-    def spying(config: Config, sequence: Any) -> Estimators:
+    def spying(config: Config, sequence: Any, own: Any) -> Estimators:
         parts = create(config, sequence)
         if anchor_too:
             spies.append(SpyDepth(parts.anchor.reference, **spy))
@@ -50,5 +51,5 @@ def spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any)
         spies.append(SpyDepth(parts.depth, **spy))
         return replace(parts, depth=spies[-1])
 
-    monkeypatch.setattr("scopemap.runner.create_estimators", spying)
+    monkeypatch.setattr("scopemap.runner.preparation.create_estimators", spying)
     return spies

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
-from scopemap.mapping.bundle_adjustment import adjust
+from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors
 
 FOCAL_PX = 150.0
@@ -62,6 +62,53 @@ def test_exact_observations_and_depths_recover_exact_poses() -> None:
     assert translation_mm < 1e-2
     assert np.abs(found.state.log_depth - points.log_depth).max() < 1e-3
     assert found.sigma_px == pytest.approx(0.1)  # its floor
+
+
+@pytest.mark.parametrize("window", [2, 3, 4])
+def test_windows_of_exact_data_recover_exact_poses(window: int) -> None:
+    rng = np.random.default_rng(7)
+    T, points, observations = _world(rng)
+    loose = Priors(rotation_rad=10, translation_share=10)
+    found = adjust_in_windows(BundleProblem(_tracked(T, rng), points, observations, loose, LINE, FOCAL_PX), window)
+    rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
+    assert rotation_rad < 3e-4
+    assert translation_mm < 3e-2
+    assert np.abs(found.state.log_depth - points.log_depth).max() < 3e-3
+    assert np.isfinite(found.log_depth_sigma).all()
+    assert found.sigma_px == pytest.approx(0.1)
+
+
+def test_windows_lose_little_against_all_keyframes_at_once() -> None:
+    rng = np.random.default_rng(8)
+    T, points, observations = _world(rng)
+    noisy = replace(observations, pixel=observations.pixel + rng.normal(0, 0.3, observations.pixel.shape))
+    tracked, wrong = (
+        _tracked(T, rng),
+        replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host))),
+    )
+    problem = BundleProblem(tracked, wrong, noisy, Priors(), LINE, FOCAL_PX)
+    at_once, windowed = adjust(problem), adjust_in_windows(problem, 3)
+    one = adjust_in_windows(problem, KEYFRAMES).state
+    assert one.T_camera_world.tobytes() == at_once.state.T_camera_world.tobytes()
+    errors, more = (_pose_errors(found.state.T_camera_world, T) for found in (at_once, windowed))
+    assert more[0] < 2 * errors[0] + 1e-3
+    assert more[1] < 2 * errors[1] + 0.05
+    assert windowed.sigma_px == pytest.approx(at_once.sigma_px, rel=0.1)
+
+
+@pytest.mark.parametrize("window", [2, 3])
+def test_a_window_that_nothing_is_observed_in_goes_on_as_tracked(window: int) -> None:
+    rng = np.random.default_rng(9)
+    T, points, observations = _world(rng)
+    early = np.maximum(points.host[observations.point], observations.keyframe) < 3
+    some = Observations(observations.point[early], observations.keyframe[early], observations.pixel[early])
+    tracked = _tracked(T, rng)
+    loose = Priors(rotation_rad=10, translation_share=10)
+    problem = BundleProblem(tracked, points, some, loose, LINE, FOCAL_PX)
+    found, last = adjust_in_windows(problem, window).state.T_camera_world, 5 - window
+    for k in range(last + 1, KEYFRAMES):
+        np.testing.assert_allclose(found[k] @ inverse(found[last]), tracked[k] @ inverse(tracked[last]), atol=1e-9)
+    assert _pose_errors(found[:3], T[:3])[1] < 3e-2
 
 
 def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:

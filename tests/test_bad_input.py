@@ -246,6 +246,21 @@ def test_links_in_a_circle_change_nothing(name: str, tmp_path: Path) -> None:
     survey(open_sequence(entry))
 
 
+def test_a_link_to_an_ancestor_leads_nowhere(tmp_path: Path) -> None:
+    """The data set beside the folder is not found in it, and the link hides no pictures."""
+    WRITERS["c3vd"](tmp_path / "other")
+    inner = tmp_path / "study" / "mine"
+    inner.mkdir(parents=True)
+    (inner / "up").symlink_to(tmp_path)
+    (inner / "up1").symlink_to("..")
+    with pytest.raises(InputError, match="there is no image"):
+        open_sequence(tmp_path / "study")
+    (inner / "pictures").mkdir()
+    for number in range(3):
+        save(inner / "pictures" / f"{number}.png", picture(number))
+    assert open_sequence(tmp_path / "study").path == inner / "pictures"
+
+
 def test_a_path_in_a_circle_or_too_long_is_a_sentence(capfd: Capture, tmp_path: Path) -> None:
     (tmp_path / "there.mp4").symlink_to("back.mp4")
     (tmp_path / "back.mp4").symlink_to("there.mp4")

@@ -21,7 +21,7 @@ from scopemap.errors import SettingsError
 from scopemap.evaluation.poses import evaluate_poses
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
-from scopemap.runner import reconstruct
+from scopemap.runner.run import reconstruct
 from scopemap.tracking.track import FrameTracker, Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
@@ -197,7 +197,7 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch: pytest.Monke
         raise OSError(f"libusb-1.0.so.0: cannot open shared object file ({name})")
 
     monkeypatch.setattr(open3d_odometry.importlib, "import_module", missing)
-    with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install 'scopemap\[baselines\]'.*libgl1"):
+    with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -e '\.\[baselines\]'.*libgl1"):
         Open3dTracker("park")
 
 

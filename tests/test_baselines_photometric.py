@@ -19,7 +19,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import rotation_angle_rad
 from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner import reconstruct
+from scopemap.runner.run import reconstruct
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.formats.opening import read_trajectory

@@ -144,6 +144,8 @@ def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path
         ('path = "clips/c*"', "", "either a path or a phantom"),
         ('title = "small"', 'titel = "small"', "titel"),
         ("seeds = [0, 3]", "seeds = [0, 3", "cannot read the plan"),
+        ("seeds = [0, 3]", "seeds = " + "[" * 100_000, "cannot read the plan"),
+        ("seeds = [0, 3]", f"seeds = [{'9' * 5000}]", "cannot read the plan"),
         ('title = "small"', 'title = "small"\nmethod_sets = ["all"]', "unknown set of methods 'all': choose from abl"),
         (
             'title = "small"',

@@ -60,6 +60,7 @@ def test_a_row_writes_the_bytes_of_a_run(
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
-    """The files of a run, but those that hold its times."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "provenance.json"]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+    """The files of a run, but those that hold its times, and the report, which the command adds."""
+    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]
+    left_out = ("provenance.json", "SHA256SUMS", "report.html", "summary.png", "frames/")
+    return {name: (folder / name).read_bytes() for name in names if not name.startswith(left_out)}

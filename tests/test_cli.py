@@ -24,15 +24,17 @@ from scopemap.cli import main
 OPTIONS = {
     "run": "--out --preset --config --dataset --camera --fov --camera-fit --stereo --deinterlace --near-far --depth"
     " --flow --frames --fps --size --device --colours --mesh-faces --mesh-smooth --mesh-watertight --set --overwrite"
-    " --json --quiet",
+    " --resume --json --quiet",
     "evaluate": "--truth --align --unit --paper-units --json --quiet",
     "phantom": "--scene --frames --size --seed --path --deform --loop --events --set --json --quiet",
     "models list": "--json --quiet",
     "models pull": "--json --quiet",
     "models verify": "--json --quiet",
 }
-JSON_KEYS = ["input", "dataset", "frames", "tracked", "skipped", "camera", "estimators", "notes"]
-JSON_KEYS += ["warnings", "seconds", "versions", "machine", "surface", "out", "preset", "mesh_faces"]
+JSON_KEYS = ["input", "dataset", "frames", "tracked", "lost", "in_other_maps", "skipped", "camera", "scale"]
+JSON_KEYS += ["estimators", "notes", "warnings", "seconds", "versions", "machine", "surface"]
+JSON_KEYS += ["interrupted_at_frame", "resumed_after_frame", "input_content"]
+JSON_KEYS += ["out", "preset", "mesh_faces"]
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,8 @@ def test_run_writes_its_folder_and_says_what_it_found(scopemap: Say, folder: Pat
     assert "camera: calibration file camera.yaml" in said.out
     assert str(out) in said.out
     assert f"frame {FRAMES} of {FRAMES}" in said.err
+    assert str(out / "report.html") in said.out
+    assert "writing the report" in said.err
 
 
 def test_json_has_its_keys_and_nothing_else_is_printed(scopemap: Say, images: Path, tmp_path: Path) -> None:
@@ -347,7 +351,7 @@ def test_interruption_is_code_130(scopemap: Say, images: Path, tmp_path: Path, m
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scopemap.runner.reconstruct", interrupt)
+    monkeypatch.setattr("scopemap.runner.with_report.reconstruct", interrupt)
     said = scopemap("run", images, "--out", tmp_path / "out")
     assert said.code == 130
     assert "Traceback" not in said.err
@@ -357,7 +361,7 @@ def test_a_bug_keeps_its_traceback(images: Path, tmp_path: Path, monkeypatch: py
     def break_down(*_: object, **__: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("scopemap.runner.reconstruct", break_down)
+    monkeypatch.setattr("scopemap.runner.with_report.reconstruct", break_down)
     monkeypatch.setattr(sys, "argv", ["scopemap", "run", str(images), "--out", str(tmp_path / "out")])
     with pytest.raises(ZeroDivisionError, match="a bug"):
         main()

@@ -48,6 +48,16 @@ def test_runs_and_foreign_files_stand_side_by_side(places: tuple[Path, Path, Pat
     assert {"ate.png", "frames_until_loss.png"} <= figures
 
 
+def test_an_imported_trajectory_is_compared_and_left_out_of_the_page(
+    places: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    ours, theirs, truth = places
+    (ours / "provenance.json").write_text(json.dumps({"input": str(truth), "imported": str(theirs)}))
+    result = run("compare", ours, "--truth", truth, "--out", tmp_path / "out")
+    assert "0.309" in result.stdout
+    assert not (tmp_path / "out/report.html").exists()
+
+
 def test_names_alignment_and_json(places: tuple[Path, Path, Path]) -> None:
     ours, theirs, truth = places
     given = ("compare", ours, theirs, "--truth", truth, "--names", "A, B", "--align", "se3", "--json")
@@ -111,6 +121,7 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
     assert [row["method"] for row in consistency] == ["one", "two"]
     assert all(np.isfinite(float(row["TAE, true poses [%]"])) for row in consistency)
     assert "## Consistency in time" in (out / "results.md").read_text()
+    assert "<title>one, phantom, two, phantom" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_plans_that_come_along_are_listed() -> None:

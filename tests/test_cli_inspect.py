@@ -57,7 +57,7 @@ def test_json_is_all_that_is_printed(say: Say, video: Path, tmp_path: Path) -> N
     code, out, err = say(video, "--json", "--out", file, "--masks", masks)
     assert (code, err) == (0, "")
     told = json.loads(out)
-    assert list(told) == ["path", "facts", "findings", "field", "overlays", "insets", "picture"]
+    assert list(told) == ["path", "facts", "forecast", "findings", "field", "overlays", "insets", "picture"]
     assert (told["facts"]["pictures"], told["facts"]["width"], told["facts"]["field"]) == (36, 320, "full")
     codes = [finding["code"] for finding in told["findings"]]
     assert codes == ["overlay", "inset", "overlay-privacy"]
@@ -94,7 +94,8 @@ def test_nothing_is_replaced_unasked(say: Say, video: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "why"), [("picture.jpg", "must end in .png"), ("folder.png", "a folder"), ("file.png/a.png", "writing")]
+    ("name", "why"),
+    [("picture.jpg", "must end in .png"), ("folder.png", "a folder"), ("file.png/a.png", "file.png is a file")],
 )
 def test_a_picture_that_cannot_be_written(say: Say, video: Path, tmp_path: Path, name: str, why: str) -> None:
     (tmp_path / "folder.png").mkdir()

@@ -22,14 +22,14 @@ SOURCE = Path(scopemap.config.__file__).parents[1]
 ROOT = Path(__file__).resolve().parents[1]
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
-    "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner.py"],
+    "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner/*.py"],
     "mask": ["masking/*.py"],
     "depth": ["depth/*.py"],
     "mapis": ["depth/*.py", "pipeline.py"],
     "networks": ["estimators.py"],
     "tracking": ["tracking/*.py"],
     "smoothing": ["tracking/smoothing.py"],
-    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py", "runner.py"],
+    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py", "runner/*.py"],
     "fusion": ["fusion/*.py", "pipeline.py"],
 }
 
@@ -156,7 +156,13 @@ def test_an_unknown_preset_is_refused() -> None:
         Config.load("fast")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("content", [b"[odometry\nhuber=1", b"\xff\xfe\x00"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"[odometry\nhuber=1", b"\xff\xfe\x00", b"a = " + b"[" * 100_000, b"a = " + b"{a=" * 20_000),
+        *(b"[" + b"a." * 50_000 + b"b]\nx = 1", b"tracking.keyframe_every = " + b"9" * 5000),
+    ],
+)
 def test_an_unreadable_file_is_refused(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "broken.toml"
     file.write_bytes(content)

@@ -345,5 +345,5 @@ def test_an_empty_video_is_one_sentence(tmp_path: Path) -> None:
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_frames(tmp_path / "a")
     monkeypatch.setattr("scopemap.io.datasets.dicom.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'scopemap\[dicom\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[dicom\]'"):
         open_sequence(file)

@@ -177,7 +177,7 @@ def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_bag1(tmp_path / "a")
     monkeypatch.setattr("scopemap.io.datasets.rosbag.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'scopemap\[ros\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[ros\]'"):
         open_sequence(file)
 
 

@@ -196,3 +196,10 @@ def test_no_permission_is_a_sentence(downloaded: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(ScaredKeyframe, "recognises", staticmethod(refuse))
     with pytest.raises(InputError, match="no permission to look into it"):
         open_sequence(downloaded)
+
+
+def test_poses_that_grow_are_refused(keyframe: Path) -> None:
+    """Some kB of archive, 8 MB of lists in a list: 300 MB once it is parsed."""
+    replace_frame_data(keyframe, 4, lambda n, entry: entry | {"timestamp": [[]] * 2_000_000} if n == 1 else entry)
+    with pytest.raises(InputError, match=r"frame_data000001\.json: it holds \d+ MB, expected 1 MB at most"):
+        open_sequence(keyframe)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import struct
 import zlib
 from collections.abc import Callable
@@ -93,3 +94,14 @@ def test_the_limit_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SCOPEMAP_MAX_MEGAPIXELS", "many")
     with pytest.raises(InputError, match="must be a number, got 'many'"):
         decoded(encoded(".png", grey()))
+
+
+def test_a_chunk_that_claims_gigabytes_takes_no_memory() -> None:
+    """A PNG of 100 kB, of which a length is damaged."""
+    sound = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (200, 200, 3), np.uint8))[1].tobytes()
+    at = sound.index(b"IDAT")
+    damaged = sound[: at - 4] + b"\xf0" + sound[at - 3 :]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert decoded(damaged) is None
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000, "kB of memory"
+    assert decoded(sound) is not None

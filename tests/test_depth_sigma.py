@@ -289,11 +289,11 @@ def test_sigma_flows_to_every_stage_of_a_run(tmp_path: Any, monkeypatch: pytest.
     config = Config.load(settings={"depth.backend": "shading", **light})
     for name, left in {"none": None, "equal": 0.1, "doubted": 1.0}.items():
 
-        def telling(config: Config, sequence: Any, left: float | None = left) -> Estimators:
+        def telling(config: Config, sequence: Any, own: Any, left: float | None = left) -> Estimators:
             parts = create(config, sequence)
             return parts if left is None else replace(parts, depth=_Telling(parts.depth, left))
 
-        monkeypatch.setattr("scopemap.runner.create_estimators", telling)
+        monkeypatch.setattr("scopemap.runner.preparation.create_estimators", telling)
         steps: list[Step] = []
         runs[name] = reconstruct(open_sequence(folder), config, observers=(steps.append,)), steps[-1]
     result, step = runs["doubted"]

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 import typer.main
+import yaml
 
+import scopemap
 from scopemap import __version__
 from scopemap.cli import app
 from scopemap.config import PRESETS, setting_names
@@ -17,37 +19,46 @@ from scopemap.io.weights import REGISTRY
 from scopemap.reconstruction import _COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 GROUPS = {name.split(".")[0] for name in setting_names() if "." in name}
 
 
 def _text(name: str) -> str:
-    return (ROOT / name).read_text()
+    return (ROOT / name).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_links_lead_somewhere(document: Path) -> None:
-    targets = re.findall(r"\]\(([^)#]+)\)", document.read_text())
+    targets = re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8"))
     missing = [t for t in targets if not t.startswith("http") and not (document.parent / t).exists()]
     assert missing == []
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_settings_that_are_named_exist(document: Path) -> None:
-    named = re.findall(rf"(?<![\w/.])((?:{'|'.join(sorted(GROUPS))})(?:\.[a-z_]+)+)(?![\w(/])", document.read_text())
+    named = re.findall(
+        rf"(?<![\w/.])((?:{'|'.join(sorted(GROUPS))})(?:\.[a-z_]+)+)(?![\w(/])", document.read_text(encoding="utf-8")
+    )
     files = {f"{group}.{ending}" for group in GROUPS for ending in ("py", "json", "png", "toml")}
     assert set(named) - files <= set(setting_names())
 
 
-def test_the_readme_names_options_and_commands_that_exist() -> None:
+def test_the_readme_names_every_command() -> None:
     command = typer.main.get_command(app)
-    known = {option for sub in command.commands.values() for param in sub.params for option in param.opts}  # type: ignore[attr-defined]
-    lines = [line for line in _text("README.md").splitlines() if "scopemap " in line or line.startswith("|")]
-    used = {option for line in lines for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", line)}
-    assert "--out" in used
-    assert used <= known
     named = set(re.findall(r"(?:`|^ {4}|&& )scopemap ([a-z]+)", _text("README.md"), flags=re.MULTILINE))
     assert named == set(command.commands)  # type: ignore[attr-defined]
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    navigation = _text("mkdocs.yml").split("\nnav:")[1]
+    assert sorted(re.findall(r"[\w./-]+\.md", navigation)) == sorted(pages)
+
+
+def test_the_page_of_the_interface_has_every_public_name() -> None:
+    shown = re.findall(r"^::: scopemap\.([\w.]+)\.(\w+)$", _text("docs/api.md"), flags=re.MULTILINE)
+    assert {name: home for home, name in shown} == scopemap._HOMES
+    assert set(scopemap.__all__) == set(scopemap._HOMES) | {"__version__"}
 
 
 def test_the_readme_names_every_preset_and_all_weights() -> None:
@@ -104,3 +115,59 @@ def test_constraints_fit_the_requirements() -> None:
         name, _, exact = requirement.partition("==")
         assert not exact or canonical[name] == exact
     assert "://" not in _text("constraints.txt")
+
+
+def test_the_container_is_what_the_readme_says() -> None:
+    lines = _text("Containerfile").splitlines()
+    copied, climb = (
+        [source for line in _text(file).splitlines() if line.startswith("COPY ") for source in line.split()[1:-1]]
+        for file in ("Containerfile", "containers/climb/Containerfile")
+    )
+    assert {"constraints.txt", "pyproject.toml", "src"} <= set(copied)
+    assert [source for source in copied if not (ROOT / source).exists()] == []
+    kept = {line.removeprefix("!") for line in _text(".dockerignore").splitlines() if line.startswith("!")}
+    assert {source.split("/")[0] for source in [*copied, *climb]} == kept
+    first = next(line.strip() for line in _text("README.md").splitlines() if line.startswith("    pip install"))
+    assert f"RUN {first.partition(' && ')[0]}" in lines
+    user = next(line for line in lines if line.startswith("USER "))
+    assert user.split()[1].split(":")[0] not in ("0", "root")
+    assert lines.index(user) > max(number for number, line in enumerate(lines) if line.startswith("RUN "))
+
+
+def test_workflows_name_files_that_exist_and_store_no_secret() -> None:
+    for file in (ROOT / ".github/workflows").glob("*.yml"):
+        text = file.read_text(encoding="utf-8")
+        assert {"on", "jobs", "permissions"} <= {"on" if key is True else key for key in yaml.safe_load(text)}
+        assert "secrets." not in text
+        assert [name for name in re.findall(r"tests/\w+\.py|\.ci/\w+", text) if not (ROOT / name).exists()] == []
+
+
+def test_the_citation_is_complete() -> None:
+    citation = yaml.safe_load(_text("CITATION.cff"))
+    assert {"cff-version", "message", "title", "authors", "version", "license"} <= set(citation)
+    assert citation["license"] == tomllib.loads(_text("pyproject.toml"))["project"]["license"]
+
+
+def test_every_extra_is_documented() -> None:
+    table = _text("docs/install.md").split("## Where things")[0]
+    rows = re.findall(r"^\| ((?:`[a-z]+`(?:, )?)+) \|", table, flags=re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([a-z]+)`", row)}
+    assert named == set(tomllib.loads(_text("pyproject.toml"))["project"]["optional-dependencies"])
+
+
+@pytest.mark.parametrize("name", ["how-it-works", "method", "extend"])
+def test_source_files_that_are_named_exist(name: str) -> None:
+    named = re.findall(r"`((?:[\w-]+/)*[\w-]+\.py)`", _text(f"docs/{name}.md"))
+    assert named
+    places = (ROOT, ROOT / "src/scopemap", ROOT / "src/scopemap/depth/scopenet", ROOT / "training")
+    assert [one for one in named if "NAME" not in one and not any((place / one).exists() for place in places)] == []
+
+
+def test_a_wheel_holds_every_file_of_the_package() -> None:
+    patterns = tomllib.loads(_text("pyproject.toml"))["tool"]["setuptools"]["package-data"]["scopemap"]
+    package = ROOT / "src/scopemap"
+    files = [path.relative_to(package) for path in package.rglob("*") if path.is_file() and path.suffix != ".py"]
+    files = [path for path in files if "__pycache__" not in path.parts]
+    assert files
+    assert [str(path) for path in files if not any(path.match(pattern) for pattern in patterns)] == []
+    assert [str(path.parent) for path in package.rglob("*.py") if not (path.parent / "__init__.py").is_file()] == []

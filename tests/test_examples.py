@@ -8,7 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 from tiny_phantom import write_tiny
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -49,3 +51,17 @@ def test_examples_with_arguments(tmp_path: Path) -> None:
     assert "9 of 9 frames tracked" in _run("02_evaluate.py", run, phantom, weights=tmp_path / "none")
     # A run's own depth folder is depth from files, too.
     assert "9 files" in _run("03_depth_from_files.py", phantom, run / "depth", weights=tmp_path / "none")
+
+
+def test_the_notebook_runs_and_is_kept_without_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    notebook = nbformat.read(EXAMPLES / "first_run.ipynb", as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in cells)
+    NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output for cell in cells for output in cell.outputs]
+    assert any("data:image/jpeg;base64," in output.get("data", {}).get("text/html", "") for output in shown)
+    said = "".join(output.get("text", "") for output in shown)
+    assert re.search(r"24 of 24 frames, path \d+\.\d", said)
+    assert re.search(r"position error 0\.\d+ mm after Sim\(3\)", said)
+    assert re.search(r"[1-9]\d* vertices, [1-9]\d* faces", said)

@@ -26,9 +26,10 @@ from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import so3_exp
+from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.runner import reconstruct
+from scopemap.runner.run import reconstruct
 
 HALF_PX = 160.0
 ROTATION_DEG, TRANSLATION = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)
@@ -194,8 +195,22 @@ def test_the_focal_length_is_estimated_from_images_of_a_rotating_camera(turning:
     assert estimate.share < 0.06
     assert estimate.focal_px == pytest.approx(focal_of(100.0), rel=2 * estimate.share)
     window = next(windows_of(sequence, Config()))
-    assert window.seen.shape == (len(window.start), 10, 2)
+    assert window.seen.shape == (len(window.start), 6, 2)
     assert window.half_width_px == SIZE[0] / 2
+
+
+def test_frames_that_the_estimate_leaves_out_are_not_skipped_in_the_run(turning: Path) -> None:
+    sequence = dataclasses.replace(open_sequence(turning), choice=FrameChoice(skip_repeated=True, fps=5.0))
+    focal_from_motion(sequence, Config())
+    assert not sequence.skipped
+    list(sequence.frames())
+    assert sequence.skipped
+
+
+def test_no_estimate_from_a_source_that_ends_early(turning: Path) -> None:
+    sequence = open_sequence(turning)
+    sequence.source.frames = lambda selection: iter([])  # type: ignore[method-assign]
+    assert "0 windows" in focal_from_motion(sequence, Config()).reason
 
 
 def test_a_large_working_size_is_reduced(tmp_path: Path) -> None:
@@ -245,8 +260,11 @@ def test_a_camera_at_rest_stays_as_assumed(still: Sequence, focal: str) -> None:
     result = reconstruct(still, config)
     assert result.camera == still.camera
     assert result.provenance["camera"]["focal_sigma_px"] is None
-    notes = [note for note in result.provenance["notes"] if note.startswith("focal length: assumed")]
-    assert len(notes) == (focal == "auto")
+    camera, notes = result.provenance["camera"]["source"], result.provenance["notes"]
+    assert camera.startswith("assumed: horizontal field of view 70 deg")
+    assert ("the motion does not determine it" in camera) == (focal == "auto")
+    assert "--fov" not in camera  # it was not given
+    assert not any("focal" in note or "field of view" in note for note in notes)
     assert ("focal length" in result.provenance["seconds"]) == (focal == "auto")
 
 
@@ -264,8 +282,8 @@ ESTIMATES = {
     [
         ("clear", "auto", True, "fx 84 +- 3 px, horizontal field of view 100 deg"),
         ("bent", "auto", True, "radial distortion, about 30%"),
-        ("wide", "auto", False, "the estimate is uncertain: fx 84 +- 17 px"),
-        ("agrees", "auto", False, "consistent with the estimate: fx 140 +- 7 px"),
+        ("wide", "auto", False, "uncertain: fx 84 +- 17 px"),
+        ("agrees", "auto", False, "consistent with the estimate from the motion: fx 140 +- 7 px"),
         ("none", "auto", False, "0 windows"),
         ("clear", "flow", True, "fx 84 +- 3 px"),
         ("wide", "flow", True, "fx 84 +- 17 px"),
@@ -283,7 +301,8 @@ def test_which_estimate_is_taken(
         assert found.camera.fx == pytest.approx(estimate.focal_px)
         assert found.focal_sigma_px == pytest.approx(estimate.sigma_px)
     else:
-        assert found is still
+        assert found.camera is still.camera
+        assert found.focal_sigma_px is None
 
 
 def test_no_estimate_is_an_error_if_it_is_required(still: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,8 +360,8 @@ def test_real_clips_are_right_or_silent(real_data: Path, folder: str) -> None:
         pytest.skip(f"{folder} not found")
     sequence = open_sequence(real_data / folder, frames=slice(0, 120))
     unknown = _pretend_unknown(sequence)
-    found, notes = with_focal_from_motion(unknown, Config())
-    assert found is not unknown or any("focal length: assumed" in note for note in notes)
-    if found is not unknown:
+    found, _ = with_focal_from_motion(unknown, Config())
+    assert (found.camera is unknown.camera) == ("; " in found.camera_source)
+    if found.camera is not unknown.camera:
         assert found.focal_sigma_px is not None
         assert abs(math.log(found.camera.fx / sequence.camera.fx)) < 2 * found.focal_sigma_px / found.camera.fx

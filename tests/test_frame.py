@@ -10,7 +10,7 @@ import pytest
 from scopemap import errors
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError, check_shape
-from scopemap.frame import Frame, Truth
+from scopemap.frame import Frame, Truth, percentiles
 
 CAMERA = PinholeCamera(50.0, 50.0, 19.5, 14.5, 40, 30)
 
@@ -98,3 +98,10 @@ def test_every_kind_of_error_is_a_scopemap_error() -> None:
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, Exception)]
     assert len(kinds) >= 6
     assert all(issubclass(kind, ScopemapError) for kind in kinds)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 100, 1001])
+def test_percentiles_of_levels_are_those_of_numpy(count: int) -> None:
+    levels = np.random.default_rng(count).integers(0, 40, (1, count)).astype(np.uint8)
+    shares = [0.0, 0.5, 50.0, 99.5, 100.0]
+    np.testing.assert_allclose(percentiles(levels, shares), np.percentile(levels, shares), atol=1e-9)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.errors import InputError
+from scopemap.trajectory.formats import splatam
 from scopemap.trajectory.formats.opening import read_trajectory
 
 HELD_OUT = [frame for frame in range(100) if frame % 8 != 7]
@@ -125,6 +126,16 @@ def test_other_and_damaged_npz_files_are_refused(tmp_path: Path) -> None:
     for name in ("text.npz", "one.npy"):
         with pytest.raises(InputError, match="expected the arrays cam_unnorm_rots"):
             read_trajectory(tmp_path / name, kind="splatam")
+
+
+def test_poses_that_grow_are_refused_and_gaussians_stay_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(splatam, "_MOST_BYTES", 1 << 20)
+    arrays = splatam_arrays(moving_camera())
+    np.savez_compressed(tmp_path / "params.npz", **(arrays | {"means3D": np.zeros((200_000, 3))}))
+    assert len(read_trajectory(tmp_path / "params.npz", kind="splatam")) == 20
+    np.savez_compressed(tmp_path / "params.npz", **(arrays | {"cam_trans": np.zeros((1, 3, 200_000))}))
+    with pytest.raises(InputError, match=r"cam_trans\.npy: it holds 4 MB, expected 1 MB at most"):
+        read_trajectory(tmp_path / "params.npz", kind="splatam")
 
 
 @given(count=st.integers(2, 60), factors=st.lists(st.floats(0.01, 100), min_size=60, max_size=60), data=st.data())

@@ -25,6 +25,7 @@ import pytest
 from drawn_datasets import WRITERS
 from drawn_inputs import picture, save, write_c3vd
 from drawn_scared import json_files, point_files
+from drawn_trajectories import write_trajectories
 from front_door import refused
 from test_datasets_endomapper import XML, archive_of, images_bin, write_endomapper
 from test_datasets_endoslam import write_real
@@ -33,6 +34,7 @@ from scopemap.errors import InputError, ScopemapError
 from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
+from scopemap.trajectory.formats.opening import read_trajectory
 
 Capture = pytest.CaptureFixture[str]
 
@@ -157,6 +159,26 @@ def test_pipes_in_the_place_of_files_end_reading_at_once(name: str, tmp_path: Pa
         file.unlink()
         file.write_bytes(content)
     read_all(entry)
+
+
+@needs_pipes
+@pytest.mark.parametrize("name", ["run/frames.csv", "run/trajectory.tum", "splatam/config.py", "kitti.txt"])
+def test_pipes_in_the_place_of_trajectories_end_reading_at_once(name: str, tmp_path: Path, at_once: None) -> None:
+    write_trajectories(tmp_path / "poses")
+    file = tmp_path / "poses" / name
+    file.unlink()
+    os.mkfifo(file)
+    for path in (file, file.parent):
+        with pytest.raises(ScopemapError):
+            read_trajectory(path)
+
+
+@needs_pipes
+@pytest.mark.parametrize("name", ["poses.txt", "frame_data.tar.gz", "params.npz"])
+def test_a_pipe_is_no_trajectory(name: str, tmp_path: Path, at_once: None) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match="is no file"):
+        read_trajectory(tmp_path / name)
 
 
 # ---- files that grow while they are read

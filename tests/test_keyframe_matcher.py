@@ -79,6 +79,48 @@ def test_flow_begins_at_that_of_the_frame_before_unless_this_matched_few_corners
     assert [start is not None for start in flow.starts] == [False, True, False, False]
 
 
+class _InHalf(DisFlow):
+    """DIS flow that is searched in images of half the size; `blind` there: it finds nothing."""
+
+    enough_px = 120
+
+    def __init__(self, *, blind: bool) -> None:
+        super().__init__()
+        self.widths: list[int] = []
+        self._blind = blind
+
+    def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
+        self.widths.append(rgb_from.shape[1])
+        forth, back = super().estimate_checked(rgb_from, rgb_to, start)
+        return (forth, back + 9) if self._blind and rgb_from.shape[1] == 120 else (forth, back)
+
+
+def test_flow_between_small_images_is_enough_for_as_exact_corners() -> None:
+    T, errors_px = inverse(THERE) @ HERE, []
+    for flow in (DisFlow(), _InHalf(blind=False)):
+        matcher = KeyframeMatcher(flow)
+        matcher.set_keyframe(_frame(0, HERE))
+        for index in (1, 2):
+            found = matcher.match(_frame(index, THERE))
+        assert found is not None
+        assert found.coverage > 0.8
+        errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
+        errors_px.append(np.median(np.linalg.norm(errors, axis=1)))
+    assert flow.widths == [120, 120]
+    assert errors_px[1] <= errors_px[0]
+
+
+def test_where_flow_between_small_images_fails_the_whole_ones_are_used() -> None:
+    matcher, flow = KeyframeMatcher(blind := _InHalf(blind=True)), KeyframeMatcher(DisFlow())
+    for each in (matcher, flow):
+        each.set_keyframe(_frame(0, HERE))
+    found, wanted = matcher.match(_frame(1, THERE)), flow.match(_frame(1, THERE))
+    assert blind.widths == [120, 240]
+    assert found is not None
+    assert wanted is not None
+    assert found.coverage == pytest.approx(wanted.coverage, abs=0.05)
+
+
 class _Shifted(DisFlow):
     """DIS flow with a bias along x, px, that both directions share, so that they stay consistent."""
 

@@ -71,6 +71,18 @@ def test_a_camera_that_never_returns_closes_no_loop() -> None:
         assert not [loop for loop in finder.add(frame) if loop.past == 0]
 
 
+def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.mapping.loop_closure.MOST_SEARCHED", 6)
+    finder, kept, loops = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,)))), [], []
+    for number, x_mm in enumerate([*np.linspace(-60.0, 60.0, 17), -60.0]):
+        view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
+        frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
+        loops = finder.add(frame)
+        kept.append(len(finder._features))
+    assert max(kept) == 6
+    assert [(loop.past, loop.new) for loop in loops if loop.past == 0] == [(0, 17)]
+
+
 def test_the_pose_graph_removes_drift_of_poses_and_scale() -> None:
     # The depth of keyframe k is too large by exp(0.02 k), and so is every translation tracked from it.
     scale = np.exp(0.02 * np.arange(COUNT))
@@ -179,7 +191,7 @@ def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: py
         found = adjust(problem)
         return found if problem.start is None else replace(found, state=found.state._replace(sigma_px=9.9))
 
-    monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
+    monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
     correction = backend.adjust()
     assert [start is None for start in starts] == [False, True]
     assert not correction.refused

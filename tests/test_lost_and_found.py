@@ -145,6 +145,21 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
     assert way_mm < 0.3
 
 
+def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_found() -> None:
+    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    there = [_elsewhere(8 + n, n % 9) for n in range(12)]
+    back = [_frame(20 + n, T) for n, T in enumerate(NEAR[:4])]
+    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 0, "search_every": 3}))
+    searched = ["not searched" not in track.reason for track in tracks[8:20]]
+    # The first five, and every third after these.
+    assert searched == [True] * 6 + [True, False, False] * 2
+    first = next(track for track in tracks[20:] if track.status == "ok")
+    assert first.index <= 22
+    turn, way_mm = _off(first, NEAR[first.index - 20])
+    assert turn < np.radians(0.4)
+    assert way_mm < 0.3
+
+
 @pytest.mark.parametrize("unseen", ["dark", "smoked"])
 def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]

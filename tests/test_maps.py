@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -68,12 +69,16 @@ def result(spliced: Path, out: Path) -> Reconstruction:
     return reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT), out=out)
 
 
-def test_the_largest_submap_is_the_result_and_other_frames_are_lost(result: Reconstruction) -> None:
-    lost = FIRST + LOST_BEFORE_NEW
-    assert [r.track.status for r in result.records] == ["lost"] * lost + ["initial"] + ["ok"] * (
-        SECOND - LOST_BEFORE_NEW - 1
-    )
-    assert result.records[0].track.reason == "tracked in another submap"
+def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_maps(result: Reconstruction) -> None:
+    rest = SECOND - LOST_BEFORE_NEW
+    other = ["other-map"] * FIRST + ["lost"] * LOST_BEFORE_NEW
+    assert [r.track.status for r in result.records] == [*other, "initial", *["ok"] * (rest - 1)]
+    assert [r.map for r in result.records] == [1] * FIRST + [None] * LOST_BEFORE_NEW + [0] * rest
+    assert [record.index for record in result.lost] == list(range(FIRST, FIRST + LOST_BEFORE_NEW))
+    counts = {name: result.provenance[name] for name in ("frames", "tracked", "lost", "in_other_maps")}
+    expected = {"frames": FIRST + SECOND, "tracked": rest, "lost": LOST_BEFORE_NEW, "in_other_maps": FIRST}
+    assert counts == expected
+    assert result.records[0].track.reason == "tracked in maps/1"
     assert "keyframe" in result.records[FIRST].track.reason
     note = next(text for text in result.provenance["warnings"] if "submaps" in text)
     assert note.startswith("2 submaps")
@@ -83,7 +88,8 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost(result: Reco
 def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
     begin = FIRST + LOST_BEFORE_NEW
     poses = result.trajectory.T_world_camera
-    np.testing.assert_array_equal(poses[: begin + 1], np.broadcast_to(np.eye(4), (begin + 1, 4, 4)))
+    assert np.isnan(poses[:begin]).all()
+    np.testing.assert_array_equal(poses[begin], np.eye(4))
     off = inverse(poses[begin:]) @ true_poses(spliced, begin)[begin:]
     assert rotation_angle_rad(off[:, :3, :3]).max() < np.radians(0.5)
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.5
@@ -98,17 +104,22 @@ def test_only_the_kept_map_is_fused(result: Reconstruction, spliced: Path) -> No
 
 def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
     (other,) = result.others
-    lost = [record.track.status == "lost" for record in other.records]
-    assert lost == [False] * FIRST + [True] * SECOND
-    off = inverse(other.trajectory.T_world_camera[:FIRST]) @ true_poses(spliced)[:FIRST]
+    assert [record.index for record in other.records] == list(range(FIRST))
+    assert {record.map for record in other.records} == {1}
+    off = inverse(other.trajectory.T_world_camera) @ true_poses(spliced)[:FIRST]
     assert rotation_angle_rad(off[:, :3, :3]).max() < np.radians(0.5)
     assert other.provenance["tracked"] == FIRST
     scene = spliced.parent / "0"
     alone = reconstruct(open_sequence(scene), with_true_depth(scene, **LIGHT))
     np.testing.assert_allclose(other.mesh.bounds, alone.mesh.bounds, atol=1e-3)
-    assert read_trajectory(out / "maps" / "1").tracked.tolist() == [not missing for missing in lost]
-    written = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
-    np.testing.assert_allclose(written.bounds, other.mesh.bounds, atol=1e-3)
+    written = read_trajectory(out / "maps" / "1")
+    assert written.indices.tolist() == list(range(FIRST))
+    assert written.tracked.all()
+    assert read_trajectory(out).tracked.tolist() == [record.map == 0 for record in result.records]
+    with (out / "frames.csv").open(newline="") as file:
+        assert [row["map"] for row in csv.DictReader(file)][:FIRST] == ["1"] * FIRST
+    mesh = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
+    np.testing.assert_allclose(mesh.bounds, other.mesh.bounds, atol=1e-3)
 
 
 def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: Path) -> None:
@@ -122,16 +133,19 @@ def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: P
 def test_small_submaps_are_left_out(spliced: Path) -> None:
     some = open_sequence(spliced, frames=slice(1, None))
     result = reconstruct(some, with_true_depth(spliced, **LIGHT, fusion__enabled=False))
-    assert len(result.records) - len(result.lost) == SECOND - LOST_BEFORE_NEW
+    assert result.provenance["tracked"] == SECOND - LOST_BEFORE_NEW
+    assert result.provenance["in_other_maps"] == FIRST - 1
+    assert result.records[0].track.reason == "tracked in a submap too small to be saved"
     assert result.others == []
 
 
-def test_where_frames_are_fused_as_they_come_there_is_one_map(spliced: Path) -> None:
+def test_frames_that_are_fused_as_they_come_are_fused_by_map(spliced: Path, result: Reconstruction) -> None:
     at_once = {"mapping__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
-    result = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
-    assert [r.track.status for r in result.records] == ["initial"] + ["ok"] * (FIRST - 1) + ["lost"] * SECOND
-    assert {record.track.map for record in result.records} == {0}
-    assert len(result.mesh.faces) > 0
+    live = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
+    assert [r.track.status for r in live.records] == [r.track.status for r in result.records]
+    for part, stored in zip([live, *live.others], [result, *result.others], strict=True):
+        np.testing.assert_allclose(part.mesh.bounds, stored.mesh.bounds, atol=6.0)  # of other voxels
+        assert part.provenance["surface"]["coverage_mean"] > 0.5
 
 
 def _keyframe(
@@ -293,7 +307,7 @@ def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.Mon
         found = adjust(problem)
         return replace(found, state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
 
-    monkeypatch.setattr("scopemap.mapping.backend.adjust", failing)
+    monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
     correction = backend.adjust()
     assert not correction.refused
     np.testing.assert_array_equal(correction.index, [0, 20, 40, 60, 80])

@@ -170,3 +170,30 @@ def test_any_damage_ends_in_one_kind_of_error(tmp_path: Path) -> None:
         except InputError:
             refused += 1
     assert 10 < refused < 100
+
+
+# ---- headers without limit
+
+
+def test_a_long_name_that_grows_is_refused(tmp_path: Path) -> None:
+    """200 kB of archive that would become a name of 200 MB."""
+    member = tarfile.TarInfo("././@LongLink")
+    member.type, member.size = tarfile.GNUTYPE_LONGNAME, 200 * MB
+    with gzip.open(tmp_path / "points.tar.gz", "wb") as file:
+        file.write(member.tobuf())
+        for _ in range(200):
+            file.write(bytes(MB))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"points\.tar\.gz.*a header claims 209715200 bytes"):
+        find(tmp_path).numbers()
+    assert tracemalloc.get_traced_memory()[1] < 20 * MB
+    tracemalloc.stop()
+
+
+def test_an_archive_of_empty_members_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numbered, "_MOST_MEMBERS", 50)
+    write_tar(tmp_path / "points.tar.gz", members(50, 0))
+    assert find(tmp_path).numbers() == list(range(50))
+    write_tar(tmp_path / "points.tar.gz", members(51, 0))
+    with pytest.raises(InputError, match="more than 50 members"):
+        find(tmp_path).numbers()

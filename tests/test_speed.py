@@ -38,7 +38,7 @@ def test_every_frame_of_a_run_is_measured_stage_by_stage(measured: Speed) -> Non
     assert always | {"MAPIS", "store", "fusion", "writing", "back end"} <= measured.stages.keys()
     assert sum(stage.share for stage in measured.stages.values()) == pytest.approx(1)
     assert measured.stages["depth network"].thread == "preprocess"
-    assert measured.stages["tracking"].thread == "main"
+    assert measured.stages["tracking"].thread == "track"
     for stage in measured.stages.values():
         assert stage.ratio == pytest.approx(stage.ms / measured.calibration_ms)
     assert measured.cpu_ms > measured.stages["tracking"].ms

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from evo.tools import file_interface
 from sample_trajectories import write_c3vd, write_run
 
 from scopemap.errors import InputError
@@ -20,12 +22,13 @@ def trajectory() -> Trajectory:
     twists = np.hstack([rng.normal(size=(6, 3)), rng.normal(scale=80, size=(6, 3))])
     status = np.array(["initial", "ok", "lost", "lost", "ok", "ok"])
     poses = np.stack([se3_exp(twist) for twist in twists])
+    poses[2:4] = np.nan
     return Trajectory(np.array([0, 2, 4, 6, 8, 11]), np.array([0, 2, 4, 6, 8, 11]) / 25, poses, status)
 
 
 def test_properties(trajectory: Trajectory) -> None:
     assert trajectory.tracked.tolist() == [True, True, False, False, True, True]
-    steps = np.diff(trajectory.T_world_camera[:, :3, 3], axis=0)
+    steps = np.diff(trajectory.T_world_camera[[0, 1, 4, 5], :3, 3], axis=0)
     assert trajectory.path_length_mm == pytest.approx(sum(np.sqrt(step @ step) for step in steps))
     assert trajectory.rows(trajectory.tracked).indices.tolist() == [0, 2, 8, 11]
 
@@ -51,17 +54,40 @@ def test_run_folder_whose_files_do_not_fit_is_refused(tmp_path: Path, trajectory
         read_trajectory(tmp_path)
 
 
+def test_tum_holds_tracked_frames_alone_and_says_what_its_poses_are(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_tum(tmp_path / "a.tum", trajectory, comment="scale unknown")
+    lines = (tmp_path / "a.tum").read_text().splitlines()
+    head = " ".join(line for line in lines if line.startswith("#"))
+    for words in ("4 tracked frames of 6", "camera-to-world", "OpenCV", "unit: mm", "time: s", "scale unknown"):
+        assert words in head
+    stamps = [float(line.split()[0]) for line in lines if not line.startswith("#")]
+    np.testing.assert_allclose(stamps, np.array([0, 2, 8, 11]) / 25, atol=1e-6)
+    poses = file_interface.read_tum_trajectory_file(tmp_path / "a.tum")
+    np.testing.assert_allclose(poses.poses_se3, trajectory.T_world_camera[[0, 1, 4, 5]], atol=1e-7)
+
+
+def test_runs_of_earlier_versions_with_a_line_per_lost_frame_are_read(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_run(tmp_path, trajectory)
+    held = trajectory.T_world_camera[[0, 1, 1, 1, 4, 5]]
+    every = replace(trajectory, T_world_camera=held, status=np.array(["initial"] + ["ok"] * 5))
+    write_tum(tmp_path / "trajectory.tum", every)
+    found = read_trajectory(tmp_path)
+    np.testing.assert_array_equal(found.tracked, trajectory.tracked)
+    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-7)
+
+
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_tum_says_its_unit_and_its_times(tmp_path: Path, trajectory: Trajectory, unit: str) -> None:
     write_tum(tmp_path / "a.tum", trajectory, unit=unit)
     numbers = np.loadtxt(tmp_path / "a.tum")
-    assert numbers.shape == (6, 8)
+    assert numbers.shape == (4, 8)
     assert np.all(numbers[:, 7] >= 0)
-    np.testing.assert_allclose(numbers[:, 1:4] * {"mm": 1, "m": 1000}[unit], trajectory.positions_mm, atol=1e-5)
+    tracked = trajectory.rows(trajectory.tracked)
+    np.testing.assert_allclose(numbers[:, 1:4] * {"mm": 1, "m": 1000}[unit], tracked.positions_mm, atol=1e-5)
     # The header wins over what the caller assumes.
     found = read_trajectory(tmp_path / "a.tum", unit="m" if unit == "mm" else "mm")
-    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-5)
-    np.testing.assert_allclose(found.times_s, trajectory.times_s, atol=1e-6)
+    np.testing.assert_allclose(found.T_world_camera, tracked.T_world_camera, atol=1e-5)
+    np.testing.assert_allclose(found.times_s, tracked.times_s, atol=1e-6)
     assert not found.has_indices
 
 
@@ -69,11 +95,12 @@ def test_our_tum_with_whole_seconds_is_not_taken_for_frame_numbers(tmp_path: Pat
     whole = Trajectory(trajectory.indices, np.arange(6.0), trajectory.T_world_camera, trajectory.status)
     write_tum(tmp_path / "a.tum", whole)
     assert not read_trajectory(tmp_path / "a.tum").has_indices
-    body = "\n".join((tmp_path / "a.tum").read_text().splitlines()[2:])
+    lines = (tmp_path / "a.tum").read_text().splitlines()
+    body = "\n".join(line for line in lines if not line.startswith("#"))
     (tmp_path / "foreign.tum").write_text(body)
     foreign = read_trajectory(tmp_path / "foreign.tum")
     assert foreign.has_indices
-    assert foreign.indices.tolist() == [0, 1, 2, 3, 4, 5]
+    assert foreign.indices.tolist() == [0, 1, 4, 5]
 
 
 def test_foreign_tum_is_sorted_and_scaled(tmp_path: Path) -> None:
@@ -86,15 +113,16 @@ def test_foreign_tum_is_sorted_and_scaled(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_kitti_round_trip(tmp_path: Path, trajectory: Trajectory, unit: str) -> None:
-    write_kitti(tmp_path / "a.txt", trajectory, unit=unit)
+    tracked = trajectory.rows(trajectory.tracked)
+    write_kitti(tmp_path / "a.txt", tracked, unit=unit)
     found = read_trajectory(tmp_path / "a.txt", unit=unit)
-    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera, atol=1e-8)
-    assert found.indices.tolist() == list(range(6))
-    np.testing.assert_allclose(found.times_s, np.arange(6) / 30)
+    np.testing.assert_allclose(found.T_world_camera, tracked.T_world_camera, atol=1e-8)
+    assert found.indices.tolist() == list(range(4))
+    np.testing.assert_allclose(found.times_s, np.arange(4) / 30)
 
 
 def test_c3vd_in_both_forms_and_with_a_pose_at_the_origin(tmp_path: Path, trajectory: Trajectory) -> None:
-    poses = trajectory.T_world_camera.copy()
+    poses = trajectory.T_world_camera[trajectory.tracked]
     poses[0, :3, 3] = 0  # ambiguous alone: the form is decided over the whole file
     stored, row_major = tmp_path / "pose.txt", tmp_path / "row_major.txt"
     write_c3vd(tmp_path, poses, digits=6)
@@ -104,25 +132,27 @@ def test_c3vd_in_both_forms_and_with_a_pose_at_the_origin(tmp_path: Path, trajec
         np.testing.assert_allclose(found.T_world_camera, poses, atol=2e-3)
         # Six digits in the file, exact rotations inside.
         R = found.T_world_camera[:, :3, :3]
-        np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.stack([np.eye(3)] * 6), atol=1e-12)
+        np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.stack([np.eye(3)] * 4), atol=1e-12)
 
 
 def test_seven_scenes_is_metres_and_numbered_by_file(tmp_path: Path, trajectory: Trajectory) -> None:
-    for number, T in zip((3, 10, 100), trajectory.T_world_camera, strict=False):
+    poses = trajectory.T_world_camera[[0, 1, 4]]
+    for number, T in zip((3, 10, 100), poses, strict=True):
         metres = T.copy()
         metres[:3, 3] /= 1000
         np.savetxt(tmp_path / f"frame-{number:06d}.pose.txt", metres)
     found = read_trajectory(tmp_path)
     assert found.indices.tolist() == [3, 10, 100]
-    np.testing.assert_allclose(found.T_world_camera, trajectory.T_world_camera[:3], atol=1e-9)
+    np.testing.assert_allclose(found.T_world_camera, poses, atol=1e-9)
 
 
 def test_what_was_assumed_is_said(tmp_path: Path, trajectory: Trajectory) -> None:
-    poses = trajectory.T_world_camera
+    tracked = trajectory.rows(trajectory.tracked)
+    poses = tracked.T_world_camera
     write_run(tmp_path / "run", trajectory)
     write_c3vd(tmp_path / "c3vd", poses)
     write_tum(tmp_path / "ours.tum", trajectory)
-    write_kitti(tmp_path / "kitti.txt", trajectory)
+    write_kitti(tmp_path / "kitti.txt", tracked)
     (tmp_path / "numbered.tum").write_text("3 0 0 0 0 0 0 1\n5 0 0 0 0 0 0 1\n")
     (tmp_path / "row_major.txt").write_text("".join(" ".join(map(repr, T.ravel().tolist())) + "\n" for T in poses))
     (tmp_path / "7scenes").mkdir()
@@ -163,10 +193,8 @@ def test_a_named_kind_must_fit(tmp_path: Path, kind: str, wanted: int) -> None:
 
 
 def test_evo_reads_the_same_from_tum_and_kitti(tmp_path: Path, trajectory: Trajectory) -> None:
-    from evo.tools import file_interface
-
     write_tum(tmp_path / "a.tum", trajectory)
-    write_kitti(tmp_path / "a.txt", trajectory)
+    write_kitti(tmp_path / "a.txt", trajectory.rows(trajectory.tracked))
     theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "a.tum"))
     np.testing.assert_allclose(read_trajectory(tmp_path / "a.tum").T_world_camera, theirs.poses_se3, atol=1e-6)
     theirs = file_interface.read_kitti_poses_file(str(tmp_path / "a.txt"))

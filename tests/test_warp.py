@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, se3, se3_exp, transform
-from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
+from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull, resampled
 
 CAMERA = PinholeCamera(70.0, 75.0, 30.2, 22.9, 64, 48)
 SHAPE = (48, 64)
@@ -34,6 +34,23 @@ def _plane_seen_by_both() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pixels = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), -1)
     to_previous = CAMERA.project(transform(inverse(MOTION), points)) - pixels
     return _plane_depth(normal, offset_mm), current, to_previous.astype(np.float32)
+
+
+def test_resampled_depth_keeps_a_planes_inverse_slope_and_its_holes() -> None:
+    large = CAMERA.resized(128, 96)
+    y, x = np.mgrid[:48, :64].astype(np.float32)
+    ramp = 40 + x - 0.5 * y
+    ramp[10, 20] = np.nan
+    found = resampled(ramp, large)
+    v, u = np.mgrid[:96, :128].astype(np.float32)
+    expected = 40 + (u - 0.5) / 2 - (v - 0.5) / 4
+    inside = np.s_[1:-1, 1:-1]
+    near = np.abs(found - expected)[inside]
+    assert np.isnan(found).sum() == 4
+    assert np.isnan(found[20:22, 40:42]).all()
+    assert np.sort(near[np.isfinite(near)])[:-12].max() < 1e-4  # but for the nearest values around the hole
+    assert near[np.isfinite(near)].max() < 0.5
+    np.testing.assert_array_equal(resampled(ramp, CAMERA), ramp)
 
 
 def test_a_slanted_plane_keeps_its_place() -> None:

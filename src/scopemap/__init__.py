@@ -7,28 +7,87 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # Networks share the cores with the tracker. Threads that wait for each other must sleep then: spinning, torch's were
 # seen to take seventeen times as long for a flow while something else ran. Read when the network library is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# The stages have threads of their own. OpenBLAS's would compete with them (a run took 1.3 times the time), and
+# sum in another order: results would depend on their number. Read when numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def _may_write(folder: Path) -> bool:
+    """Return whether a folder may be written, or made."""
+    there = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    return os.access(there, os.W_OK | os.X_OK)
+
+
+def _private_folder() -> str:
+    """Return a temporary folder that only this user can have written to; "" where there is none."""
+    import tempfile
+
+    for place in (tempfile.gettempdir(), "/dev/shm"):  # noqa: S108 - whose folder it is, is looked at below
+        folder = Path(place) / f"scopemap-kernels-{os.getuid()}"
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            found = folder.lstat()
+        except OSError:
+            continue
+        # Kernels are code: in a folder of someone else they would be theirs.
+        if found.st_uid == os.getuid() and found.st_mode & 0o170077 == 0o040000:
+            return str(folder)
+    return ""
+
+
+def _choose_kernel_cache() -> None:
+    """Name a folder for compiled kernels where numba's own cannot be written: it would refuse to start.
+
+    Without any, nothing is cached, and each process compiles its kernels.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    usual = [
+        Path(__file__).parent / "geometry" / "__pycache__",
+        Path(caches) / "numba",
+        *([Path(named)] if named else []),
+    ]
+    if os.name != "posix" or any(_may_write(folder) for folder in usual):
+        return
+    try:
+        chosen = _private_folder()
+    except OSError:  # there is no folder for temporary files either
+        chosen = ""
+    os.environ["NUMBA_CACHE_DIR"] = chosen
+    if not chosen:
+        from numba.core.dispatcher import Dispatcher
+
+        Dispatcher.enable_caching = lambda self: None  # type: ignore[method-assign]
+
+
+_choose_kernel_cache()
 
 if TYPE_CHECKING:
     __version__: str
 
     from scopemap.config import Config
+    from scopemap.depth.own import OwnDepth
     from scopemap.errors import ScopemapError
     from scopemap.frame import Frame, Truth
     from scopemap.io.opening import open_sequence
     from scopemap.reconstruction import Reconstruction
-    from scopemap.runner import reconstruct
+    from scopemap.runner.reconstructor import Reconstructor
+    from scopemap.runner.run import reconstruct
     from scopemap.trajectory.formats.opening import read_trajectory
     from scopemap.trajectory.trajectory import Trajectory
 
 __all__ = [
     "Config",
     "Frame",
+    "OwnDepth",
     "Reconstruction",
+    "Reconstructor",
     "ScopemapError",
     "Trajectory",
     "Truth",
@@ -41,13 +100,15 @@ __all__ = [
 _HOMES = {
     "Config": "config",
     "Frame": "frame",
+    "OwnDepth": "depth.own",
     "Reconstruction": "reconstruction",
+    "Reconstructor": "runner.reconstructor",
     "ScopemapError": "errors",
     "Trajectory": "trajectory.trajectory",
     "Truth": "frame",
     "open_sequence": "io.opening",
     "read_trajectory": "trajectory.formats.opening",
-    "reconstruct": "runner",
+    "reconstruct": "runner.run",
 }
 
 

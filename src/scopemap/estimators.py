@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
+from numba.core.event import TimingListener, register
+
 from scopemap.config import Config
-from scopemap.depth.anchor import max_depth_mm
+from scopemap.depth.anchor import MEASURED, max_depth_mm
 from scopemap.depth.create import create_anchor, create_depth, files_folder
 from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.depth.files import FilesDepth
@@ -21,12 +27,29 @@ from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
 from scopemap.pipeline import Estimators
 
+_VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
+_COMPILING = TimingListener()
+register("numba:compile", _COMPILING)
+_VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
 
-def create_estimators(config: Config, sequence: Sequence) -> Estimators:
-    """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do."""
+
+@dataclass(frozen=True)
+class OwnEstimators:
+    """Estimators of the caller in place of those that the settings name; None: by the settings."""
+
+    depth: DepthEstimator | None = None
+    flow: FlowEstimator | None = None
+
+
+def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | None = None) -> Estimators:
+    """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do.
+
+    own : replace those of the settings; a flow must then be safe in several threads.
+    """
+    own = own or OwnEstimators()
     networks, folder = config.networks, files_folder(config.depth)
     in_input = folder is not None and folder.resolve() == sequence.path.resolve()
-    depth = create_depth(
+    depth = own.depth or create_depth(
         config.depth,
         sequence.depth_rectifier if in_input else sequence.rectifier,
         networks.device,
@@ -36,9 +59,9 @@ def create_estimators(config: Config, sequence: Sequence) -> Estimators:
     return Estimators(
         depth,
         create_anchor(config.depth, networks.device),
-        create_flow(networks.flow, networks.device),
-        create_flow(networks.keyframe_flow, networks.device),
-        create_flow(networks.keyframe_flow, networks.device),
+        own.flow or create_flow(networks.flow, networks.device),
+        own.flow or create_flow(networks.keyframe_flow, networks.device),
+        own.flow or create_flow(networks.keyframe_flow, networks.device),
         create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks),
     )
@@ -76,6 +99,14 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
     return math.exp(log_factor) * max_depth_mm(config.depth)
 
 
+def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
+    """Return `known`, whether the scale of a run is measured or anchored, and its `source` in words."""
+    depth, anchor = estimators.depth, estimators.anchor
+    guessed = isinstance(depth, FilesDepth) and anchor.description == MEASURED and not depth.scale_is_known
+    source = anchor.description + (" of unknown unit" if guessed else "")
+    return {"known": anchor.scale_is_known and not guessed, "source": source}
+
+
 def estimators_provenance(estimators: Estimators) -> dict[str, str]:
     """Return names, versions and hashes of the estimators, and the source of the depth scale."""
     parts = estimators.depth.provenance()
@@ -91,3 +122,14 @@ def estimators_provenance(estimators: Estimators) -> dict[str, str]:
         parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
     masks = {} if estimators.masks is None else estimators.masks.provenance()
     return parts | masks | {"keyframe_flow": estimators.keyframe_flow.name, "anchor": estimators.anchor.description}
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on; of `networks` if present."""
+    installed = [name for name in _VERSIONS_OF_NETWORKS if find_spec(name) is not None]
+    return {name: version(name) for name in (*_VERSIONS, *installed)} | {"python": platform.python_version()}
+
+
+def compiling_s() -> float:
+    """Return how long this process has compiled kernels that no cache held, s."""
+    return float(_COMPILING.duration) if _COMPILING.done else 0.0

@@ -5,6 +5,7 @@ A stage takes a Frame and returns a new one (`dataclasses.replace`); frames are 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -62,6 +63,27 @@ class Frame:
         if self.T_world_camera is not None:
             check_shape("Frame.T_world_camera", self.T_world_camera, (4, 4))
 
+    def downscaled(self, factor: int) -> Frame:
+        """Return the image with its valid pixels and camera at 1/factor of the size, without results of stages."""
+        if factor == 1:
+            return self
+        size = max(self.camera.width // factor, 1), max(self.camera.height // factor, 1)
+        rgb = cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA)
+        valid = cv2.resize(self.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+        return Frame(self.index, self.time_s, rgb, self.camera.resized(*size), valid, name=self.name)
+
+    def point_cloud(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the usable pixels with depth as points (N, 3) float32, world mm, and their colours (N, 3) uint8.
+
+        Both are empty where the frame has no depth or no pose.
+        """
+        if self.depth_mm is None or self.T_world_camera is None:
+            return np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+        seen = self.valid & (self.depth_mm > 0)
+        points = self.camera.rays[seen] * self.depth_mm[seen, None]
+        world = points @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+        return world.astype(np.float32), self.rgb[seen]
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -84,5 +106,16 @@ class Truth:
 def is_constant(rgb: np.ndarray) -> bool:
     """Return whether an image (H, W, 3) uint8 is black or of one colour, up to noise."""
     smooth = cv2.blur(rgb, (_NOISE_WIDTH_PX, _NOISE_WIDTH_PX))
-    low, high = np.percentile(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
+    low, high = percentiles(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
     return bool(high - low <= _CONSTANT_RANGE)
+
+
+def percentiles(levels: np.ndarray, shares: list[float]) -> list[float]:
+    """Return the percentiles (0..100) of values uint8, any shape but not empty, as numpy interpolates them."""
+    below = np.cumsum(np.bincount(levels.ravel(), minlength=256))
+    found = []
+    for share in shares:
+        place = share / 100 * (levels.size - 1)
+        low, high = np.searchsorted(below, [math.floor(place), math.ceil(place)], side="right")
+        found.append(float(low + (place - math.floor(place)) * (high - low)))
+    return found

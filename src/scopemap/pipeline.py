@@ -1,34 +1,42 @@
-"""The pipeline: frames, in order, to poses, depth and a surface. No files, clocks or printing: see `runner.py`.
+"""The pipeline: frames, in order, to poses, depth and a surface. No files, clocks or printing: see `runner/run.py`.
 
-    preprocess  mask -> raw metric depth -> correspondence with the previous frame
-    step        track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS) -> new keyframe
-                -> smooth (WEMA) -> store, or fuse (TSDF)
+    estimate    mask -> raw metric depth
+    match       correspondence with the previous frame
+    track       track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS) -> new keyframe
+                -> smooth (WEMA)
+    fuse        store, or fuse (TSDF)
     mapper.submaps    after the last frame: adjust all keyframes, close loops, merge maps
     fusion.fuse       fuse the stored frames of a submap, corrected (TSDF)
 
-`preprocess` needs no motion, so it may run a frame ahead of `step`. The preset `paper` refines before it tracks.
+Each stage has its own state, so each may run in a thread of its own, frames in order. The preset `paper` refines before
+it tracks.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from scopemap.config import Config
-from scopemap.depth.anchor import AnchoredDepth
+from scopemap.depth.anchor import AnchoredDepth, depth_downscale
 from scopemap.depth.correspondence import DenseCorrespondence, DenseMatcher
 from scopemap.depth.estimate import DepthEstimator, DepthKind, PerceptualDistance
 from scopemap.depth.mapis import Mapis, RefinedDepth
+from scopemap.errors import ScopemapError
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
+from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.tracking.tracker import Tracker
+
+_MOST_FAULTS, _MOST_FAULTS_SHARE = 3, 0.05  # frames that may fail; more are no accident
 
 
 @dataclass(frozen=True)
@@ -48,19 +56,25 @@ class Estimators:
 class PreprocessedFrame:
     """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale.
 
-    depth_note : that most of its depth is beyond the limit; else "".
+    small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth.downscale`.
+    depth_note : that most of its depth is beyond the limit; else "". fault : why the frame could not be processed, "".
     """
 
     frame: Frame
+    small: Frame
     kind: DepthKind
     correspondence: DenseCorrespondence | None
     anchored: bool
     depth_note: str = ""
+    fault: str = ""
 
 
 @dataclass(frozen=True)
 class Step:
-    """All results for a frame; `frame` has refined depth and, unless it is lost, its pose as tracked."""
+    """All results for a frame; `frame` has refined depth and, unless it is lost, its pose as tracked.
+
+    raw_mm : of the frame's size. refined : of the size of the depth estimate.
+    """
 
     frame: Frame
     track: Track
@@ -69,10 +83,17 @@ class Step:
 
 
 class Pipeline:
-    """One run over one sequence; frames go through `preprocess` and `step` in order, each once.
+    """One run over one sequence; frames go through `estimate`, `match`, `track` and `fuse` in order, each once.
 
     store : for frames that are fused after the last one. tracker : replaces the one of `config.tracking` (baselines).
     """
+
+    STATES: ClassVar = {
+        "preprocess": ("_masker", "estimators", "_depth_faults"),
+        "match": ("_matcher", "_flow_faults"),
+        "track": ("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_tracking_faults"),
+    }
+    """The attributes that each stage changes, by its name; those of `fuse` are in `fusion`."""
 
     def __init__(
         self,
@@ -82,50 +103,111 @@ class Pipeline:
         tracker: FrameTracker | None = None,
     ) -> None:
         self.config, self.estimators = config, estimators
-        self.fusion = SurfaceFusion(config.fusion, store or FrameStore(), corrected=config.mapping.method == "full")
-        # Frames that are fused at once cannot be sorted into submaps.
-        tracking = config.tracking.model_copy(update={"new_map_after": 0} if self.fusion.at_once else {})
+        # An empty store counts as false.
+        store = FrameStore() if store is None else store
+        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method == "full")
         self._masker = Masker(config.mask, estimators.masks)
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
-        self._tracker = tracker or Tracker(tracking, estimators.corner_flow)
+        self._tracker = tracker or Tracker(config.tracking, estimators.corner_flow)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
         self.mapper = Mapper(config.mapping, estimators.keyframe_flow)
         self._last_track: Track | None = None
+        self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
 
-    def preprocess(self, frame: Frame) -> PreprocessedFrame:
-        """Mask a frame, estimate its raw depth and its correspondence with the previous frame."""
+    @property
+    def warnings(self) -> list[str]:
+        """What could not be processed so far."""
+        return _warnings((self._depth_faults, self._flow_faults, self._tracking_faults))
+
+    def estimate(self, frame: Frame) -> PreprocessedFrame:
+        """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
+        try:
+            return self._estimate(frame)
+        except Exception as error:
+            fault = self._depth_faults.noted(frame.index, error)
+            blind = _blind(frame)
+            small = _blind(blind.downscaled(depth_downscale(self.config.depth, max(frame.valid.shape))))
+            return PreprocessedFrame(blind, small, "measured", None, False, fault=fault)
+
+    def _estimate(self, frame: Frame) -> PreprocessedFrame:
+        self._depth_faults.frames += 1
         frame = self._masker(frame)
         # A frame that the tracker refuses must not fix the scale of depth.
         usable = frame.valid.mean() >= self.config.tracking.min_valid_share
-        shown = frame if usable else replace(frame, valid=np.zeros_like(frame.valid))
+        small = frame.downscaled(depth_downscale(self.config.depth, max(frame.valid.shape)))
+        shown = small if usable else replace(small, valid=np.zeros_like(small.valid))
         estimate = self.estimators.depth.estimate(shown)
+        if usable and estimate.kind != "measured" and not np.isfinite(estimate.values).any():
+            self._depth_faults.has_no_depth(frame.index)
         raw = self.estimators.anchor.metric(estimate, shown)
-        correspondence = self._matcher.match(frame.rgb, frame.valid, wanted=self._mapis.needs_previous(estimate.kind))
-        frame = replace(frame, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
-        anchored = self.estimators.anchor.just_fitted
-        return PreprocessedFrame(frame, estimate.kind, correspondence, anchored, raw.limit_note)
+        small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
+        frame = _with_depth(frame, raw.depth_mm, raw.sigma_mm)
+        return PreprocessedFrame(frame, small, estimate.kind, None, self.estimators.anchor.just_fitted, raw.limit_note)
 
-    def step(self, preprocessed: PreprocessedFrame) -> Step:
-        """Track a frame, refine its depth, make it a keyframe where one is due, store or fuse it."""
+    def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:
+        """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""
+        frame, wanted = estimated.small, self._mapis.needs_previous(estimated.kind)
+        self._flow_faults.frames += 1
+        try:
+            return replace(estimated, correspondence=self._matcher.match(frame.rgb, frame.valid, wanted=wanted))
+        except Exception as error:
+            return replace(estimated, fault=self._flow_faults.noted(frame.index, error))
+
+    def preprocess(self, frame: Frame) -> PreprocessedFrame:
+        """Estimate and match: all that needs no motion."""
+        return self.match(self.estimate(frame))
+
+    def track(self, preprocessed: PreprocessedFrame) -> Step:
+        """Track a frame, refine its depth, make it a keyframe where one is due; one with which that fails is lost."""
+        self._tracking_faults.frames += 1
+        try:
+            step = self._track(preprocessed)
+        except Exception as error:
+            step = self._lost(preprocessed, self._tracking_faults.noted(preprocessed.frame.index, error))
+        self.mapper.observe(step.track)
+        self._last_track = step.track
+        return step
+
+    def _track(self, preprocessed: PreprocessedFrame) -> Step:
         refined = self._refine(preprocessed, None) if self.config.mapis.paper.order == "refine-first" else None
         track, last = self._tracker.track(preprocessed.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
         refined = refined or self._refine(preprocessed, motion_between(last, track))
-        frame = replace(preprocessed.frame, depth_mm=refined.depth_mm, depth_sigma_mm=refined.sigma_mm)
+        frame = _with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
         track = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-        self.mapper.observe(track)
-        self.fusion.put(frame)
-        self._last_track = track
+        if preprocessed.fault and track.status == "lost":
+            track = replace(track, reason=preprocessed.fault)
         return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
 
+    def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
+        """Return the step of a frame that could not be tracked, without depth."""
+        self._reset()
+        frame, last = preprocessed.frame, self._last_track
+        if last is None:
+            track = Track(frame.index, "lost", reason, np.eye(4), frame.index)
+        else:
+            track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
+        blind, unknown_mm = _blind(frame), np.asarray(_blind(preprocessed.small).depth_mm)
+        return Step(blind, track, np.asarray(blind.depth_mm), RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm))
+
+    def fuse(self, step: Step) -> None:
+        """Fuse a tracked frame, or store it until the last one."""
+        self.fusion.put(step.frame, step.track.map)
+
+    def step(self, preprocessed: PreprocessedFrame) -> Step:
+        """Track and fuse."""
+        step = self.track(preprocessed)
+        self.fuse(step)
+        return step
+
     def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
-        raw = preprocessed.frame
+        raw = preprocessed.small
         return self._mapis.refine(
             np.asarray(raw.depth_mm),
             preprocessed.kind,
@@ -154,3 +236,54 @@ class Pipeline:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from"
             return replace(track, status="lost", reason=unknown)
         return track
+
+
+def _blind(frame: Frame) -> Frame:
+    """Return a frame without a usable pixel, and with unknown depth."""
+    nowhere, unknown_mm = np.zeros_like(frame.valid), np.full(frame.valid.shape, np.nan, np.float32)
+    return replace(frame, valid=nowhere, depth_mm=unknown_mm, depth_sigma_mm=None)
+
+
+class _Faults:
+    """Frames that a stage could not process: each stage has its own, as a part of the state that it alone changes."""
+
+    def __init__(self, stage: str) -> None:
+        self._stage = stage
+        self.frames = self.failed = self.without_depth = 0
+        self.first, self.first_without_depth = (-1, ""), -1
+
+    def has_no_depth(self, index: int) -> None:
+        """Note a frame to which the network gave no depth."""
+        self.first_without_depth = index if not self.without_depth else self.first_without_depth
+        self.without_depth += 1
+
+    def noted(self, index: int, error: Exception) -> str:
+        """Note the error of a frame and return it in words. Raises it where it is no frame's own, or one of many."""
+        if isinstance(error, ScopemapError):
+            raise error
+        reason = f"{self._stage} failed: {' '.join(str(error).split())[:200] or type(error).__name__}"
+        self.first = self.first if self.failed else (index, reason)
+        self.failed += 1
+        if self.failed > _MOST_FAULTS and self.failed > _MOST_FAULTS_SHARE * self.frames:
+            first = "frame {}, {}".format(*self.first)
+            error.add_note(f"the run ends at frame {index}: {self.failed} frames failed, first {first}")
+            raise error
+        return reason
+
+
+def _warnings(stages: tuple[_Faults, ...]) -> list[str]:
+    """Return in words what the stages could not process."""
+    failed, blind, said = sum(faults.failed for faults in stages), sum(faults.without_depth for faults in stages), []
+    if failed:
+        first = "frame {}, {}".format(*min(faults.first for faults in stages if faults.failed))
+        said.append(f"{failed} frame(s) could not be processed whole (first: {first})")
+    if blind:
+        first_blind = next(faults.first_without_depth for faults in stages if faults.without_depth)
+        said.append(f"{blind} frame(s) got no depth from the network (first: frame {first_blind})")
+    return said
+
+
+def _with_depth(frame: Frame, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> Frame:
+    """Return a frame with depth, and its standard deviation where there is one, from any size to the frame's."""
+    sigma_mm = None if sigma_mm is None else resampled(sigma_mm, frame.camera)
+    return replace(frame, depth_mm=resampled(depth_mm, frame.camera), depth_sigma_mm=sigma_mm)

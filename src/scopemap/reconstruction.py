@@ -2,17 +2,20 @@
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
       depth/000000.png (16 bit, depth/depth.json has the scale)  depth_sigma/000000.png (8 bit, relative)
+      depth_preview/000000.jpg (colours)
       maps/1 (the same for submaps that are not merged), ...
 """
 
 from __future__ import annotations
 
 import csv
+import html
 import json
 import math
-import os
-import shutil
+from base64 import b64encode
+from collections import Counter
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -26,61 +29,68 @@ from scopemap.config import Config
 from scopemap.errors import InputError, reporting
 from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
+from scopemap.io.decoding import read_decoded, write_encoded
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step
+from scopemap.report.kept_run import LOST, KeptMap, KeptRun
+from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
+from scopemap.report.shown_mesh import simplified
+from scopemap.report.summary_picture import summary_picture
+from scopemap.report.verdict import verdict
 from scopemap.tracking.track import Track
-from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
+from scopemap.trajectory.trajectory import OTHER_MAP, SKIPPED, TRACKED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
 """The finest unit of depth/*.png; the largest depth is then 655 mm."""
 
 _LARGEST_UNIT = 65534
+_FEW_FRAMES = 5
+_PREVIEW_SHARES = (0.01, 0.99)  # of all known depth, at the ends of the colours
 # Standard deviations in 8 bits: shares of depth from 0.1 % to 180 % in steps of 3 %; 0 = unknown.
 _LEAST_SIGMA, _SIGMA_STEP = 0.001, 1.03
+_SHOWN_FACES = 100_000
 _COLUMNS = [
-    *("index", "time_s", "name", "status", "reason", "keyframe", "residual", "inlier_share", "correlation"),
+    *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
     *("depth_scale", "warped_share"),
 ]
-_OWN_FILES = (
-    *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
-    *("config.toml", "provenance.json"),
-)
-_OWN_FOLDERS = ("depth", "depth_sigma", "pictures", "maps", "against_video")
-# Files by which a run's folder is recognised: the first is written last, the second first.
-_MARKS = ("provenance.json", "depth/depth.json")
 
 
 @dataclass(frozen=True)
 class FrameRecord:
     """One row of frames.csv: the results for a frame besides its images.
 
-    `depth_scale` is MAPIS' factor of its depth, times the back end's.
+    T_world_camera : (4, 4), or None where the frame has no pose in this submap: `track.status` is then "lost" or
+        "other-map". depth_scale : MAPIS' factor of its depth, times the back end's.
+    map : number of the submap it was tracked in, 0 for the result and N for `maps/N`; None where it is lost, in a
+        submap too small to be saved, or not sorted yet.
     """
 
     index: int
     time_s: float
     name: str
     track: Track
-    T_world_camera: np.ndarray
+    T_world_camera: np.ndarray | None
     depth_scale: float
     warped_share: float
+    map: int | None = None
 
     @classmethod
     def of(cls, step: Step) -> FrameRecord:
-        """Return the record of a step; a lost frame's pose is the last one known."""
+        """Return the record of a step, as tracked."""
         frame, track = step.frame, step.track
-        T_world_camera = track.T_world_camera if frame.T_world_camera is None else frame.T_world_camera
         scale, share = step.refined.scale, step.refined.warped_share
-        return cls(frame.index, frame.time_s, frame.name, track, T_world_camera, scale, share)
+        return cls(frame.index, frame.time_s, frame.name, track, frame.T_world_camera, scale, share)
 
     def row(self) -> list[str]:
         """Return the columns of frames.csv as text."""
         track = self.track
         numbers = (track.residual, track.inlier_share, track.correlation, track.overlap)
+        number = "" if self.map is None else str(self.map)
         return [
-            *(str(self.index), f"{self.time_s:.6f}", self.name, track.status, track.reason, str(track.keyframe)),
+            *(str(self.index), f"{self.time_s:.6f}", self.name, track.status, track.reason),
+            *(number, str(track.keyframe)),
             *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
         ]
@@ -92,29 +102,61 @@ def _skipped_row(frame: SkippedFrame) -> list[str]:
     return known + [""] * (len(_COLUMNS) - len(known))
 
 
-def records_of(submap: Submap, records: list[FrameRecord]) -> list[FrameRecord]:
-    """Return the records with corrected poses and scales; frames of other submaps are lost in this one.
+def records_of(number: int, submaps: list[Submap], records: list[FrameRecord]) -> list[FrameRecord]:
+    """Return the records of the submap with this number, with corrected poses and scales.
 
-    A lost frame repeats the last tracked pose; those before the first tracked frame repeat the first.
+    Submap 0 is the result: its records are those of all frames, lost ones and those of other submaps included. Any
+    other has the records of its own frames.
     """
-    first = next(record for record in records if record.index in submap.frames)
-    last, out, started = _corrected(submap, first).T_world_camera, list[FrameRecord](), False
+    submap = submaps[number]
+    map_of = {index: number for number, submap in enumerate(submaps) for index in submap.frames}
+    out, started = list[FrameRecord](), False
     for record in records:
-        track = record.track
-        if record.index not in submap.frames:
-            reason = track.reason if track.status == "lost" else "tracked in another submap"
-            record = replace(record, track=replace(track, status="lost", reason=reason), T_world_camera=last)
-        else:
+        track, found_in = record.track, map_of.get(record.index)
+        if found_in == number:
             if track.status == "initial" and started:
                 record = replace(record, track=replace(track, status="ok", reason="first frame of a merged map"))
-            record, started = _corrected(submap, record), True
-            last = record.T_world_camera
-        out.append(record)
+            out.append(replace(_corrected(submap, record), map=number))
+            started = True
+        elif number == 0 and record.T_world_camera is not None:
+            where = "a submap too small to be saved" if found_in is None else f"maps/{found_in}"
+            track = replace(track, status=OTHER_MAP, reason=f"tracked in {where}")
+            out.append(replace(record, track=track, T_world_camera=None, map=found_in))
+        elif number == 0:
+            out.append(record)
     return out
 
 
+def frame_counts(records: list[FrameRecord]) -> dict[str, int]:
+    """Return how many frames there are, are tracked in this submap, lost, and tracked in another submap."""
+    status: Counter[str] = Counter(record.track.status for record in records)
+    tracked = sum(status[name] for name in TRACKED)
+    return {"frames": len(records), "tracked": tracked, "lost": status["lost"], "in_other_maps": status[OTHER_MAP]}
+
+
+def warnings_of_frames(records: list[FrameRecord], interrupted_at: int | None) -> list[str]:
+    """Return a warning where the run was interrupted, by the last frame's number, and one where few are tracked."""
+    tracked = frame_counts(records)["tracked"]
+    warnings = []
+    if interrupted_at is not None:
+        warnings.append(f"interrupted at frame {interrupted_at}: the result is of the frames until then")
+    if tracked < _FEW_FRAMES:
+        frames = "1 frame is" if tracked == 1 else f"{tracked} frames are"
+        warnings.append(f"only {frames} in the result: too few to judge it by; the surface is a glimpse from one place")
+    return warnings
+
+
+def scale_words(scale: dict[str, Any]) -> str:
+    """Return what is known of a result's scale in words, from "scale" of its provenance; "" where that is empty."""
+    if not scale:
+        return ""
+    if scale["known"]:
+        return f"scale: {scale['source']}"
+    return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"
+
+
 def _corrected(submap: Submap, record: FrameRecord) -> FrameRecord:
-    if submap.correction is None:
+    if submap.correction is None or record.T_world_camera is None:
         return record
     pose = submap.correction.pose(record.index, record.T_world_camera)
     scale = record.depth_scale * submap.correction.depth_factor(record.index)
@@ -127,7 +169,7 @@ class Reconstruction:
 
     Attributes
     ----------
-    camera : working camera of all frames. records : one per frame, lost frames included.
+    camera : working camera of all frames. records : one per frame, also of frames that are lost or in `others`.
     mesh : world mm, vertex colours; may be empty. config : the resolved settings.
     provenance : what the result depends on and what was assumed: input, camera, scale, weights, versions, machine,
         time.
@@ -135,8 +177,8 @@ class Reconstruction:
         `camera.source_pixel` gives the pixel before rectification.
     skipped : frames that were read and not used.
     focal_sigma_px : standard deviation of the focal length of `camera` where it is an estimate, or None.
-    others : the other submaps, each with its own world and scale, since their relative pose is unknown; most
-        frames first.
+    others : the other submaps, with the records of their own frames, each with its own world and scale, since their
+        relative pose is unknown; most frames first, as in maps/1, maps/2, ...
     """
 
     camera: PinholeCamera
@@ -149,20 +191,44 @@ class Reconstruction:
     focal_sigma_px: float | None = None
     others: list[Reconstruction] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        return f"<Reconstruction, {verdict(self._kept()).word}: {verdict(self._kept()).sentence}>"
+
+    def _repr_html_(self) -> str:
+        """Return the summary picture for a notebook."""
+        kept, file = self._kept(), BytesIO()
+        summary_picture(kept, simplified(self.mesh, _SHOWN_FACES)).save(file, "JPEG", quality=88)
+        picture, words = b64encode(file.getvalue()).decode(), html.escape(repr(self))
+        return f'<p>{words}</p><img alt="{words}" src="data:image/jpeg;base64,{picture}" style="max-width: 100%">'
+
+    def _kept(self) -> KeptRun:
+        """Return this result in the form that reports are made from."""
+        maps = []
+        for result in (self, *self.others):
+            known = result.trajectory.rows(result.trajectory.tracked)
+            maps.append(KeptMap(known.indices, known.T_world_camera, result.mesh))
+        outside = {"lost": LOST, OTHER_MAP: OTHER_PLACE}
+        # A submap is the result of its own report, whatever its number.
+        tracked = [record.T_world_camera is not None for record in self.records]
+        elsewhere = [record.map or outside.get(record.track.status, 0) for record in self.records]
+        places = np.where(tracked, 0, elsewhere)
+        rows = [dict(zip(_COLUMNS, record.row(), strict=True)) for record in self.records]
+        return KeptRun(None, rows, maps, places.astype(np.int64), self.provenance)
+
     @property
     def trajectory(self) -> Trajectory:
-        """The poses with their status; a lost frame repeats the last tracked pose."""
-        records = self.records
+        """The poses with their status; NaN where a frame is lost or in another submap."""
+        records, unknown = self.records, np.full((4, 4), np.nan)
         return Trajectory(
             np.array([record.index for record in records], dtype=np.int64),
             np.array([record.time_s for record in records]),
-            np.stack([record.T_world_camera for record in records]),
+            np.stack([unknown if record.T_world_camera is None else record.T_world_camera for record in records]),
             np.array([record.track.status for record in records]),
         )
 
     @property
     def lost(self) -> list[FrameRecord]:
-        """The records of the frames that could not be tracked."""
+        """The records of the frames that could not be tracked; those of other submaps are not among them."""
         return [record for record in self.records if record.track.status == "lost"]
 
     def save(self, folder: Path) -> None:
@@ -175,15 +241,17 @@ class Reconstruction:
             other.save(folder / "maps" / str(number))
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_tum(folder / "trajectory.tum", self.trajectory)
-            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb")
+            scale = scale_words(self.provenance.get("scale", {}))
+            write_tum(folder / "trajectory.tum", self.trajectory, comment=scale)
+            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
             sigma_px = self.focal_sigma_px
             write_calibration(self.camera, folder / "camera.yaml", focal_sigma_px=sigma_px)
             if (source := self.source_camera) is not None:
                 sigma_px = None if sigma_px is None else sigma_px * source.central.fx / self.camera.fx
                 write_calibration(source, folder / "source_camera.yaml", focal_sigma_px=sigma_px)
             rows = [*map(FrameRecord.row, self.records), *map(_skipped_row, self.skipped)]
-            with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+            # A file's name may hold bytes that are no UTF-8.
+            with (folder / "frames.csv").open("w", newline="", encoding="utf-8", errors="replace") as file:
                 csv.writer(file).writerows([_COLUMNS, *sorted(rows, key=lambda row: int(row[0]))])
             (folder / "config.toml").write_text(self.config.toml(), encoding="utf-8")
             provenance = json.dumps(self.provenance, indent=2) + "\n"
@@ -195,44 +263,83 @@ class Reconstruction:
 class DepthWriter:
     """Writes the depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
 
-    Beside it the standard deviation of frames that have one, as 8-bit PNG: 0.001 * 1.03^(v - 1) of the depth.
+    Beside it the standard deviation of frames that have one, as 8-bit PNG: 0.001 * 1.03^(v - 1) of the depth. `finish`
+    adds pictures to look at, in colours over one range for all frames.
 
     largest_mm : depth that must be representable; it makes the unit coarser than `DEPTH_SCALE_MM` where necessary.
     Raises `InputError` where nothing can be written.
     """
 
+    NOT_IN_CHECKPOINT = ("_folder", "_sigma_folder", "_preview_folder")
+    """Not in a checkpoint: a run may go on under another name of its folder."""
+
     def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
-        self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))
+        names = ("depth", "depth_sigma", "depth_preview")
+        self._folder, self._sigma_folder, self._preview_folder = (Path(folder) / name for name in names)
         self._scale_mm = _unit_for(largest_mm)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            description = json.dumps({"scale_mm": self._scale_mm, "unknown": 0}) + "\n"
-            (self._folder / "depth.json").write_text(description, encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
+        self._written: list[str] = []
+        self._histogram = np.zeros(_LARGEST_UNIT + 2, np.int64)  # of every 16th pixel, by unit
+        self._describe({})
 
     def __call__(self, frame: Frame) -> None:
         """Write the depth of a frame, and its standard deviation where it has one."""
         depth_mm = np.asarray(frame.depth_mm)
         units = np.nan_to_num(depth_mm / self._scale_mm, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
-        _write_png(self._folder / f"{frame.index:06d}.png", image)
+        _write_picture(self._folder / f"{frame.index:06d}.png", image)
+        self._written.append(f"{frame.index:06d}")
+        self._histogram += np.bincount(image[::4, ::4].ravel(), minlength=len(self._histogram))
         if frame.depth_sigma_mm is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
                 code = 1 + np.log(frame.depth_sigma_mm / depth_mm / _LEAST_SIGMA) / np.log(_SIGMA_STEP)
             levels = np.where(np.isnan(code), 0, np.clip(np.round(code), 1, 255)).astype(np.uint8)
             with reporting(f"cannot write to {self._sigma_folder}"):
                 self._sigma_folder.mkdir(exist_ok=True)
-            _write_png(self._sigma_folder / f"{frame.index:06d}.png", levels)
+            _write_picture(self._sigma_folder / f"{frame.index:06d}.png", levels)
+
+    def finish(self, *, scale_known: bool) -> None:
+        """Write a JPEG of each frame's depth: turbo over its logarithm from red (near) to blue (far), the same range
+        for all frames.
+
+        Unknown depth is black. depth.json then states the range, and whether the millimetres are known or a guess.
+        """
+        seen = np.cumsum(self._histogram[1:])
+        near, far = (1 + int(np.searchsorted(seen, share * seen[-1])) for share in _PREVIEW_SHARES)
+        far = max(far, near + 1)
+        facts: dict[str, Any] = {"scale_known": scale_known}
+        if seen[-1]:
+            with reporting(f"cannot write to {self._preview_folder}"):
+                self._preview_folder.mkdir(exist_ok=True)
+            # Level 0 is unknown, 1 the far end of the colours.
+            colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_TURBO)
+            colours[0] = 0
+            unit = np.arange(_LARGEST_UNIT + 2).clip(1)
+            level = np.clip(255 - 254 * np.log(unit / near) / np.log(far / near), 1, 255).astype(np.uint8)
+            level[0] = 0
+            for name in dict.fromkeys(self._written):
+                levels = level[read_decoded(self._folder / f"{name}.png")]
+                _write_picture(self._preview_folder / f"{name}.jpg", cv2.applyColorMap(levels, colours))
+            range_mm = [round(unit * self._scale_mm, 4) for unit in (near, far)]
+            facts |= {
+                "preview_mm": range_mm,
+                "preview_colours": "turbo over the logarithm, red = near, blue = far, black = unknown",
+            }
+        self._describe(facts)
+
+    def _describe(self, facts: dict[str, Any]) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            description = json.dumps({"scale_mm": self._scale_mm, "unknown": 0} | facts) + "\n"
+            (self._folder / "depth.json").write_text(description, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
 
 
-def _write_png(file: Path, image: np.ndarray) -> None:
+def _write_picture(file: Path, image: np.ndarray) -> None:
     try:
-        written = cv2.imwrite(str(file), image)
-    except cv2.error:
-        written = False
-    if not written:
-        raise InputError(f"cannot write {file}: the disk is full or the folder may not be written")
+        write_encoded(file, image)
+    except OSError as error:
+        raise InputError(f"cannot write {file}: {error.strerror or error}") from None
 
 
 class DepthReader:
@@ -247,28 +354,25 @@ class DepthReader:
         self.present = description.is_file()
         """Whether the run kept its depth."""
         try:
-            self._scale_mm = float(json.loads(description.read_text())["scale_mm"]) if self.present else 0.0
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            self.scale_mm = float(json.loads(description.read_text())["scale_mm"]) if self.present else 0.0
+            """Millimetres per unit of the files; 0 where there are none."""
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"cannot read {description}: {error}") from None
 
     def read(self, index: int) -> np.ndarray | None:
         """Return depth (H, W) float32, mm, NaN = unknown, of the frame with this number; None where none was kept."""
-        image = _read_png(self._folder / f"{index:06d}.png")
+        image = read_decoded(self._folder / f"{index:06d}.png")
         if image is None:
             return None
-        return np.where(image > 0, image * np.float32(self._scale_mm), np.float32(np.nan))
+        return np.where(image > 0, image * np.float32(self.scale_mm), np.float32(np.nan))
 
     def read_sigma(self, index: int) -> np.ndarray | None:
         """Return the standard deviation of `read`, to 1.5 %, in the same form; None where none was kept."""
-        depth_mm, levels = self.read(index), _read_png(self._sigma_folder / f"{index:06d}.png")
+        depth_mm, levels = self.read(index), read_decoded(self._sigma_folder / f"{index:06d}.png")
         if depth_mm is None or levels is None:
             return None
         share = _LEAST_SIGMA * _SIGMA_STEP ** (levels.astype(np.float32) - 1)
         return np.where(levels > 0, share * depth_mm, np.float32(np.nan)).astype(np.float32)
-
-
-def _read_png(file: Path) -> np.ndarray | None:
-    return cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
 
 
 def _unit_for(largest_mm: float) -> float:
@@ -276,32 +380,3 @@ def _unit_for(largest_mm: float) -> float:
     least = max(largest_mm / _LARGEST_UNIT, DEPTH_SCALE_MM) * (1 - 1e-6)
     power = 10.0 ** math.floor(math.log10(least))
     return next(round(digit * power, 12) for digit in (1, 2, 5, 10) if digit * power >= least)
-
-
-def prepare_folder(folder: Path, *, overwrite: bool) -> None:
-    """Make an empty folder for a run; with `overwrite` an earlier run's files in it are removed, nothing else.
-
-    Raises `InputError` if a file has that name, or if the folder to overwrite holds no run.
-    """
-    folder = Path(folder)
-    try:
-        _make_empty(folder, overwrite=overwrite)
-    except OSError as error:
-        raise InputError(f"cannot write a run to {folder}: {error.strerror or error}") from None
-
-
-def _make_empty(folder: Path, *, overwrite: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"cannot write a run to {folder}: a file has that name")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            raise InputError(f"cannot write a run to {folder}: it is not empty; name another folder or use --overwrite")
-        if not any((folder / mark).is_file() for mark in _MARKS):
-            raise InputError(f"will not overwrite {folder}: it holds no run; name another folder")
-        for name in _OWN_FILES:
-            (folder / name).unlink(missing_ok=True)
-        for name in _OWN_FOLDERS:
-            shutil.rmtree(folder / name, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"cannot write a run to {folder}: the folder is read-only; name another one")

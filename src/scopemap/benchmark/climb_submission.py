@@ -37,7 +37,7 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
         prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0) + seconds.get("check surface", 0.0)
         # The time up to the last pose, the back end included; the mesh comes after it.
         times = zip(RUNTIME_KEYS, (prepare_s, seconds["total"] - prepare_s - fuse_s), strict=True)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"exporting {run}: it is not the folder of a finished run ({error})") from None
     first, *others = (out / clip / number for number in RUNS)
     try:

@@ -22,13 +22,17 @@ from scopemap.evaluation.depth import evaluate_depth, mean_depth_report
 from scopemap.evaluation.poses import MatchedTrajectories, match, pose_report
 from scopemap.evaluation.surface import compare_surfaces
 from scopemap.io.opening import open_sequence
+from scopemap.io.result_folder import check_result_folder
 from scopemap.io.sequence import Sequence
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.pipeline import Step
-from scopemap.reconstruction import Reconstruction, prepare_folder
+from scopemap.reconstruction import Reconstruction
 from scopemap.report.depth_figures import draw_depths
+from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.mesh_figures import draw_mesh, draw_trajectories
-from scopemap.runner import Observer, reconstruct
+from scopemap.report.page import write_report
+from scopemap.runner.preparation import Progress
+from scopemap.runner.run import Observer, reconstruct
 from scopemap.trajectory.formats.opening import read_trajectory
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
@@ -65,10 +69,10 @@ class Demonstration:
 
 
 def prepare_out(out: Path, *, overwrite: bool) -> None:
-    """Make the folders. An earlier demonstration's run is removed if `overwrite`, else it is an `InputError`."""
-    prepare_folder(out / "run", overwrite=overwrite)
+    """Make the folder of pictures; an earlier demonstration's run is an `InputError`, unless `overwrite`."""
+    check_result_folder(out / "run", overwrite=overwrite)
     try:
-        (out / "pictures").mkdir(exist_ok=True)
+        (out / "pictures").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write pictures to {out}: {error.strerror or error}") from None
 
@@ -78,16 +82,24 @@ def render(out: Path, spec: PhantomSpec = PHANTOM, progress: Callable[[int, int]
     return render_once(spec, out / "phantom", progress)
 
 
-def run_on_phantom(out: Path, config: Config, observers: tuple[Observer, ...] = ()) -> Demonstration:
+def run_on_phantom(
+    out: Path,
+    config: Config,
+    observers: tuple[Observer, ...] = (),
+    progress: Progress = lambda doing, done, total: None,
+) -> Demonstration:
     """Reconstruct OUT/phantom into OUT/run; the estimators see its images and calibration only."""
     raw_mm: dict[int, np.ndarray] = {}
     refined_mm: dict[int, np.ndarray] = {}
 
     def keep_depth(step: Step) -> None:
-        raw_mm[step.frame.index], refined_mm[step.frame.index] = step.raw_mm, step.refined.depth_mm
+        raw_mm[step.frame.index], refined_mm[step.frame.index] = step.raw_mm, np.asarray(step.frame.depth_mm)
 
     sequence = open_sequence(out / "phantom")
-    result = reconstruct(sequence, config, out=out / "run", overwrite=True, observers=(*observers, keep_depth))
+    pictures = FramePictures()
+    seen = (*observers, keep_depth, pictures.observe)
+    result = reconstruct(sequence, config, out=out / "run", overwrite=True, observers=seen, progress=progress)
+    write_report(out / "run", pictures)
     return Demonstration(sequence, result, raw_mm, refined_mm)
 
 

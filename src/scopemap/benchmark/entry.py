@@ -153,7 +153,7 @@ def render_once(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], 
     """Render a phantom, unless `folder` holds it, complete (its mesh is written last); return whether it was needed."""
     try:
         description = json.loads((folder / "phantom.json").read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         description = {}
     wanted = json.loads(json.dumps(asdict(spec), default=str))
     same = description.get("spec") == wanted and description.get("made_by") == f"scopemap {version('scopemap')}"

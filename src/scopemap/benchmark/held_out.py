@@ -188,7 +188,7 @@ def _frames(run: Path, config: Config) -> Iterator[Frame]:
     depth, trajectory, sequence = DepthReader(run), read_trajectory(run), open_truth(run, source)
     if not depth.present or not is_camera_of(run, sequence):
         raise InputError(f"the run {run} kept no depth maps, or its input gives another camera now")
-    tracked = np.flatnonzero(trajectory.status != "lost")
+    tracked = np.flatnonzero(trajectory.tracked)
     pose_of = {int(trajectory.indices[k]): trajectory.T_world_camera[k] for k in tracked[:: config.fusion.every]}
     mask = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
     for frame in sequence.frames():

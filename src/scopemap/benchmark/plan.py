@@ -168,10 +168,10 @@ def read_plan(plan: Path | str) -> Plan:
     text = _text_of(plan)
     try:
         return Plan.model_validate(_with_sets(tomllib.loads(text)))
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"cannot read the plan {plan}: {error}") from None
     except ValidationError as error:
         raise SettingsError(f"the plan {plan}: " + "; ".join(explain(item) for item in error.errors())) from None
+    except (RecursionError, ValueError) as error:
+        raise SettingsError(f"cannot read the plan {plan}: {error}") from None
     except ScopemapError as error:
         raise SettingsError(f"the plan {plan}: {error}") from None
 

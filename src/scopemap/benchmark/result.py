@@ -59,7 +59,7 @@ class RunResult:
         path = Path(folder) / FILE_NAME
         try:
             return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"cannot read the result of a benchmark run {path}: {error}") from None
 
 
@@ -67,7 +67,7 @@ def read_provenance(run: Path) -> dict[str, Any]:
     """Return the `provenance.json` of a run's folder; {} where there is none that can be read."""
     try:
         found = json.loads((run / "provenance.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

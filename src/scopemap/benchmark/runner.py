@@ -176,7 +176,7 @@ def _run_in_process(entry: Entry, timeout_s: float | None) -> RunResult:
     command, log = worker_command(entry.save()), entry.folder / "log.txt"
     with log.open("w", encoding="utf-8") as output:
         try:
-            code = subprocess.run(
+            code = subprocess.run(  # noqa: S603 - this program, its arguments a list
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, timeout=timeout_s
             ).returncode
             error = _cause(code, log) if code else "ended without a result"
@@ -253,7 +253,9 @@ def source_commit() -> str:
 
 def _git(*arguments: str) -> str:
     folder = Path(__file__).resolve().parent
-    return subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+    command = ["git", *arguments]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - constants
+    return ran.stdout.strip()
 
 
 def _commits_note(results: list[RunResult]) -> list[str]:

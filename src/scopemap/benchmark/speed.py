@@ -29,7 +29,7 @@ from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
-from scopemap.runner import reconstruct
+from scopemap.runner.run import reconstruct
 
 PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
 """What is measured without a video."""
@@ -64,7 +64,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """Functions, "module:name" in the package, whose processor time is a stage's; the rest is that of the run's parts."""
 
-_PARTS = "runner:_Clock.timed"  # called with the part's name
+_PARTS = "runner.run:Clock.timed"  # called with the part's name
 _CALLER = {"correspondence": "flow to the previous frame", "corners": "flow to the keyframe"}
 _OTHER_FLOW = "flow between keyframes"
 _NOISE = 0.05  # of the calibration
@@ -139,7 +139,7 @@ def read_speed(file: Path) -> Speed:
         content = json.loads(file.read_text(encoding="utf-8"))
         stages = {name: StageTime(**stage) for name, stage in content.pop("stages").items()}
         return Speed(**content | {"size": tuple(content["size"])}, stages=stages)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(f"reading {file}: it holds no measurement of speed ({error})") from None
 
 

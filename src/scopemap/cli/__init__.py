@@ -5,11 +5,13 @@ A known error is one line and exit code 1, wrong usage exit code 2, anything els
 
 from __future__ import annotations
 
+import io
 import sys
 
 import typer
 
 from scopemap.cli import datasets, models
+from scopemap.cli.batch import batch
 from scopemap.cli.bench import bench
 from scopemap.cli.calibrate import calibrate
 from scopemap.cli.compare import compare
@@ -17,8 +19,13 @@ from scopemap.cli.demo import demo
 from scopemap.cli.evaluate import evaluate
 from scopemap.cli.export import export
 from scopemap.cli.inspect import inspect
+from scopemap.cli.live import live
+from scopemap.cli.measure import measure
 from scopemap.cli.phantom import phantom
+from scopemap.cli.report import report
 from scopemap.cli.run import run
+from scopemap.cli.verify import verify
+from scopemap.cli.view import view
 from scopemap.errors import ScopemapError
 
 app = typer.Typer(
@@ -26,8 +33,25 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (run, demo, inspect, evaluate, compare, bench, export, phantom, calibrate):
+for command in (
+    run,
+    batch,
+    live,
+    view,
+    report,
+    demo,
+    inspect,
+    evaluate,
+    compare,
+    bench,
+    export,
+    measure,
+    verify,
+    phantom,
+    calibrate,
+):
     app.command()(command)
 app.add_typer(models.app, name="models")
 app.add_typer(datasets.app, name="datasets")
@@ -50,11 +74,15 @@ def _root(
 
 def main() -> None:
     """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # A pipe on Windows has a code page that lacks most letters.
+            stream.reconfigure(errors="replace")
     try:
         app(prog_name="scopemap")
     except ScopemapError as error:
-        typer.echo(f"scopemap: {error}", err=True)
+        typer.echo("; ".join([f"scopemap: {error}", *getattr(error, "__notes__", [])]), err=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("scopemap: stopped", err=True)
+    except KeyboardInterrupt as error:
+        typer.echo("; ".join(["scopemap: stopped", *getattr(error, "__notes__", [])]), err=True)
         sys.exit(130)

@@ -39,12 +39,18 @@ def compare(
     from scopemap.benchmark.figures import write_results
     from scopemap.benchmark.plan import ProtocolPlan
     from scopemap.benchmark.tables import benchmark_tables
+    from scopemap.report.kept_run import is_run
+    from scopemap.report.page import PAGE, write_comparison
 
     protocol = ProtocolPlan(align=align, consistency=consistency)
     given = [name.strip() for name in names.split(",")] if names else []
     runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
+    finished = [run for run in runs if is_run(run.folder)]
+    if out is not None and finished:
+        names_shown = [f"{run.result.method}, {run.result.sequence}" for run in finished]
+        files.append(write_comparison([run.folder for run in finished], names_shown, out / PAGE))
     if as_json:
         print_json([asdict(result) for result in results])
     elif not quiet:
@@ -52,4 +58,5 @@ def compare(
         typer.echo(overview.markdown())
         typer.echo(overview.caption)
         if files:
-            typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables")
+            seen = f", {PAGE} shows the runs" if finished else ""
+            typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables{seen}")

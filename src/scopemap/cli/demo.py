@@ -37,8 +37,8 @@ def demo(
     with count_progress("rendering", "rendered", silent=silent) as progress:
         rendered = demonstration.render(out, demonstration.PHANTOM, progress)
     _tell(f"{'rendered' if rendered else 'using the earlier'} phantom in {out / 'phantom'}; reconstructing it", silent)
-    with run_progress(demonstration.PHANTOM.frames, silent=silent) as observers:
-        done = demonstration.run_on_phantom(out, config, observers)
+    with run_progress(demonstration.PHANTOM.frames, silent=silent) as shown:
+        done = demonstration.run_on_phantom(out, config, shown.observers, shown.progress)
     _tell("measuring against the truth", silent)
     figures = demonstration.measure(done)
     pictures = demonstration.draw(done, out / "pictures")
@@ -70,5 +70,6 @@ def _lines(figures: dict[str, float], out: Path, seconds: float) -> list[str]:
     return [line.format(**figures) for line in lines] + [
         f"mesh: {run / 'mesh.ply'} and mesh.glb; truth: {out / 'phantom' / 'mesh_truth.ply'}",
         f"trajectory: {run / 'trajectory.tum'}; truth: {out / 'phantom' / 'pose.txt'}",
+        f"report: {run / 'report.html'}, to be looked at in a browser",
         f"pictures: {pictures / 'trajectory.png'} (estimate green, truth red), mesh.png, depth.png",
     ]

@@ -91,3 +91,4 @@ def _print(source: Path, found: Inspection) -> None:
             typer.echo(f"advice: {finding.code}: {finding.advice}")
     if not found.findings:
         typer.echo("no problem was found")
+    typer.echo(f"forecast: {found.forecast}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +12,7 @@ import typer
 
 from scopemap.errors import InputError, SettingsError
 
+_QUOTED = 80  # characters of a text that an error repeats
 Align = Literal["none", "origin", "se3", "sim3", "scale"]
 Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
@@ -37,20 +39,26 @@ def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
         raise InputError(f"cannot write {file}: there is a folder of that name")
     if file.exists() and not overwrite:
         raise InputError(f"{file} exists; give another name with --out, or --overwrite")
+    around = next(folder for folder in file.absolute().parents if folder.exists())
+    if not around.is_dir():
+        raise InputError(f"cannot write {file}: {around} is a file")
+    if not os.access(file if file.exists() else around, os.W_OK):
+        raise InputError(f"cannot write {file}: no permission to write in {around}")
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """Return (width, height) of "WIDTHxHEIGHT", px."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if not match:
-        raise SettingsError(f"cannot read the size '{text}': expected WIDTHxHEIGHT such as 320x256")
+        raise SettingsError(f"cannot read the size '{text[:_QUOTED]}': expected WIDTHxHEIGHT such as 320x256")
     return int(match[1]), int(match[2])
 
 
 def parse_slice(text: str) -> slice:
     """Return the slice of "A:B:S", a Python slice over the input's frames; A, B and S may be left out."""
-    if not re.fullmatch(r"(-?\d+)?:(-?\d+)?(:\d*)?", text):
-        raise SettingsError(f"cannot read the frames '{text}': expected START:STOP or START:STOP:STEP such as 0:100")
+    if not re.fullmatch(r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?", text):
+        quoted = text[:_QUOTED]
+        raise SettingsError(f"cannot read the frames '{quoted}': expected START:STOP or START:STOP:STEP such as 0:100")
     return slice(*(int(part) if part else None for part in text.split(":")))
 
 
@@ -76,10 +84,12 @@ def parse_settings(pairs: list[str]) -> dict[str, Any]:
         key, found, value = pair.partition("=")
         if not found:
             raise SettingsError(
-                f"cannot read the setting '{pair}': expected KEY=VALUE such as tracking.keyframe_every=5"
+                f"cannot read the setting '{pair[:_QUOTED]}': expected KEY=VALUE such as tracking.keyframe_every=5"
             )
         try:
             settings[key] = json.loads(value)
         except json.JSONDecodeError:
             settings[key] = value
+        except (RecursionError, ValueError) as error:  # lists in lists without end, numbers of thousands of digits
+            raise SettingsError(f"cannot read the setting '{pair[:_QUOTED]}': {error}") from None
     return settings

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from scopemap.cli.figures import print_json
+from scopemap.cli.interruption import Interruption
 from scopemap.cli.options import (
     AsJson,
     CameraFile,
@@ -106,10 +108,20 @@ def run(
     device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="Device of the networks.")] = None,
     settings: SetPairs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
+    resume: Annotated[
+        bool | None,
+        typer.Option(
+            "--resume/--no-resume",
+            help="Resume a killed run from its checkpoint; default: where input, settings and versions agree.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Reconstruct camera poses, depth and a tissue surface from a video."""
+    """Reconstruct camera poses, depth and a tissue surface from a video.
+
+    Ctrl-C ends it early and writes what was tracked until then; a second Ctrl-C writes nothing.
+    """
     from scopemap.config import Config
 
     given = {
@@ -130,7 +142,8 @@ def run(
     resolved = Config.load(preset, config, chosen)
 
     from scopemap.io.opening import open_sequence
-    from scopemap.runner import reconstruct
+    from scopemap.runner.checkpoints import check_resumable, discard_unfinished
+    from scopemap.runner.with_report import reconstruct_with_report
 
     sequence = open_sequence(
         source,
@@ -141,9 +154,19 @@ def run(
         frames=frames,
         settings=resolved.input,
     )
-    with run_progress(sequence.count, silent=quiet or as_json) as observers:
-        result = reconstruct(sequence, resolved, out=out, overwrite=overwrite, observers=observers)
+    if resume:
+        check_resumable(out, sequence, resolved)
+    elif resume is not None:
+        discard_unfinished(out)
+    with run_progress(sequence.count, silent=quiet or as_json) as shown, Interruption() as interruption:
+        seen = (*shown.observers, interruption.observe)
+        result = reconstruct_with_report(
+            sequence, resolved, out, overwrite=overwrite, observers=seen, progress=shown.progress
+        )
     _report(result, resolved, out, as_json=as_json, quiet=quiet)
+    # After the last frame there is nothing to cut short: the result is whole.
+    if interruption.exit_code and result.provenance["interrupted_at_frame"] is not None:
+        raise typer.Exit(interruption.exit_code)
 
 
 def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
@@ -156,26 +179,58 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
         for line in summary_lines(result):
             typer.echo(line)
         submaps = ", maps/" if result.others else ""
-        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, frames.csv{submaps}")
+        typer.echo(f"look at {out / 'report.html'} in a browser, or at summary.png beside it")
+        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, depth_preview/, frames.csv{submaps}")
 
 
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
-    facts = result.provenance
+    from scopemap.reconstruction import scale_words
+
+    facts, known = result.provenance, result.provenance["scale"]["known"]
+    unit = " mm" if known else " (scale unknown)"
     lines = [
-        f"{facts['tracked']} of {facts['frames']} frames tracked, path {result.trajectory.path_length_mm:.1f} mm",
+        f"{_counted(facts)}, path {result.trajectory.path_length_mm:.1f}{unit}",
+        scale_words(facts["scale"]) + ("" if known else "; every mm below is in this scale"),
         f"camera: {facts['camera']['source']}",
         f"size: {facts['camera']['size']}",
-        f"depth: {facts['estimators']['depth']}; scale: {facts['estimators']['anchor']}",
+        f"depth: {facts['estimators']['depth']}",
         f"flow: {facts['estimators']['flow']}; perceptual distance: {facts['estimators']['perceptual']}",
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
-        f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s",
+        f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s"
+        + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
+    if result.others:
+        lines.append(f"other maps: {', '.join(_other_map(n, other) for n, other in enumerate(result.others, 1))}")
     lines += [f"lost: frame {record.index}, {record.track.reason}" for record in result.lost[:5]]
     if len(result.lost) > 5:
         lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]
+
+
+def compiling_words(seconds: float) -> str:
+    """Return what compiling the kernels took, and that it was for this process alone where they cannot be cached."""
+    if seconds < 0.1:
+        return ""
+    kept = (
+        "once"
+        if os.environ.get("NUMBA_CACHE_DIR") != ""
+        else "every time: set NUMBA_CACHE_DIR to a folder to keep them"
+    )
+    return f"; {seconds:.1f} s of it to compile kernels, {kept}"
+
+
+def _counted(facts: dict[str, Any]) -> str:
+    """Return how many frames are tracked in the result, lost, and in other maps."""
+    others = (("lost", "lost"), ("in_other_maps", "in other maps"))
+    parts = [f"{facts['tracked']} of {facts['frames']} frames tracked"]
+    return ", ".join(parts + [f"{facts[key]} {words}" for key, words in others if facts[key]])
+
+
+def _other_map(number: int, other: Reconstruction) -> str:
+    first, last = other.records[0].index, other.records[-1].index
+    return f"maps/{number} with {len(other.records)} frames ({first} to {last})"
 
 
 def _surface(figures: dict[str, float]) -> str:
@@ -183,6 +238,7 @@ def _surface(figures: dict[str, float]) -> str:
     if "depth_error" not in figures:
         return ""
     return (
-        f"; covers {figures['coverage_mean']:.0%} of what the frames see (least {figures['coverage_least']:.0%}), "
+        f"; covers {int(100 * figures['coverage_mean'])}% of what the frames see "
+        f"(least {int(100 * figures['coverage_least'])}%), "
         f"depth {figures['depth_error']:.1%} off theirs"
     )

@@ -56,6 +56,8 @@ line may not."""
 REMOVED_VALUES = {"networks.flow": "auto", "networks.keyframe_flow": "auto", "networks.perceptual": "auto"}
 """Values of earlier versions that depended on the weights of the machine: in a file they mean what the preset names."""
 
+_QUOTED = 80  # characters of a value that an error repeats
+
 
 class Config(Settings):
     """All settings of a run."""
@@ -81,7 +83,7 @@ class Config(Settings):
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}
-        in_file = {} if file is None else _of_earlier_versions(_flatten(_read_toml(file)))
+        in_file = {} if file is None else _of_earlier_versions(_read_toml(file))
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
@@ -176,13 +178,20 @@ def _nearest(dotted: str, names: list[str]) -> str | None:
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
+    """Return the settings in a file by their dotted names."""
     try:
-        return tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return _flatten(tomllib.loads(Path(file).read_text(encoding="utf-8")))
+    # Tables in tables without end, and numbers of thousands of digits, have errors of their own.
+    except (OSError, RecursionError, ValueError) as error:
         raise SettingsError(f"cannot read the settings in {file}: {error}") from None
 
 
 def explain(error: Any) -> str:
     """Return one phrase for an error that pydantic found: which setting, what is wrong, what was given."""
     where = ".".join(str(part) for part in error["loc"])
-    return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {error['input']!r})"
+    return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {_quoted(error['input'])})"
+
+
+def _quoted(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."

@@ -72,10 +72,17 @@ class DepthSettings(Settings):
         description="kind of depth files; auto: 8 bit is disparity, else measured; depth: predicted, scale may float",
     )
     files_scale_mm: float | None = Field(
-        None, gt=0, description="mm per unit of depth files; unset: from the calibration, else 1"
+        None, gt=0, le=1e6, description="mm per unit of depth files; unset: from the calibration, else 1"
     )
     max_depth_mm: float = Field(
         300.0, gt=0, description="predicted depth beyond this is unknown, unless near-far names a farther one, mm"
+    )
+    downscale: int | None = Field(
+        None,
+        ge=1,
+        le=32,
+        description="estimate depth and make it consistent at the working size over this, inert for depth from files; "
+        "unset: scopenet at about its training size, the longest side 160 to 319 px, others at the full one",
     )
     exponent: float | Literal["fit"] = Field(
         1.0,

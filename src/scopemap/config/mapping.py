@@ -87,11 +87,13 @@ class FusionSettings(Settings):
 
     enabled: bool = Field(True, description="false: no mesh")
     voxel_mm: float | None = Field(
-        None, ge=0.01, description="voxel size, mm; default: 1/60 of the clip's median depth"
+        None, ge=0.01, le=1000, description="voxel size, mm; default: 1/60 of the clip's median depth"
     )
-    truncation_mm: float | None = Field(None, ge=0.05, description="truncation of the TSDF, mm; default: 5 voxels")
+    truncation_mm: float | None = Field(
+        None, ge=0.05, le=1e4, description="truncation of the TSDF, mm; default: 5 voxels"
+    )
     max_depth_mm: float | None = Field(
-        None, gt=0, description="depth beyond this is not fused, mm; default: 200 voxels"
+        None, gt=0, le=1e6, description="depth beyond this is not fused, mm; default: 200 voxels"
     )
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
     colours: Literal["albedo", "raw"] = Field(

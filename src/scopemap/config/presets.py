@@ -68,6 +68,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": _PAPER,
     "paper-strict": _PAPER | _BEYOND_PAPER,
     "realtime": {
+        "tracking.search_every": 3,
         "tracking.advanced.max_iterations": 15,
         "fusion.voxel_mm": 1.5,
         "fusion.truncation_mm": 5.0,

@@ -69,6 +69,9 @@ class TrackingSettings(Settings):
     relocalisation_keyframes: int = Field(
         10, ge=0, description="number of recent keyframes in which a lost camera is relocalised; 0: off"
     )
+    search_every: int = Field(
+        1, ge=1, description="a camera that has been lost for more than 5 frames is looked for in every n-th frame"
+    )
     new_map_after: int = Field(5, ge=0, description="sharp frames lost in a row after which a new map begins; 0: never")
     advanced: TrackingAdvanced = TrackingAdvanced()
     paper: TrackingPaper = TrackingPaper()

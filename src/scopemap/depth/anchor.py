@@ -18,11 +18,18 @@ from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, 
 from scopemap.errors import InputError, SettingsError, check_shape
 from scopemap.frame import Frame
 
+MEASURED = "measured depth"
+"""The source of the scale where depth is measured."""
+
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02
 _MIN_SHARE_NOTED = 0.005
 _MAX_SHARE_BEYOND = 0.5  # of the depth that may be beyond the limit without a note
 _FACTOR_MM = 1000.0
+# Longest side of most images that scopenet was trained on: at twice the size it needs four times as long, and surfaces
+# are less consistent.
+_SCOPENET_PX = 160
+_LEAST_PX = 32  # of the longest side, as of an input's; flow needs 12
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,7 @@ class AnchoredDepth:
         self._reference = reference
         self._conversion: AffineDisparity | DepthScale | None = None
         self._description = "not anchored: no usable frame yet"
+        self._is_known = False
         self._frames_held = 0
         self._pivot: float | None = None
 
@@ -90,6 +98,14 @@ class AnchoredDepth:
     def description(self) -> str:
         """The source of the scale, for people: for instance "near-far 13.5:100 mm"."""
         return self._description
+
+    @property
+    def scale_is_known(self) -> bool:
+        """Whether depth is measured, or anchored to a stated range or by Depth Pro; False: its millimetres are a guess.
+
+        What a network without an anchor, the shading prior or a factor says is a guess.
+        """
+        return self._is_known
 
     @property
     def reference(self) -> DepthEstimator:
@@ -201,6 +217,8 @@ class AnchoredDepth:
             first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
         self._description = self._describe(source, estimate, frame) + details
+        network = self._settings.backend if source == "own" else self._reference.name if source == "reference" else ""
+        self._is_known = estimate.kind == "measured" or source == "near-far" or network == "depth-pro"
         return first_mm, ""
 
     def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
@@ -239,7 +257,7 @@ class AnchoredDepth:
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
         if estimate.kind == "measured":
-            return "measured depth"
+            return MEASURED
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
@@ -263,6 +281,24 @@ class AnchoredDepth:
 def max_depth_mm(settings: DepthSettings) -> float:
     """Return the largest valid predicted depth, mm: `settings.max_depth_mm`, or the far end of near-far if larger."""
     return max(settings.max_depth_mm, *(settings.near_far_mm or (0.0,)))
+
+
+def depth_downscale(settings: DepthSettings, longest_px: int) -> int:
+    """Return what the working size is divided by for the estimation of depth.
+
+    longest_px : longest side of the working images. Raises `SettingsError` where too little would be left of it.
+    """
+    if settings.backend.startswith("files:"):
+        return 1  # nothing is estimated
+    if settings.downscale is not None:
+        most = max(longest_px // _LEAST_PX, 1)
+        if settings.downscale > most:
+            raise SettingsError(
+                f"depth.downscale={settings.downscale}: of images of {longest_px} px less than {_LEAST_PX} px would be "
+                f"left; at most {most} here"
+            )
+        return settings.downscale
+    return max(longest_px // _SCOPENET_PX, 1) if settings.backend == "scopenet" else 1
 
 
 def apply_power_law(depth_mm: np.ndarray, camera: PinholeCamera, exponent: float, pivot_mm: float) -> np.ndarray:

@@ -33,10 +33,11 @@ _C3VD_RANGE_MM = 100.0
 
 @dataclass(frozen=True)
 class _Scale:
-    """Millimetres per unit of depth, and the source of that number."""
+    """Millimetres per unit of depth, the source of that number, and whether it is more than a guess."""
 
     mm: float
     source: str
+    is_known: bool = True
 
 
 class FilesDepth:
@@ -82,6 +83,11 @@ class FilesDepth:
         values = _disparity(array) if self._kind == "disparity" else _depth(array, self._scale.mm)
         return DepthEstimate(self._rectified(values), self._kind)
 
+    @property
+    def scale_is_known(self) -> bool:
+        """False where the unit of the files is a guess, or that of a run of unknown scale."""
+        return self._scale.is_known
+
     def provenance(self) -> dict[str, str]:
         """Return the folder, the kind of values and, for depth, mm per unit with the reason."""
         origin = {"depth": f"{len(self._files)} files in {self._folder}", "depth_kind": self._kind}
@@ -107,7 +113,7 @@ class FilesDepth:
             return _Scale(calibrated_mm, "depth_scale of the input's calibration")
         if next(iter(self._files.values())).name.lower().endswith(("_depth.tiff", "_depth.tif")):
             return _Scale(_C3VD_RANGE_MM / np.iinfo(array.dtype).max, "C3VD's 0..100 mm")
-        return _Scale(1.0, "assumed; set depth.files_scale_mm if it is not so")
+        return _Scale(1.0, "assumed; set depth.files_scale_mm if it is not so", is_known=False)
 
     def _check(self, array: np.ndarray, file: Path) -> None:
         if self._only_type not in (None, array.dtype):
@@ -203,13 +209,15 @@ def _scale_in(folder: Path) -> _Scale | None:
     written, calibration = folder / "depth.json", folder / "camera.yaml"
     if written.exists():
         try:
-            return _Scale(float(json.loads(written.read_text(encoding="utf-8"))["scale_mm"]), written.name)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            stated = json.loads(written.read_text(encoding="utf-8"))
+            return _Scale(float(stated["scale_mm"]), written.name, bool(stated.get("scale_known", True)))
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"cannot read scale_mm in {written}: {error!r}") from None
     if calibration.exists():
         try:
-            storage = cv2.FileStorage(str(calibration), cv2.FILE_STORAGE_READ)
-        except (cv2.error, SystemError) as error:
+            text = calibration.read_text(encoding="utf-8")
+            storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        except (cv2.error, SystemError, OSError, ValueError) as error:
             raise InputError(f"cannot read depth_scale in {calibration}: {error}") from None
         # A node is a view into its storage, which must outlive it.
         node = storage.getNode("depth_scale")

@@ -23,7 +23,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
-from scopemap.depth.anchor import apply_power_law, ray_lengths
+from scopemap.depth.anchor import apply_power_law, depth_downscale, ray_lengths
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
 from scopemap.errors import check_shape
 from scopemap.flow.dis import DisFlow
@@ -178,7 +178,8 @@ def _pairs(sequence: Sequence, config: Config) -> Iterator[tuple[Frame, list[Fra
     masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
     count = config.depth.advanced.exponent_frames
     every = min(max(min(sequence.count or count, count) // _REFERENCES, 1), _REFERENCE_EVERY)
-    frames = [masker(frame) for frame in islice(sequence.frames(), count)]
+    downscale = depth_downscale(config.depth, max(sequence.camera.width, sequence.camera.height))
+    frames = [masker(frame).downscaled(downscale) for frame in islice(sequence.frames(), count)]
     usable = [frame.valid.mean() >= config.tracking.min_valid_share for frame in frames]
     for i in range(0, len(frames), every):
         if usable[i]:

@@ -9,15 +9,12 @@ from scopemap.flow.estimator import FlowEstimator, FlowPair
 
 
 class DisFlow(FlowEstimator):
-    """OpenCV's DIS flow on grey values, preset "medium".
-
-    smooth : False leaves the variational refinement out and goes down to whole pixels: noisier, but near tissue keeps
-    its parallax.
-    """
+    """OpenCV's DIS flow on grey values, preset "medium"."""
 
     name = "dis"
+    enough_px = 160
 
-    def __init__(self, *, smooth: bool = True) -> None:
+    def __init__(self) -> None:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         # Flow that begins near the truth needs fewer steps, and flow that only checks another fewer patches. A coarser
         # finest scale would let wrong matches pass: poses from frame to frame were a sixth worse.
@@ -25,9 +22,6 @@ class DisFlow(FlowEstimator):
         for dis in (self._near, self._check):
             dis.setGradientDescentIterations(12)
         self._check.setPatchStride(5)
-        if not smooth:
-            self._dis.setFinestScale(0)
-            self._dis.setVariationalRefinementIterations(0)
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""

@@ -18,6 +18,9 @@ class FlowEstimator(Protocol):
     """Optical flow between two images: pixel p of the first is seen at p + flow(p) in the second."""
 
     name: str
+    enough_px: int | None = None
+    """Longest side of images in which corners are found well enough to align their patches; None: no image is larger
+    than needed."""
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px (x, y), of two (H, W, 3) uint8 images of one size."""

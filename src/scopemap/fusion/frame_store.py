@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -39,13 +40,17 @@ class _Entry:
 
 
 class FrameStore:
-    """Stores frames with depth in one unnamed file, which is created with the first frame and deleted with the store.
+    """Stores frames with depth in one file, which is created with the first frame.
 
     folder : where that file is; None: the system's temporary folder. advice : what else helps where that is full.
+    name : of the file, which then stays when the store is closed, for a run to resume; "": it is deleted then.
     """
 
-    def __init__(self, folder: Path | None = None, advice: str = "") -> None:
-        self._folder = Path(tempfile.gettempdir() if folder is None else folder)
+    NOT_IN_CHECKPOINT = ("_folder",)
+    """Not in a checkpoint: a run may go on under another name of its folder."""
+
+    def __init__(self, folder: Path | None = None, advice: str = "", name: str = "") -> None:
+        self._folder, self._name = Path(tempfile.gettempdir() if folder is None else folder), name
         self._advice = f", {advice}" if advice else ""
         self._file: IO[bytes] | None = None
         self._entries: list[_Entry] = []
@@ -67,7 +72,7 @@ class FrameStore:
         ]
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile(dir=self._folder, prefix="scopemap")  # noqa: SIM115
+                self._file = self._opened("w+b")
             self._file.seek(0, os.SEEK_END)
             self._file.write(b"".join(parts))
             self._file.flush()
@@ -76,10 +81,37 @@ class FrameStore:
                 f"cannot store frames in {self._folder}: {error.strerror or error}; free space there{self._advice}"
             ) from None
         sizes = [len(part) for part in parts]
-        offset = self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
-        entry = (frame.index, frame.time_s, frame.camera, frame.T_world_camera, offset, sizes, _median_depth_mm(frame))
+        entry = (
+            frame.index,
+            frame.time_s,
+            frame.camera,
+            frame.T_world_camera,
+            self._end,
+            sizes,
+            _median_depth_mm(frame),
+        )
         self._place[frame.index] = len(self._entries)
         self._entries.append(_Entry(*entry))
+
+    def _opened(self, mode: str) -> IO[bytes]:
+        if not self._name:
+            return tempfile.TemporaryFile(dir=self._folder, prefix="scopemap")
+        return (self._folder / self._name).open(mode)
+
+    @property
+    def _end(self) -> int:
+        return self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
+
+    def sync(self) -> None:
+        """Have the disk hold what was stored. Raises `OSError` where it cannot."""
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+
+    def reopen(self) -> None:
+        """Open the file of the store that this one was restored from; frames put later are cut off."""
+        if self._entries:
+            self._file = self._opened("r+b")
+            self._file.truncate(self._end)
 
     def frame(self, index: int) -> Frame:
         """Return the frame with this number; any thread may call it."""
@@ -103,9 +135,10 @@ class FrameStore:
         return float(np.median(medians_mm)) if medians_mm else None
 
     def close(self) -> None:
-        """Delete the file."""
+        """Close the file."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # a full disk, which `put` has told
+                self._file.close()
 
     def _read(self, entry: _Entry) -> Frame:
         assert self._file is not None

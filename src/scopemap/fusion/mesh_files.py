@@ -13,30 +13,44 @@ from scopemap.geometry.rendering import vertex_colours
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
+_PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
 _WRITTEN_COLOURS, _COLOURS = "_COLOR_0", "COLOR_0"
 
 
-def save_mesh(mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None) -> list[Path]:
+def save_mesh(
+    mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None, *, comment: str = ""
+) -> list[Path]:
     """Write a mesh with vertex colours, world mm, as binary PLY and as GLB; return the files written.
 
     The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward), so a y-up viewer shows it upside
     down; vertex attributes such as `confidence` are properties there. The GLB is glTF's: metres, y up, thus 0.001 of
     the trajectory's unit with y and z negated; matt and visible from both sides, because a lumen is seen from inside
     and outside; linear colours of 16 bits (glTF 2.0, section 3.7.2.1), because 8 bits would hold dark sRGB levels 0 to
-    12 in two steps. Both have vertex normals. A mesh without faces gives no GLB.
+    12 in two steps. Both have vertex normals. A mesh without faces gives no GLB. The unit, the axes and `comment`, such
+    as that the scale is unknown, are comments in the PLY and `asset.extras` in the GLB.
     """
     written: list[Path] = []
     if ply_file is not None:
-        content = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=bool(len(mesh.faces)))
-        Path(ply_file).write_bytes(content)
+        Path(ply_file).write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
         written.append(Path(ply_file))
     if glb_file is not None and len(mesh.faces):
-        Path(glb_file).write_bytes(_glb(mesh))
+        Path(glb_file).write_bytes(_glb(mesh, comment))
         written.append(Path(glb_file))
     return written
 
 
-def _glb(mesh: trimesh.Trimesh) -> bytes:
+def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
+    """Return a mesh, or its vertices where it has no faces, as binary PLY with these comments; empty ones are left
+    out.
+    """
+    content = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=bool(len(mesh.faces)))
+    head, end, rest = content.partition(b"\nelement vertex")
+    for line in comments:
+        head += f"\ncomment {line}".encode() if line else b""
+    return head + end + rest
+
+
+def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
     R = T_GLTF_WORLD[:3, :3]
     rotated = trimesh.Trimesh(
         mesh.vertices @ R.T,
@@ -45,9 +59,12 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
         vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
         process=False,
     )
-    return trimesh.exchange.gltf.export_glb(
-        trimesh.Scene(rotated), include_normals=True, tree_postprocessor=_with_colours_and_material
-    )
+
+    def finish(tree: dict[str, Any]) -> None:
+        _with_colours_and_material(tree)
+        tree["asset"]["extras"] = {"unit": "m", "axes": "y up", "comment": comment}
+
+    return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), include_normals=True, tree_postprocessor=finish)
 
 
 def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:

@@ -350,8 +350,10 @@ class VoxelBlocks:
         slots = np.array([index.setdefault(key, len(index) + 1) for key in keys.tolist()], dtype=np.int64)
         capacity = len(self.voxels.weight)
         if len(index) >= capacity:
-            spare = _zeros(max(capacity // 2, len(index) + 1 - capacity))
-            self.voxels = Voxels(*(np.concatenate(pair) for pair in zip(self.voxels, spare, strict=True)))
+            larger = max(capacity * 5 // 4, len(index) + 1)
+            for array in self.voxels:
+                # In place, so that a large volume is not in memory twice; the new blocks are zero.
+                array.resize((larger, *array.shape[1:]), refcheck=False)
         return slots
 
     def find(self, coordinates: np.ndarray) -> np.ndarray:

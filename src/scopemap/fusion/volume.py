@@ -200,29 +200,48 @@ class SurfaceFusion:
         self.settings, self.store = settings, store
         self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
         """Whether frames are stored until the last one."""
-        self._volume = TsdfVolume(settings) if settings.enabled and not self.at_end else None
+        self.most_blocks: int | None = None
+        """Blocks in all volumes beyond which nothing more is fused at once; None: no limit."""
+        self._volumes: dict[int, TsdfVolume] = {}
         self._tracked_frames = 0
 
     @property
     def at_once(self) -> bool:
         """Whether frames are fused as they come."""
-        return self._volume is not None
+        return self.settings.enabled and not self.at_end
 
-    def put(self, frame: Frame) -> None:
-        """Store a frame, or fuse it if it has a pose and is an n-th one (`settings.every`)."""
+    @property
+    def is_full(self) -> bool:
+        """Whether the volumes of frames fused at once are as large as they may be."""
+        blocks = sum(volume.block_count for volume in self._volumes.values())
+        return self.most_blocks is not None and blocks >= self.most_blocks
+
+    def surface(self, map_number: int) -> trimesh.Trimesh:
+        """Return the surface of a map's frames fused at once so far, not finished; empty where there are none."""
+        volume = self._volumes.get(map_number)
+        return trimesh.Trimesh() if volume is None else volume.extract_mesh()
+
+    def forget(self, map_number: int) -> None:
+        """Drop the volume of a map's frames fused at once."""
+        self._volumes.pop(map_number, None)
+
+    def put(self, frame: Frame, map_number: int = 0) -> None:
+        """Store a frame, or fuse it in its map's volume if it has a pose and is an n-th one (`settings.every`)."""
         if self.at_end:
             self.store.put(frame)
-        elif self._volume is not None and frame.T_world_camera is not None:
-            if self._tracked_frames % self.settings.every == 0:
-                self._volume.integrate(frame)
+        elif self.at_once and frame.T_world_camera is not None:
+            volume = self._volumes.setdefault(map_number, TsdfVolume(self.settings))
+            if self._tracked_frames % self.settings.every == 0 and not self.is_full:
+                volume.integrate(frame)
             self._tracked_frames += 1
 
-    def fuse(self, frames: Iterable[Frame], main_frames: Collection[int]) -> FusedSurface:
+    def fuse(self, frames: Iterable[Frame], main_frames: Collection[int], map_number: int = 0) -> FusedSurface:
         """Return the surface of every n-th of the stored frames, all of which are consumed, or of those fused at once.
 
-        main_frames : numbers of those whose median depth the TSDF parameters follow.
+        main_frames : numbers of those whose median depth the TSDF parameters follow. map_number : of those fused at
+        once.
         """
-        volume, settings = self._volume, self.settings
+        volume, settings = self._volumes.get(map_number), self.settings
         median_mm = self.store.median_depth_mm(main_frames)
         if self.at_end and settings.enabled and (median_mm or settings.voxel_mm):
             volume = TsdfVolume(settings, choose_parameters(settings, median_mm))
@@ -234,3 +253,16 @@ class SurfaceFusion:
         notes = [] if settings.voxel_mm is not None else [volume.parameters.description]
         used = settings.model_copy(update=volume.parameters._asdict())
         return FusedSurface(volume.extract_mesh(), used, notes)
+
+
+def depth_warnings(medians_mm: list[float], settings: FusionSettings) -> list[str]:
+    """Return a warning where most of the scene, by its frames' median depths, is beyond the depth that is fused."""
+    if not settings.enabled or not medians_mm or settings.max_depth_mm is None:
+        return []
+    median_mm = float(np.median(medians_mm))
+    if median_mm <= settings.max_depth_mm:
+        return []
+    return [
+        f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
+        f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
+    ]

@@ -13,8 +13,8 @@ import trimesh
 from numba import njit, prange
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 
+from scopemap.fusion.mesh import marching_cubes
 from scopemap.geometry.rendering import vertex_colours
 
 _MOST_CELLS = 160  # along the longest side of the mesh
@@ -43,7 +43,7 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
     coarse = np.ceil(((high - low) / cell_mm + 2 * _MARGIN_CELLS) / _LEVELS[0]).astype(int)
     corner = (low + high - _LEVELS[0] * cell_mm * coarse) / 2
     facing = np.linalg.norm(mesh.area_faces @ mesh.face_normals) / max(float(mesh.area), 1e-12)
-    side, direction = (-1, "ascent") if facing > _ONE_WAY else (1, "descent")
+    side = -1 if facing > _ONE_WAY else 1
     planes, tree = (np.asarray(mesh.vertices), side * np.asarray(mesh.vertex_normals)), cKDTree(mesh.vertices)
     field = np.full(coarse, -float(_BAND_CELLS))
     for level in _LEVELS:
@@ -52,7 +52,8 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
         fixed = _set_distances(field, planes, tree, corner, level * cell_mm)
         _relax(field, fixed, _SWEEPS)
     field = _one_space(np.where(np.abs(field) < _SMALLEST_CELLS, np.copysign(_SMALLEST_CELLS, field), field))
-    vertices, faces, _, _ = marching_cubes(field.astype(np.float32), 0.0, gradient_direction=direction)
+    vertices, faces = marching_cubes(field, np.ones(np.array(field.shape) - 1, bool))
+    faces = faces[:, ::side]
     vertices = corner + (vertices + 0.5) * cell_mm
     distance_mm, nearest = tree.query(vertices)
     seen = distance_mm <= _SEEN_CELLS * cell_mm

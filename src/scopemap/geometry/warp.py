@@ -99,6 +99,15 @@ def moved_depth(
     return np.where(moved > 0, moved, np.float32(np.nan))
 
 
+def resampled(values: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """Return floats (H, W) of the same view at the size of `camera`, bilinear; nearest where that meets NaN."""
+    size = camera.width, camera.height
+    if values.shape == size[::-1]:
+        return values
+    smooth = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
+    return np.where(np.isnan(smooth), cv2.resize(values, size, interpolation=cv2.INTER_NEAREST), smooth)
+
+
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:
     """Smooth depth (H, W) float32 within surfaces, not across edges; NaN pixels stay NaN and do not count.
 

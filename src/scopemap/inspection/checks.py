@@ -15,8 +15,8 @@ from scopemap.io.video_format.interlacing import is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
-# A blurred frame has less than this share of the video's usual detail.
-_BLURRED_SHARE = 0.35
+BLURRED_SHARE = 0.35
+"""A blurred frame has less than this share of the video's usual detail."""
 # Mean red over the stronger of green and blue, of tissue in white light.
 _LEAST_REDNESS, _MOSTLY = 1.1, 0.9
 _UNEVEN, _UNEVEN_SHARE = 0.2, 0.05
@@ -135,7 +135,7 @@ def _blank(clip: Clip) -> Iterator[VideoFinding]:
 def _blurred(clip: Clip) -> Iterator[VideoFinding]:
     shown, detail = ~clip["blank"], clip["detail"]
     usual = np.median(detail[shown]) if shown.any() else 0.0
-    segments = clip.segments(shown & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2)
+    segments = clip.segments(shown & (detail < BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2)
     if segments:
         share = np.median(detail[covered(segments, len(clip))]) / usual
         message = (

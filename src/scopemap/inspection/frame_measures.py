@@ -31,7 +31,8 @@ class FrameMeasures:
     position : in the input, from 0, as `--frames` counts. index, time_s : from the reader.
     blank : whether it shows next to nothing that is not black. brightness : mean level in the field, 0-255.
     detail : the tracker's sharpness. change : mean difference from the last frame that was no repeat, grey levels.
-    motion : median flow since the frame before, share of the width.
+    motion : median flow since the frame before, share of the width. likeness : correlation with the frame before,
+        moved by that flow, -1 to 1; 1 for the first frame.
     redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the field.
     usable : share of the frame that a run would use.
     """
@@ -44,6 +45,7 @@ class FrameMeasures:
     detail: float
     change: float
     motion: float
+    likeness: float
     redness: float
     clipped: float
     dark: float
@@ -94,6 +96,7 @@ class FrameInspector:
         means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
         lit_share = np.count_nonzero(lit & inside) / count
         highlights = specular(cv2.min(low, blue), inside) & inside
+        motion, likeness = self._motion(small)
         measures = FrameMeasures(
             position=position,
             index=masked.index,
@@ -102,7 +105,8 @@ class FrameInspector:
             brightness=sum(cv2.mean(small, mask)[:3]) / 3,
             detail=sharpness(masked.rgb, masked.valid),
             change=self._change(rgb, small),
-            motion=self._motion(small),
+            motion=motion,
+            likeness=likeness,
             redness=means[0] / max(means[1], means[2], 1.0),
             clipped=np.count_nonzero(clipped) / count,
             dark=1 - lit_share,
@@ -122,13 +126,26 @@ class FrameInspector:
             self._kept = rgb, small
         return change
 
-    def _motion(self, small: np.ndarray) -> float:
+    def _motion(self, small: np.ndarray) -> tuple[float, float]:
+        """Return motion and likeness."""
         grey = cv2.cvtColor(smaller(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
         before, self._before = self._before, grey
         if before is None:
-            return 0.0
+            return 0.0, 1.0
         flow = self._flow.calc(before, grey, np.zeros((*grey.shape, 2), np.float32))
-        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1]
+        height, width = grey.shape
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        # Large shades agree whatever moves: fine ones tell.
+        fine, moved = _fine(before), cv2.remap(_fine(grey), x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
+        norm = float(np.sqrt((fine**2).mean() * (moved**2).mean()))
+        likeness = float((fine * moved).mean()) / norm if norm > 0 else 1.0
+        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / width, likeness
+
+
+def _fine(grey: np.ndarray) -> np.ndarray:
+    """Return a picture (H, W) uint8 without what is larger than some 10 pixels, float32."""
+    picture = grey.astype(np.float32)
+    return cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 4.0)
 
 
 def smaller(rgb: np.ndarray, longest_px: int) -> np.ndarray:

@@ -8,12 +8,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scopemap.config import InputSettings
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
 from scopemap.inspection import checks
 from scopemap.inspection.clip import Clip, VideoFinding
 from scopemap.inspection.container import check_container, read_container
+from scopemap.inspection.dangers import check_dangers, forecast
 from scopemap.inspection.field import Field, FieldWatcher
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
 from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher, ShareBox
@@ -60,6 +63,8 @@ class Inspection:
             "pictures": len(self.clip),
             "span_s": float(times_s[-1] - times_s[0]),
             "usual_rate_hz": self.clip.rate_hz,
+            "motion_per_frame_share": float(np.median(self.clip["motion"])),
+            "motion_fastest_share": float(np.percentile(self.clip["motion"], 95)),
             "repeated": int(checks.repeated(self.clip).sum()),
             "field": self.field.shape,
             "field_share": self.field.share,
@@ -68,11 +73,17 @@ class Inspection:
         return {name: value for name, value in facts.items() if value is not None}
 
     @property
+    def forecast(self) -> str:
+        """What a run can be expected to make of the video, in words."""
+        return forecast(self.clip)
+
+    @property
     def report(self) -> dict[str, Any]:
         """All of it but the pictures, as JSON has it; boxes as left, top, right, bottom, shares of width and height."""
         return {
             "path": str(self.path),
             "facts": self.facts,
+            "forecast": self.forecast,
             "findings": [asdict(finding) for finding in self.findings],
             "field": {"shape": self.field.shape, "share": self.field.share, "box": list(self.field.box)},
             "overlays": [asdict(overlay) for overlay in self.overlays],
@@ -124,6 +135,7 @@ def inspect(
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
         *checks.check_frames(clip),
+        *check_dangers(clip),
     ]
     return Inspection(
         path=sequence.path,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,14 +10,18 @@ import numpy as np
 from scopemap.inspection.checks import repeated
 from scopemap.inspection.frame_measures import InspectedFrame, smaller
 from scopemap.inspection.inspecting import Inspection
-from scopemap.report.canvas import headline, new_figure
+from scopemap.report.sheet import Plot, Sheet
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+Box = tuple[float, float, float, float]
+"""Left, top, width and height, px."""
+
+Band = tuple[str, tuple[tuple[int, int], ...]]
+"""Code of a finding, and the first and last frame of each part where it was found."""
 
 MASK_NAME = "mask.png"
 _SHOWN, _SHOWN_PX = 4, 640
-_WIDTH_IN, _LINE_IN, _BANDS_IN = 13.0, 1.0, 0.22
+_WIDTH_PX, _LEFT_PX, _HEAD_PX, _LINE_PX, _BAND_PX = 1300, 110, 50, 85, 20
+_LINE_COLOUR, _SHOWN_COLOUR = "#404040", "#9ecae1"
 _FIELD_COLOUR, _OVERLAY_COLOUR, _INSET_COLOUR = "#00e5ff", "#ffea00", "#ff00ff"
 _MASK_TINT = np.array([0.0, 90.0, 255.0])
 _LINES = (("detail", "detail"), ("brightness", "brightness"), ("motion", "motion, % of width"))
@@ -45,33 +48,19 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     """
     views = _chosen(inspection.samples)
     bands = [(f.code, f.segments) for f in inspection.findings if f.segments and f.code in _BANDS]
+    cell_px = (_WIDTH_PX - _LEFT_PX) / _SHOWN
     shapes = (views[0].rgb.shape, views[0].frame.rgb.shape)
-    rows_in = [_WIDTH_IN / _SHOWN * min(height / width, 1.6) + 0.25 for height, width, _ in shapes]
-    heights = [*rows_in, *[_LINE_IN] * len(_LINES), *([_BANDS_IN * len(bands) + 0.4] if bands else [])]
-    figure = new_figure(_WIDTH_IN, sum(heights) + 0.6)
-    grid = figure.add_gridspec(len(heights), _SHOWN, height_ratios=heights)
-    for column, view in enumerate(views):
-        _draw_found(figure.add_subplot(grid[0, column]), view, inspection)
-        _draw_masked(figure.add_subplot(grid[1, column]), view)
-    lower = [figure.add_subplot(grid[row, :]) for row in range(2, len(heights))]
-    positions, again = inspection.clip["position"], np.flatnonzero(repeated(inspection.clip))
-    for axes, (name, label) in zip(lower, _LINES, strict=False):
-        values = inspection.clip[name] * (100 if name == "motion" else 1)
-        axes.plot(positions, values, color="#404040", linewidth=1.0)
-        axes.plot(positions[again], values[again], ".", color=_BANDS["duplicates"], markersize=4)
-        axes.set_ylabel(label, fontsize=8)
-        axes.set_ylim(bottom=0)
-    if bands:
-        _draw_bands(lower[-1], bands)
-    for axes in lower:
-        for view in views:
-            axes.axvline(view.measures.position, color="#9ecae1", linewidth=0.8, zorder=0)
-        axes.set_xlim(positions[0] - 0.5, positions[-1] + 0.5)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
-    lower[-1].set_xlabel(f"frame, counted from 0{' (orange dots: repeated)' if again.size else ''}")
-    headline(figure, _title(inspection))
-    figure.savefig(file)
+    rows_px = [cell_px * min(height / width, 1.6) + 25 for height, width, _ in shapes]
+    bands_px = _BAND_PX * len(bands) + 14 * (len(bands) > 0)
+    sheet = Sheet(_WIDTH_PX, _HEAD_PX + sum(rows_px) + (_LINE_PX + 14) * len(_LINES) + bands_px + 50)
+    top = float(_HEAD_PX)
+    for row, draw in zip(rows_px, (_draw_found, _draw_masked), strict=True):
+        for column, view in enumerate(views):
+            draw(sheet, (_LEFT_PX + column * cell_px, top, cell_px - 8, row), view, inspection)
+        top += row
+    _draw_times(sheet, top, inspection, bands, [view.measures.position for view in views])
+    sheet.headline(_title(inspection))
+    sheet.save(file)
 
 
 def write_mask(inspection: Inspection, folder: Path) -> bool:
@@ -99,38 +88,70 @@ def _chosen(samples: tuple[InspectedFrame, ...]) -> list[InspectedFrame]:
     return [shown[place] for place in places]
 
 
-def _draw_found(axes: Axes, view: InspectedFrame, inspection: Inspection) -> None:
-    from matplotlib.patches import Polygon
-
-    picture = smaller(view.rgb, _SHOWN_PX)
-    size = np.array([picture.shape[1], picture.shape[0]])
-    axes.imshow(picture)
-    # Polygons are drawn in pixel centres.
+def _draw_found(sheet: Sheet, box: Box, view: InspectedFrame, inspection: Inspection) -> None:
+    left, top, width, height = sheet.picture(smaller(view.rgb, _SHOWN_PX), _below_title(box))
+    corner, size = np.array([left, top]) - 0.5, np.array([width, height])
     if inspection.field.shape != "full":
-        axes.add_patch(Polygon(inspection.field.outline * size - 0.5, fill=False, color=_FIELD_COLOUR, linewidth=1.2))
+        outline = np.vstack([inspection.field.outline, inspection.field.outline[:1]])
+        sheet.line(corner + outline * size, _FIELD_COLOUR, 2)
     boxes = [(one.box, _OVERLAY_COLOUR) for one in inspection.overlays]
     boxes += [(box, _INSET_COLOUR) for box in inspection.insets]
-    for (left, top, right, bottom), colour in boxes:
-        corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-        axes.add_patch(Polygon(corners * size - 0.5, fill=False, color=colour, linewidth=1.4))
-    axes.set_title(f"frame {view.measures.position}, {view.measures.time_s:.2f} s", fontsize=8)
-    axes.set_axis_off()
+    for (x0, y0, x1, y1), colour in boxes:
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        sheet.line(corner + corners * size, colour, 2)
+    title = f"frame {view.measures.position}, {view.measures.time_s:.2f} s"
+    sheet.text((box[0] + box[2] / 2, box[1] + 3), title, 12, anchor="ma")
 
 
-def _draw_masked(axes: Axes, view: InspectedFrame) -> None:
+def _draw_masked(sheet: Sheet, box: Box, view: InspectedFrame, inspection: Inspection) -> None:
     rgb = view.frame.rgb.astype(np.float64)
     rgb[~view.frame.valid] = 0.4 * rgb[~view.frame.valid] + 0.6 * _MASK_TINT
-    axes.imshow(rgb.round().astype(np.uint8))
-    axes.set_title(f"in a run: {view.measures.usable:.0%} usable", fontsize=8)
-    axes.set_axis_off()
+    sheet.picture(rgb.round().astype(np.uint8), _below_title(box))
+    title = f"in a run: {view.measures.usable:.0%} usable"
+    sheet.text((box[0] + box[2] / 2, box[1] + 3), title, 12, anchor="ma")
 
 
-def _draw_bands(axes: Axes, bands: list[tuple[str, tuple[tuple[int, int], ...]]]) -> None:
+def _below_title(box: Box) -> Box:
+    left, top, width, height = box
+    return left, top + 20, width, height - 25
+
+
+def _draw_times(sheet: Sheet, top: float, inspection: Inspection, bands: list[Band], shown: list[int]) -> None:
+    """Draw the figures over time, and a band for each kind of finding, from `top` px downwards."""
+    positions, again = inspection.clip["position"], np.flatnonzero(repeated(inspection.clip))
+    x, width = (float(positions[0]) - 0.5, float(positions[-1]) + 0.5), _WIDTH_PX - _LEFT_PX - 10.0
+    heights = [_LINE_PX] * len(_LINES) + [_BAND_PX * len(bands)] * (len(bands) > 0)
+    for row, height in enumerate(heights):
+        name, label = _LINES[row] if row < len(_LINES) else ("", "")
+        values = np.zeros(0) if not name else inspection.clip[name] * (100 if name == "motion" else 1)
+        known = values[np.isfinite(values)]
+        most = 1.15 * float(known.max()) if known.size and known.max() > 0 else 1.0
+        plot = Plot(sheet, (_LEFT_PX, top, width, height), x, (0.0, most) if name else (float(len(bands)), 0.0))
+        last = row == len(heights) - 1
+        if name:
+            plot.frame(
+                f"frame, counted from 0{' (orange dots: repeated)' if again.size else ''}" * last, x_numbers=last
+            )
+        for position in shown:
+            sheet.line(plot.place(np.array([[position, plot.y[0]], [position, plot.y[1]]])), _SHOWN_COLOUR)
+        if name:
+            places = plot.place(np.column_stack([positions, values]))
+            sheet.line(places, _LINE_COLOUR)
+            sheet.dots(places[again], _BANDS["duplicates"], 2)
+            sheet.text((_LEFT_PX + 6, top + 3), label, 12)
+        else:
+            _draw_bands(plot, bands)
+            sheet.text((_LEFT_PX + width / 2, top + height + 6), "frame, counted from 0", 12, anchor="ma")
+        top += height + 14
+
+
+def _draw_bands(plot: Plot, bands: list[Band]) -> None:
     for row, (code, segments) in enumerate(bands):
-        spans = [(first - 0.5, last - first + 1) for first, last in segments]
-        axes.broken_barh(spans, (row - 0.4, 0.8), color=_BANDS[code])
-    axes.set_yticks(range(len(bands)), [code for code, _ in bands], fontsize=8)
-    axes.set_ylim(len(bands) - 0.5, -0.5)
+        for first, last in segments:
+            (left, top), (right, bottom) = plot.place(np.array([[first - 0.5, row + 0.1], [last + 0.5, row + 0.9]]))
+            plot.sheet.fill((left, top, max(right - left, 1), bottom - top), _BANDS[code])
+        middle = plot.place(np.array([[plot.x[0], row + 0.5]]))[0]
+        plot.sheet.text((middle[0] - 6, middle[1]), code, 11, anchor="rm")
 
 
 def _title(inspection: Inspection) -> str:

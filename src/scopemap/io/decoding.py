@@ -1,4 +1,4 @@
-"""Decoding of images and archives from files of unknown origin: limits of pixels and bytes, checked before decoding.
+"""Reading and writing of images; limits of pixels and bytes for files of unknown origin, checked before decoding.
 
 The limit is 64 million pixels an image; the environment variable `SCOPEMAP_MAX_MEGAPIXELS` sets another (up to what
 Pillow opens, 178 million, but for TIFF).
@@ -21,6 +21,7 @@ from scopemap.errors import InputError
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNG, _MOST_MISSING_BYTES = b"\x89PNG\r\n\x1a\n", 16 << 20
 _WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
 
 
@@ -31,6 +32,8 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
     """
     claimed = _claimed_pixels(content)
     check_pixels(claimed)
+    if content.startswith(_PNG) and not _holds_its_chunks(content):
+        return None
     with suppress(cv2.error):
         return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags) if claimed else None
     return None
@@ -45,6 +48,14 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
         return None
     except InputError as error:
         raise InputError(f"reading {file}: {error}") from None
+
+
+def write_encoded(file: Path, image: np.ndarray) -> None:
+    """Write an image as OpenCV has it (BGR) in the format of the file's ending.
+
+    OpenCV's own functions for files take no names outside of the system's code page on Windows. Raises `OSError`.
+    """
+    file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())
 
 
 def first_bytes(file: Path, count: int) -> bytes:
@@ -74,6 +85,17 @@ def most_pixels() -> float:
         return 1e6 * (float(text) if text else _MOST_MEGAPIXELS)
     except ValueError:
         raise InputError(f"the environment variable {_VARIABLE} must be a number, got '{text}'") from None
+
+
+def _holds_its_chunks(content: bytes) -> bool:
+    """Return whether no chunk of a PNG claims far more bytes than follow: OpenCV takes the memory for up to 4 GB."""
+    at = len(_PNG)
+    while at + 8 <= len(content):
+        length = int.from_bytes(content[at : at + 4], "big")
+        if length > len(content) - at + _MOST_MISSING_BYTES:
+            return False
+        at += 12 + length
+    return True
 
 
 def _claimed_pixels(content: bytes) -> float:

@@ -19,7 +19,7 @@ def cpu_threads() -> int:
 def missing_packages(what: str, *packages: str) -> str:
     """Return which of the packages that `what` needs are not installed and how to install them; "" where all are."""
     missing = [package for package in packages if find_spec(package) is None]
-    return f"{what} needs {' and '.join(missing)}: pip install 'scopemap[networks]'" if missing else ""
+    return f"{what} needs {' and '.join(missing)}: pip install -e '.[networks]'" if missing else ""
 
 
 def need_packages(what: str, *packages: str) -> None:

@@ -24,7 +24,7 @@ LEAST_DIFFERENCE = 0.5
 
 # Black borders are the same in all frames: they are not compared.
 _BLACK_LEVEL = 16
-_LONGEST_SIDE_PX = 480
+_COMPARED_SIDE_PX = 160  # at least; every n-th pixel of larger pictures is compared
 # Rounding of stamps to milliseconds must not skip a frame; the tolerance is at most a share of a frame.
 _SLACK_S, _SLACK_SHARE = 1e-3, 0.25
 
@@ -78,7 +78,7 @@ def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
 
     All pixels are compared where both images are black.
     """
-    step = max(1, min(one.shape[:2]) // _LONGEST_SIDE_PX)
+    step = max(1, min(one.shape[:2]) // _COMPARED_SIDE_PX)
     one, other = (np.ascontiguousarray(rgb[::step, ::step]) for rgb in (one, other))
     difference, (red, green, blue) = cv2.absdiff(one, other), cv2.split(cv2.max(one, other))
     lit = (cv2.max(cv2.max(red, green), blue) > _BLACK_LEVEL).astype(np.uint8)

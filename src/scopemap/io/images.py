@@ -35,7 +35,12 @@ def frame_number(path: Path) -> int | None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the colour images in `folder` in numeric order; not depth, not masks; none where it is no folder."""
+    """Return the colour images in `folder` in numeric order; not depth, not masks; none where it is no folder.
+
+    The pictures of a result in a run's folder are no frames.
+    """
+    if all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json")):
+        return []
     files = sorted(_images_in(folder), key=numeric_order)
     return [file for file in files if not _COMPANION.search(file.stem)]
 

@@ -31,6 +31,7 @@ from scopemap.io.datasets.sevenscenes import SevenScenesFolder
 from scopemap.io.datasets.simcol import SimColFolder
 from scopemap.io.datasets.stereomis import StereoMisFolder
 from scopemap.io.datasets.tum import TumRgbdFolder
+from scopemap.io.decoding import most_pixels
 from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.images import ImageFolder
 from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
@@ -51,9 +52,11 @@ _OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
 # Those that need no folder inside that of the input.
 _WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
 _IMAGES = "images"
-_MOST_NAMED = 3
+VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm", ".ts", ".mts", ".m2ts")
+_MOST_NAMED = 5
 _USUAL_FOV_DEG = 70.0
-_SMALLEST_SIDE_PX = 32
+_SMALLEST_SIDE_PX, _LARGEST_SIDE_PX = 32, 32_000  # OpenCV's `remap` ends at 32767
+_LEAST_SEEN_SHARE = 0.05
 _SEARCH_DEPTH = 5
 _DEEPEST_CLOSED, _MOST_FOLDERS = 4, 500
 
@@ -76,11 +79,28 @@ def open_sequence(
     `settings.longest_side_px`. `frames` selects positions in the input. `settings` are those of reading. Raises
     `InputError` and `CalibrationError`.
     """
-    selection, settings = frames or slice(None), settings or InputSettings()
-    if selection.step is not None and selection.step <= 0:
-        raise InputError(f"selecting frames: the step must be positive, got {selection.step}")
+    if frames is not None and frames.step is not None and frames.step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
     with _errors_of_the_system(path):
         reader = _reader(Path(path), dataset)
+    sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)
+    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
+        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected, two are needed")
+    return sequence
+
+
+def sequence_of(
+    reader: Source,
+    *,
+    camera: Path | str | None = None,
+    fov_deg: float | None = None,
+    size: tuple[int, int] | None = None,
+    frames: slice | None = None,
+    settings: InputSettings | None = None,
+) -> Sequence:
+    """Return the frames of a reader as `open_sequence` returns those of a path."""
+    settings = settings or InputSettings()
+    with _errors_of_the_system(reader.path):
         source = prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
     size_source = "chosen" if size is None else "given (--size)"
@@ -89,9 +109,15 @@ def open_sequence(
         raise InputError(
             f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
         )
+    if max(size) > _LARGEST_SIDE_PX or size[0] * size[1] > most_pixels():
+        most = f"{_LARGEST_SIDE_PX} px a side and {most_pixels() / 1e6:g} million pixels at most"
+        raise InputError(f"the working size {size[0]}x{size[1]} px is too large: {most}; give another by --size")
     size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
     rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
-    sequence = Sequence(
+    if (seen := float(rectifier.valid.mean())) < _LEAST_SEEN_SHARE:
+        rest = f"{seen:.1%} of the picture remains without its distortion; check the distortion coefficients"
+        raise CalibrationError(f"{calibration.name} is that of no lens: {rest}")
+    return Sequence(
         source,
         source.path,
         rectifier,
@@ -99,13 +125,10 @@ def open_sequence(
         size_source=size_source,
         calibrated=calibrated,
         focal_is_stated=fov_deg is not None,
-        selection=selection,
+        selection=frames or slice(None),
         depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
         choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
     )
-    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
-        raise InputError(f"reading {source.path}: {sequence.count} frame(s) selected, two are needed")
-    return sequence
 
 
 def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
@@ -137,7 +160,10 @@ def _reader(path: Path, dataset: str | None) -> Source:
         raise InputError(f"reading {path}: it is no file and no folder")
     closed = _closed_folders(path) if path.is_dir() else []
     path = _innermost(path, dataset or None) if path.is_dir() else path
-    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), ImageFolder.name)
+    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "")
+    if not kind and path.is_dir():
+        _refuse_videos(path)
+    kind = kind or ImageFolder.name
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
         raise InputError(f"reading {path} as {kind}: it is a {'file' if path.is_file() else 'folder'}")
     if part and kind != RosBag.name:
@@ -148,6 +174,15 @@ def _reader(path: Path, dataset: str | None) -> Source:
     reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
     reader.warnings += [f"left out: no permission to look into {folder}" for folder in closed[:_MOST_NAMED]]
     return reader
+
+
+def _refuse_videos(folder: Path) -> None:
+    """Raise `InputError` where a folder without images holds videos: one of them is meant."""
+    videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_ENDINGS and path.is_file())
+    if videos:
+        named = ", ".join(path.name for path in videos[:_MOST_NAMED]) + (", ..." * (len(videos) > _MOST_NAMED))
+        one = f"give one of them, such as {videos[0]}"
+        raise InputError(f"reading {folder}: it holds {len(videos)} video(s) ({named}) and no images; {one}")
 
 
 def _closed_folders(folder: Path) -> list[Path]:
@@ -208,7 +243,13 @@ def _folders_in(path: Path) -> list[Path]:
     with os.scandir(path) as entries:  # it knows folders without asking for each file
         found = [entry for entry in entries if entry.is_dir(follow_symlinks=False) or entry.is_symlink()]
         names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
+    names = [name for name in names if not _leads_up(path / name)]
     return sorted(path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
+
+
+def _leads_up(folder: Path) -> bool:
+    """Return whether a folder is a link to one that it is in: out of the input, or round in a circle."""
+    return folder.is_symlink() and folder.parent.resolve().is_relative_to(folder.resolve())
 
 
 def _calibration_of(
@@ -233,9 +274,9 @@ def _calibration_of(
     unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True
-    known, fov_deg = ("assumed", _USUAL_FOV_DEG) if fov_deg is None else ("stated", fov_deg)
+    known, fov_deg, option = ("assumed", _USUAL_FOV_DEG, "") if fov_deg is None else ("stated", fov_deg, " (--fov)")
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
     focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)
-    assumed = f"{known}: horizontal field of view {fov_deg:g} deg (--fov){unfitted}"
+    assumed = f"{known}: horizontal field of view {fov_deg:g} deg{option}{unfitted}"
     return Calibration(assumed_camera(source, float(focal_px)), None, assumed), False

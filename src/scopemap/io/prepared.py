@@ -21,7 +21,7 @@ from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_v
 UNKNOWN_MAKE = ("video", "images", "dicom")
 """Readers without a data set: stereo packing and interlacing are detected, repeated frames are skipped."""
 
-OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag")
+OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag", "live")
 """Readers for which `input.stereo` may name the stereo packing; other data sets define their view."""
 
 _SAMPLES, _SAMPLED_EVERY = 8, 10

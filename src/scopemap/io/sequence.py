@@ -98,10 +98,16 @@ class Sequence:
                 depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
                 yield frame, Truth(frame.index, truth.T_world_camera, depth_mm, truth.quality)
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two."""
+    def frames(self, after: int = -1) -> Iterator[Frame]:
+        """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two.
+
+        after : number of a frame; it and those before are read, so that later ones are chosen as ever, but not yielded.
+        """
         found = 0
         for item in self.choice(self.source.frames(self.selection)):
+            if item.index <= after:
+                found += 1
+                continue
             rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
             yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
             found += 1

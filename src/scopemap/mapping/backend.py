@@ -19,7 +19,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
     depth_disagreement,
@@ -123,10 +123,13 @@ class Backend:
         self._tracked = [pose._replace(map=maps[pose.map, pose.segment]) for pose in self._tracked]
         return maps
 
-    def _finish(self) -> None:
-        """Wait for the features of all keyframes."""
+    def settle(self) -> None:
+        """Wait for the features of all keyframes so far."""
         while self._pending:
             self._pending.popleft().result()
+
+    def _finish(self) -> None:
+        self.settle()
         self._worker.shutdown()
 
     def adjust(
@@ -183,11 +186,11 @@ class Backend:
         map_of = np.array([self._tracked[k].map for k in chosen])
         problem, loops = self._problem(chosen, worlds, self._camera)
         points, observations = problem.points, problem.observations
-        found = adjust(problem)
+        found = adjust_in_windows(problem)
         refused, fields = self._judged(chosen, problem, found, worlds)
         if problem.start is not None and refused:
             # Loop closures may be wrong: adjust without them.
-            found, loops = adjust(replace(problem, start=None)), 0
+            found, loops = adjust_in_windows(replace(problem, start=None)), 0
             refused, fields = self._judged(chosen, problem, found, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
         length_px = errors_px(problem, found.state)

@@ -12,11 +12,14 @@ that share a small bias outweigh everything that is known of the scale along the
 the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these factors to 1; the fourth holds a
 keyframe j to its tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement:
 Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
+
+More than a few hundred keyframes are adjusted window by window, so that time grows with their number, not its cube.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -26,13 +29,24 @@ from scipy import sparse
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, PointBlock, SchurModel, cauchy, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
-from scopemap.mapping.reprojection import BundleProblem, Reprojection, State, jacobians, reproject
+from scopemap.mapping.reprojection import (
+    BundleProblem,
+    Observations,
+    Points,
+    Reprojection,
+    State,
+    jacobians,
+    reproject,
+)
 
 _PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
+WINDOW = 300
+"""Most keyframes that are adjusted at once."""
+_HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
 @dataclass(frozen=True)
@@ -54,6 +68,64 @@ class BundleSolution:
     def sigma_px(self) -> float:
         """Robust standard deviation of the reprojection errors, px; NaN without observations."""
         return self.state.sigma_px
+
+
+def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
+    """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`.
+
+    Keyframes of earlier windows that share points with a window are held, and their points by what is known of them.
+    """
+    start, count = problem.tracked if problem.start is None else problem.start, len(problem.T_camera_world)
+    if count <= window:
+        return adjust(problem)
+    found = BundleSolution(start, np.full(len(start.log_depth), np.inf), 0)
+    # Equally long windows: a last one of few keyframes would hardly be adjusted.
+    edges = np.linspace(0, count, -(-count // window) + 1).astype(int)
+    for first, end in itertools.pairwise(edges):
+        found = _with_window(problem, found, first, end)
+    lengths_px = errors_px(problem, found.state)
+    sigma_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)], problem.least_sigma_px)
+    return replace(found, state=found.state._replace(sigma_px=sigma_px))
+
+
+def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end: int) -> BundleSolution:
+    """Return the solution with the keyframes from `first` to before `end` adjusted, those before `first` being so."""
+    points, seen, state = problem.points, problem.observations, found.state
+    moved = state.T_camera_world.copy()
+    if first:  # The window goes on from where the one before has ended.
+        at_start = (problem.tracked if problem.start is None else problem.start).T_camera_world
+        moved[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ moved[first - 1]
+    host, observer = points.host[seen.point], seen.keyframe
+    some = (np.maximum(host, observer) >= first) & (np.maximum(host, observer) < end)
+    if not some.any():
+        return replace(found, state=state._replace(T_camera_world=moved))
+    keyframes = np.union1d(np.union1d(host[some], observer[some]), np.arange(max(first - 1, 0), end))
+    own = np.union1d(seen.point[some], np.flatnonzero((points.host >= first) & (points.host < end)))
+    place = np.full(len(state.T_camera_world), -1)
+    place[keyframes] = np.arange(len(keyframes))
+    known, log_scale = points.host[own] < first, state.log_scale[points.host[own]]
+    part = BundleProblem(
+        problem.T_camera_world[keyframes],
+        Points(
+            place[points.host[own]],
+            points.pixel[own],
+            np.where(known, state.log_depth[own] - log_scale, points.log_depth[own]),
+            np.where(known, np.clip(found.log_depth_sigma[own], _HELD_SIGMA, points.sigma[own]), points.sigma[own]),
+        ),
+        Observations(np.searchsorted(own, seen.point[some]), place[seen.keyframe[some]], seen.pixel[some]),
+        problem.priors,
+        place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
+        problem.focal_px,
+        start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.lens),
+        least_sigma_px=problem.least_sigma_px,
+        correlated=problem.correlated,
+        held=int((keyframes < first).sum()),
+    )
+    solved, new = adjust(part), ~known
+    log_depth, sigma, log_scale = state.log_depth.copy(), found.log_depth_sigma.copy(), state.log_scale.copy()
+    log_depth[own[new]], sigma[own[new]] = solved.state.log_depth[new], solved.log_depth_sigma[new]
+    moved[keyframes], log_scale[keyframes] = solved.state.T_camera_world, solved.state.log_scale
+    return BundleSolution(State(moved, log_scale, log_depth, state.lens), sigma, found.iterations + solved.iterations)
 
 
 def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
@@ -98,7 +170,8 @@ def linearised(problem: BundleProblem, state: State) -> SchurModel:
     seen = reproject(problem, state)
     edges = _odometry_edges(problem, state)
     held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
-    free = np.setdiff1d(np.arange(_PER_KEYFRAME * count + lens), np.concatenate([np.arange(6), *held]))
+    held += [np.arange(6), np.arange(_PER_KEYFRAME * problem.held)]
+    free = np.setdiff1d(np.arange(_PER_KEYFRAME * count + lens), np.concatenate(held))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
         parts = _Rows(seen.error, _weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))

@@ -18,6 +18,8 @@ _STATIC_PX = 2.0
 # With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
 _MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same keyframe, loops to one keyframe
 _MAX_PAIRS = 60  # features of a loop
+MOST_SEARCHED = 400
+"""Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,9 @@ class LoopFinder:
 
     def __init__(self, settings: MappingSettings) -> None:
         self._min_inliers, self._max_gap = settings.min_loop_inliers, max(settings.advanced.keyframe_gaps)
-        self._features: list[Features] = []
-        self._map_of: list[int] = []
+        self._features: dict[int, Features] = {}
+        self._map_of: dict[int, int] = {}
+        self._count, self._every = 0, 1
         self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
 
     def add(self, keyframe: Frame, map_number: int = 0) -> list[Loop]:
@@ -74,8 +77,12 @@ class LoopFinder:
                 self._loops_to[past].append(loop.new)
                 loops.append(loop)
         # Half precision distinguishes descriptors as well, in half of the memory.
-        self._features.append(replace(new, descriptors=new.descriptors.astype(np.float16)))
-        self._map_of.append(map_number)
+        self._features[self._count] = replace(new, descriptors=new.descriptors.astype(np.float16))
+        self._map_of[self._count] = map_number
+        self._count += 1
+        if len(self._features) > MOST_SEARCHED:
+            self._every *= 2
+            self._features = {k: own for k, own in self._features.items() if k % self._every == 0}
         return loops
 
     def _loop(self, past: int, new: Features, keyframe: Frame, other_map: bool) -> Loop | None:
@@ -93,19 +100,21 @@ class LoopFinder:
         if np.isfinite(ratio).sum() < min(self._min_inliers, _MAX_PAIRS) // 2:
             return None
         log_ratio, pixels = float(np.nanmedian(ratio)), (old.pixels[one], new.pixels[other])
-        return Loop(past, len(self._features), T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
+        return Loop(past, self._count, T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
 
     def _candidates(self, new: Features, map_number: int) -> list[int]:
         """Numbers of the most similar keyframes, of this map and of others.
 
         The last keyframes of this map are left out: flow matches them already.
         """
-        map_of, strongest = np.array(self._map_of, dtype=int), new.descriptors[:_STRONGEST]
-        own, elsewhere = np.flatnonzero(map_of == map_number), np.flatnonzero(map_of != map_number)
+        kept, strongest = list(self._features), new.descriptors[:_STRONGEST]
+        recent = [k for k, number in self._map_of.items() if number == map_number][-self._max_gap :]
+        own = [k for k in kept if self._map_of[k] == map_number and k not in recent]
+        elsewhere = [k for k in kept if self._map_of[k] != map_number]
         candidates: list[int] = []
-        for some in (own[: max(len(own) - self._max_gap, 0)], elsewhere):
+        for some in (own, elsewhere):
             similarity = np.array([self._similarity(strongest, self._features[k]) for k in some])
-            ranked = [int(some[k]) for k in np.argsort(-similarity, kind="stable") if similarity[k] > 0]
+            ranked = [some[k] for k in np.argsort(-similarity, kind="stable") if similarity[k] > 0]
             candidates += [k for k in ranked if self._allows_loop(k)][:_CANDIDATES]
         return candidates
 
@@ -122,4 +131,4 @@ class LoopFinder:
 
     def _allows_loop(self, past: int) -> bool:
         loops = self._loops_to[past]
-        return len(loops) < _MAX_LOOPS and (not loops or len(self._features) - loops[-1] >= _MIN_INTERVAL)
+        return len(loops) < _MAX_LOOPS and (not loops or self._count - loops[-1] >= _MIN_INTERVAL)

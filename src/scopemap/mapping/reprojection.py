@@ -75,7 +75,8 @@ class BundleProblem:
     T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
     keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
     to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
-    correlated : so many observations count as one, since errors of flow are alike at neighbouring corners.
+    correlated : so many observations count as one, since errors of flow are alike at neighbouring corners. held : so
+    many first keyframes keep pose and scale; the first one keeps its pose in any case.
     """
 
     T_camera_world: np.ndarray
@@ -88,6 +89,7 @@ class BundleProblem:
     lens: UnknownLens | None = None
     least_sigma_px: float = 0.1
     correlated: float = 1.0
+    held: int = 0
 
     @property
     def unit_mm(self) -> float:

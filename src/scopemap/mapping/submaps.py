@@ -70,6 +70,16 @@ class Mapper:
             part, found_in = (self._tracked[index] for index in (track.index, track.keyframe))
             self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
 
+    def settle(self) -> None:
+        """Wait for what was begun in other threads."""
+        if self._backend is not None:
+            self._backend.settle()
+
+    def forget(self, indices: Collection[int]) -> None:
+        """Forget where these frames were tracked: they are in no submap."""
+        for index in indices:
+            self._tracked.pop(index, None)
+
     def add_keyframe(self, keyframe: Frame, track: Track) -> None:
         """Take a keyframe with refined depth and pose, to be adjusted with the others; before it is observed."""
         if self._backend is not None:

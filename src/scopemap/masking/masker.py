@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from scopemap.config import MaskSettings
-from scopemap.frame import Frame, is_constant
+from scopemap.frame import Frame, is_constant, percentiles
 from scopemap.masking.overlays import OverlayFinder
 
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
@@ -130,7 +130,7 @@ def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:
     """
     if not field.any():
         return np.zeros_like(field)
-    surroundings = _local_median(np.where(field, darkest, np.median(darkest[field])).astype(np.uint8))
+    surroundings = _local_median(np.where(field, darkest, percentiles(darkest[field], [50.0])[0]).astype(np.uint8))
     return (darkest > _HIGHLIGHT_RATIO * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
 
 

@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 import trimesh
 from scipy import ndimage
-from skimage.measure import marching_cubes
 
 from scopemap.errors import InputError
+from scopemap.fusion.mesh import marching_cubes
+from scopemap.io.decoding import write_encoded
 from scopemap.phantom.coding import VideoCoding
 from scopemap.phantom.render import Phantom, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
@@ -46,13 +47,13 @@ def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
         values = ndimage.convolve1d(values, np.array([1, 4, 1]) / 6, axis=axis, mode="nearest")
     if not where.any() or values[where].min() > 0 or values[where].max() < 0:
         raise InputError("no tissue is in sight of the camera path: nothing to make a true mesh of")
-    vertices, faces, _, _ = marching_cubes(values, 0.0, mask=where, gradient_direction="descent")
-    points = vertices.astype(np.float64) * volume.voxel_mm + volume.origin_mm
+    vertices, faces = marching_cubes(values, where[1:, 1:, 1:])
+    points = vertices * volume.voxel_mm + volume.origin_mm
     for _ in range(_NEWTON_STEPS):
         value, gradient = volume.values_at(points)
         shift = -(value / (gradient**2).sum(1))[:, None] * gradient
         points = points + np.clip(np.nan_to_num(shift), -0.5 * volume.voxel_mm, 0.5 * volume.voxel_mm)
-    return trimesh.Trimesh(points, faces.astype(np.int64), process=False)
+    return trimesh.Trimesh(points, faces, process=False)
 
 
 def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
@@ -78,8 +79,8 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
             rgb, surface = render_frame(phantom, index)
             seen[phantom.volume.cells_of(surface.rest_mm)] = True
             rgb = rgb if coding is None else coding(rgb)
-            _write_image(folder / f"{index:04d}_color.png", rgb[..., ::-1])
-            _write_image(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
+            write_encoded(folder / f"{index:04d}_color.png", rgb[..., ::-1])
+            write_encoded(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
             if progress is not None:
                 progress(index + 1, len(phantom.poses))
         _write_meshes(phantom, seen_surface(phantom.volume, seen), folder)
@@ -100,20 +101,15 @@ def _check_free(folder: Path) -> None:
         raise InputError(f"will not write a phantom into {folder}: it holds other files; name a new or empty folder")
 
 
-def _write_image(file: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(file), image):
-        raise OSError(f"{file.name} could not be encoded or stored")
-
-
 def _write_camera(spec: PhantomSpec, file: Path) -> None:
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage = cv2.FileStorage(file.name, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", spec.width)
     storage.write("image_height", spec.height)
     storage.write("camera_matrix", spec.camera.matrix)
     storage.write("distortion_coefficients", np.zeros((1, 5)))
     storage.write("depth_scale", spec.depth_scale_mm)
     storage.write("fps", spec.fps)
-    storage.release()
+    file.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
 def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None:

@@ -1,9 +1,11 @@
-"""The sheet that pictures are drawn on: matplotlib without a display and without any state of its own."""
+"""Figures of benchmarks by matplotlib, the extra `figures`: without a display and without any state of its own."""
 
 from __future__ import annotations
 
 import textwrap
 from typing import TYPE_CHECKING
+
+from scopemap.errors import SettingsError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -15,11 +17,13 @@ _LETTERS_PER_INCH = 12
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure of this size in inches, 100 dots per inch."""
+    """Return an empty figure of this size in inches, 100 dots per inch. Raises `SettingsError` without matplotlib."""
     # Imported here, so that importing the package stays fast; a Figure with its own canvas keeps no global state.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise SettingsError("figures of benchmarks need matplotlib: pip install -e '.[figures]'") from None
     figure = Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

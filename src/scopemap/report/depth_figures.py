@@ -12,11 +12,13 @@ import numpy as np
 
 from scopemap.errors import check_shape
 from scopemap.report.canvas import new_figure
+from scopemap.report.sheet import picture_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _CHANGE_COLOURS = "YlOrRd"
+_CELL_PX = (300, 250)
 
 
 @dataclass(frozen=True)
@@ -57,30 +59,22 @@ def draw_depths(images: Sequence[np.ndarray], depths_mm: Mapping[str, Sequence[n
             f"drawing depths of {len(images)} images: give one or more, and as many depth maps of each kind"
         )
     near_mm, far_mm = _percentiles([depth for depths in depths_mm.values() for depth in depths if depth is not None])
-    figure = new_figure(3.0 * (1 + len(depths_mm)), 2.5 * len(images))
-    grid = figure.subplots(len(images), 1 + len(depths_mm), squeeze=False)
-    for axes, title in zip(grid[0], ("image", *depths_mm), strict=True):
-        axes.set_title(title)
-    for row, image, depths in zip(grid, images, zip(*depths_mm.values(), strict=True), strict=True):
-        row[0].imshow(image)
-        for axes, depth in zip(row[1:], depths, strict=True):
-            axes.imshow(np.zeros_like(image) if depth is None else colour_depth(depth, near_mm, far_mm))
-    for axes in grid.ravel():
-        axes.set_axis_off()
-    figure.suptitle(f"blue {near_mm:.0f} mm .. red {far_mm:.0f} mm, black unknown")
-    figure.savefig(file)
+    rows = []
+    for number, (image, depths) in enumerate(zip(images, zip(*depths_mm.values(), strict=True), strict=True)):
+        pictures = [np.zeros_like(image) if depth is None else colour_depth(depth, near_mm, far_mm) for depth in depths]
+        # The first row names the columns.
+        titles = [title if number == 0 else " " * column for column, title in enumerate(("image", *depths_mm))]
+        rows.append(dict(zip(titles, [image, *pictures], strict=True)))
+    picture_grid(rows, _CELL_PX, f"blue {near_mm:.0f} mm .. red {far_mm:.0f} mm, black unknown").save(file)
 
 
 def draw_renderings(pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], file: Path) -> None:
     """Draw a row per frame number as a PNG: the frame (H, W, 3) uint8, a rendering of it, their absolute difference."""
-    figure = new_figure(9.0, 2.5 * max(len(pairs), 1))
-    for row, (number, (rgb, rendered)) in enumerate(pairs.items()):
-        titles = {f"frame {number}": rgb, "surface, rendered": rendered, "difference": cv2.absdiff(rgb, rendered)}
-        for column, (title, picture) in enumerate(titles.items(), start=1):
-            axes = figure.add_subplot(len(pairs), 3, 3 * row + column, title=title)
-            axes.imshow(picture)
-            axes.set_axis_off()
-    figure.savefig(file)
+    rows = [
+        {f"frame {number}": rgb, "surface, rendered": rendered, "difference": cv2.absdiff(rgb, rendered)}
+        for number, (rgb, rendered) in pairs.items()
+    ]
+    picture_grid(rows, _CELL_PX).save(file)
 
 
 def draw_depth_change(scene: DepthScene, file: Path) -> None:
@@ -89,12 +83,12 @@ def draw_depth_change(scene: DepthScene, file: Path) -> None:
     The paper's experiments 1 and 2 (arXiv 2508.11282). Methods share the scales of depth (turbo) and of difference
     (white to red), whose far end is the 98th percentile; unknown is black. The first two rows show the two frames.
     """
+    count = max(len(scene.depths_mm), 2)
+    figure = new_figure(12.6, 2.5 * count + 0.6)
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    count = max(len(scene.depths_mm), 2)
-    figure = new_figure(12.6, 2.5 * count + 0.6)
     grid = figure.subplots(count, 4, squeeze=False)
     for axes in grid.ravel():
         axes.set_axis_off()

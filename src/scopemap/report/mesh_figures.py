@@ -5,10 +5,9 @@ Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,16 +17,14 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
-from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
+from scopemap.report.sheet import SOFT, Plot, Sheet, picture_grid
 
 _SIDE_PX = 480
 _SUBPIXEL_BITS = 4
 _AMBIENT = 0.35
 _UNPAINTED = 190
-_JPEG_QUALITY = 88
+_PLOT_PX = 400
 _MARGIN_PX = 15
 
 
@@ -49,19 +46,32 @@ def draw_trajectories(estimate_positions_mm: np.ndarray, reference_positions_mm:
 
     A dot marks the start; rows of NaN (lost frames) are gaps.
     """
-    figure = new_figure(12.0, 4.2)
-    for place, (across, up) in enumerate([(0, 1), (0, 2), (2, 1)], start=1):
-        axes = figure.add_subplot(1, 3, place, aspect="equal", adjustable="datalim")
-        axes.set(xlabel=f"{'xyz'[across]} mm", ylabel=f"{'xyz'[up]} mm")
-        axes.grid(alpha=0.3)
-        for name, (colour, positions) in _paths(estimate_positions_mm, reference_positions_mm).items():
-            axes.plot(positions[:, across], positions[:, up], color=colour, label=name, linewidth=1.6)
-            known = positions[np.isfinite(positions).all(axis=1)]
-            axes.plot(known[:1, across], known[:1, up], "o", color=colour, markersize=7, markeredgecolor="black")
-        if up == 1:
-            axes.invert_yaxis()  # the world's y points down
-    figure.axes[0].legend(title="dot: start")
-    figure.savefig(file)
+    sheet = Sheet(3 * _PLOT_PX + 20, _PLOT_PX + 20)
+    paths = _paths(estimate_positions_mm, reference_positions_mm)
+    for number, (across, up) in enumerate([(0, 1), (0, 2), (2, 1)]):
+        shown = {name: (colour, positions[:, [across, up]]) for name, (colour, positions) in paths.items()}
+        known = np.concatenate([values[np.isfinite(values).all(1)] for _, values in shown.values()])
+        low, high = (known.min(0), known.max(0)) if len(known) else (np.zeros(2), np.ones(2))
+        centre, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1e-3)
+        x, y = ((float(value) - half, float(value) + half) for value in centre)
+        # The world's y points down.
+        inside = (number * _PLOT_PX + 60.0, 15.0, _PLOT_PX - 60.0, _PLOT_PX - 60.0)
+        plot = Plot(sheet, inside, x, y[::-1] if up == 1 else y)
+        plot.frame(f"{'xyz'[across]} mm", f"{'xyz'[up]} mm")
+        for colour, values in shown.values():
+            places = plot.place(values)
+            sheet.line(places, colour, 2)
+            start = places[np.isfinite(places).all(1)][:1]
+            sheet.dots(start, "#000000", 5)
+            sheet.dots(start, colour, 4)
+    _write_legend(sheet, list(paths), 80, _PLOT_PX - 92)
+    sheet.save(file)
+
+
+def _write_legend(sheet: Sheet, names: list[str], left: float, top: float) -> None:
+    for row, name in enumerate(reversed(names)):
+        sheet.text((left, top + 16 * row), name, 14, ESTIMATE_COLOUR if name == "estimate" else TRUTH_COLOUR)
+    sheet.text((left, top + 16 * len(names)), "dot: start", 12, SOFT)
 
 
 def draw_mesh(
@@ -82,7 +92,7 @@ def draw_mesh(
     rows = [
         {prefix + title: mesh_picture(drawn, view) for title, view in views.items()} for prefix, drawn in meshes.items()
     ]
-    _picture_grid(rows, 4.0, 4.6).savefig(file)
+    picture_grid(rows, (400, 400)).save(file)
 
 
 def draw_reconstruction(
@@ -107,12 +117,11 @@ def draw_reconstruction(
     for title, view in views.items():
         for name, (colour, positions) in paths.items():
             draw_path(pictures[title], view, positions, colour, thickness_px=widths_px[name])
-    figure = _picture_grid([{title: _cropped(picture) for title, picture in pictures.items()}], 4.6, 5.2)
-    for name, (colour, _) in reversed(paths.items()):
-        figure.axes[0].plot([], [], color=colour, linewidth=widths_px[name], label=name)
-    title = "dot: start" if reference_positions_mm is not None else "dot: start; no true poses are known"
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, title=title)
-    figure.savefig(file)
+    sheet = picture_grid([{title: cropped(picture) for title, picture in pictures.items()}], (460, 460))
+    _write_legend(sheet, list(paths), 14, 30)
+    if reference_positions_mm is None:
+        sheet.text((14, 62), "no true poses are known", 12, SOFT)
+    sheet.save(file)
 
 
 def draw_surface(
@@ -133,16 +142,14 @@ def draw_surface(
     view, outside = MeshView(T_world_camera, camera), outside_views(mesh, T_world_camera, positions_mm)["from outside"]
     pictures = {"frame": rgb, "surface": _on_white(rendering)}
     if confidence is not None:
-        from matplotlib import colormaps
-
-        colours = colormaps["cividis"](np.clip(confidence, 0, 1), bytes=True)[:, :3]
+        levels = np.round(255 * np.clip(confidence, 0, 1)).astype(np.uint8)
+        colours = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
         certain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
         pictures["confidence, 0 blue to 1 yellow"] = mesh_picture(certain, view)
     pictures["from outside"] = mesh_picture(mesh, outside)
     draw_path(pictures["from outside"], outside, positions_mm, ESTIMATE_COLOUR)
-    pictures["from outside"] = _cropped(pictures["from outside"])
-    quality = {"quality": _JPEG_QUALITY} if file.suffix in (".jpg", ".jpeg") else None
-    _picture_grid([pictures], 4.0, 4.0 * camera.height / camera.width + 0.3).savefig(file, pil_kwargs=quality)
+    pictures["from outside"] = cropped(pictures["from outside"])
+    picture_grid([pictures], (400, round(400 * camera.height / camera.width))).save(file)
 
 
 def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
@@ -157,21 +164,10 @@ def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], 
         radius = float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
         for row, yaw_rad in zip(rows, (0.0, 0.8), strict=True):
             view = _view_of(np.eye(3), centre, radius, yaw_rad, 0.0)
-            row[f"{method}\n{where}"] = _cropped(
+            row[f"{method}\n{where}"] = cropped(
                 _on_white(render_points(points, colours, view.camera, view.T_world_camera))
             )
-    _picture_grid(rows, 3.6, 4.0).savefig(file)
-
-
-def _picture_grid(rows: Sequence[Mapping[str, np.ndarray]], width_in: float, height_in: float) -> Figure:
-    """Return a figure of pictures with their titles, each of this size in inches."""
-    figure = new_figure(width_in * len(rows[0]), height_in * len(rows))
-    for axes, pictures in zip(figure.subplots(len(rows), len(rows[0]), squeeze=False), rows, strict=True):
-        for place, (title, picture) in zip(axes, pictures.items(), strict=True):
-            place.imshow(picture)
-            place.set_axis_off()
-            place.set_title(title)
-    return figure
+    picture_grid(rows, (360, 360)).save(file)
 
 
 def _paths(estimate_mm: np.ndarray, reference_mm: np.ndarray | None) -> dict[str, tuple[str, np.ndarray]]:
@@ -227,11 +223,11 @@ def _view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: fl
     return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
 
 
-def mesh_picture(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
-    """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white, with smooth edges.
+def mesh_picture(mesh: trimesh.Trimesh, view: MeshView, *, smooth: bool = True) -> np.ndarray:
+    """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
 
     Both sides of a triangle are drawn; triangles partly behind the camera are left out. A mesh without vertex colours
-    is grey.
+    is grey. smooth : draw it twice as large and take means, which a picture that will be shrunk does not need.
     """
     visual, camera, colours = mesh.visual, view.camera, np.full((len(mesh.vertices), 3), _UNPAINTED)
     if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
@@ -241,6 +237,8 @@ def mesh_picture(mesh: trimesh.Trimesh, view: MeshView) -> np.ndarray:
     cosine = np.abs((np.asarray(mesh.vertex_normals) * rays).sum(1)) / lengths
     shaded = np.round((_AMBIENT + (1 - _AMBIENT) * cosine)[:, None] * colours).astype(np.uint8)
     lit = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=shaded, process=False)
+    if not smooth:
+        return _on_white(render_mesh(lit, camera, view.T_world_camera))
     # Half a pixel's sampling: the mesh's triangles are often smaller than a pixel.
     fine = camera.resized(2 * camera.width, 2 * camera.height)
     picture = _on_white(render_mesh(lit, fine, view.T_world_camera))
@@ -275,7 +273,7 @@ def _fixed_point(pixels: np.ndarray) -> np.ndarray:
     return np.round(np.clip(pixels, -1e6, 1e6) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
 
 
-def _cropped(picture: np.ndarray) -> np.ndarray:
+def cropped(picture: np.ndarray) -> np.ndarray:
     """Return the square part of a square picture (H, H, 3) that holds all that is not white, and a margin."""
     rows, columns = np.nonzero((picture != 255).any(axis=-1))
     if not len(rows):

@@ -47,7 +47,9 @@ def build_pyramid(
             camera = replace(camera, width=2 * width, height=2 * height)
             grey, weight, depth = (p[: 2 * height, : 2 * width] for p in (grey, weight, depth))
             grey, weight = _halve_image(grey, weight, (width, height))
-            depth, camera = _halve_depth(depth), camera.resized(width, height)
+            known = frame.depth_mm is not None
+            depth = _halve_depth(depth) if known else np.full((height, width), np.nan, np.float32)
+            camera = camera.resized(width, height)
         if level >= finest:
             slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
             views.append(

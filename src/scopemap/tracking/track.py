@@ -10,7 +10,7 @@ import numpy as np
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 
-Status = Literal["initial", "ok", "lost"]
+Status = Literal["initial", "ok", "lost", "other-map"]
 
 RELOCALISED = "relocalised"
 """Reason of the track of a frame where features found the lost camera again."""
@@ -23,7 +23,8 @@ class Track:
     Attributes
     ----------
     index : number of the frame.
-    status : "initial" for the frame that fixes the world of its map, "ok", or "lost".
+    status : "initial" for the frame that fixes the world of its map, "ok", or "lost". Trackers do not give
+        "other-map": in the records of a result it marks frames that were tracked in another submap.
     reason : one phrase; for a lost frame, what was wrong.
     T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose.
     keyframe : number of the frame it was aligned to.

@@ -69,6 +69,9 @@ class Tracker:
             if self._is_unsharp:
                 return self._lost(frame, unsharp)
             return Track(frame.index, "initial", "first frame of the map", np.eye(4), frame.index, map=self._map)
+        if self._frames_lost > _MAX_EXTRAPOLATION and self._frames_lost % self.settings.search_every:
+            self._sharp_frames_lost += not self._is_unsharp
+            return self._lost(frame, f"not searched: one of {self.settings.search_every} lost frames is")
         alignment, pyramid = self._align(self._keyframe, frame)
         if self._is_obscured(sharpness, alignment):
             self._sharp_frames_lost = 0

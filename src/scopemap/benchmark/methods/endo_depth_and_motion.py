@@ -24,6 +24,7 @@ SETTINGS = TrackingSettings(
     keyframe_every=2,
     min_sharpness=0.0,
     relocalisation_keyframes=0,
+    search_every=1,
     new_map_after=0,
     advanced=TrackingAdvanced(
         corner_depth_sigma=0.0,

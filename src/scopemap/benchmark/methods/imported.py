@@ -15,7 +15,7 @@ from scopemap.errors import InputError
 from scopemap.evaluation.poses import associate
 from scopemap.io.sequence import Sequence
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Trajectory, write_tum
+from scopemap.trajectory.trajectory import TRACKED, Trajectory, write_tum
 
 
 class ImportedTrajectory:
@@ -39,7 +39,8 @@ class ImportedTrajectory:
         frames = [(frame.index, frame.time_s, frame.name) for frame in sequence.frames()]
         indices, times_s = np.array([f[0] for f in frames]), np.array([f[1] for f in frames])
         submaps = [on_frames(submap, indices, times_s) for submap in (read, *read.others)]
-        if not any(submap.tracked.any() for submap in submaps):
+        submaps = [submap for submap in submaps if submap.tracked.any()]
+        if not submaps:
             raise InputError(f"{file}: none of its {len(read)} poses belongs to a frame of {sequence.path}")
         for number, submap in enumerate(submaps):
             folder = out / f"maps/{number}" if number else out
@@ -47,9 +48,11 @@ class ImportedTrajectory:
             write_tum(folder / "trajectory.tum", submap)
             with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as table:
                 writer = csv.writer(table)
-                writer.writerow(["index", "time_s", "name", "status"])
+                writer.writerow(["index", "time_s", "name", "status", "map"])
                 for (index, time_s, name), status in zip(frames, submap.status.tolist(), strict=True):
-                    writer.writerow([index, f"{time_s:.6f}", name, status])
+                    tracked = status in TRACKED
+                    if tracked or number == 0:
+                        writer.writerow([index, f"{time_s:.6f}", name, status, number if tracked else ""])
         facts = {"input": str(sequence.path), "imported": str(file), "convention": read.source}
         (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         return {}
@@ -58,16 +61,12 @@ class ImportedTrajectory:
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:
     """Return the trajectory at the frames (N,), matched by number where it has numbers, else by time.
 
-    Frames without a pose are lost and repeat the pose before them (at the start, the first known one).
+    Frames without a pose are lost.
     """
-    status = np.full(len(indices), "lost", dtype="<U7")
-    frames = Trajectory(indices, times_s, np.tile(np.eye(4), (len(indices), 1, 1)), status)
+    frames = Trajectory(indices, times_s, np.full((len(indices), 4, 4), np.nan), np.full(len(indices), "lost"))
     known = trajectory.rows(trajectory.tracked)
     rows_known, rows = associate(known, frames)
-    status = status.copy()
+    status, T_world_camera = np.full(len(indices), "lost", dtype="<U9"), frames.T_world_camera.copy()
     status[rows], status[rows[:1]] = "ok", "initial"
-    source = np.full(len(indices), -1)
-    source[rows] = rows_known
-    last = np.maximum.accumulate(source)
-    last[last < 0] = rows_known[0] if len(rows) else 0
-    return Trajectory(indices, times_s, known.T_world_camera[last], status)
+    T_world_camera[rows] = known.T_world_camera[rows_known]
+    return Trajectory(indices, times_s, T_world_camera, status)

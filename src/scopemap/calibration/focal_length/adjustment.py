@@ -23,7 +23,8 @@ _NO_DISTORTION_SIGMA = 1e-4
 _START_FOV_DEG = (60.0, 105.0)
 _BLOCKS = 4  # columns and rows of the image within which errors are correlated
 _MIN_SIGMA_PX = 0.03
-_FIRST_ITERATIONS, _ITERATIONS, _MIN_DECREASE = 25, 30, 1e-5
+# Iterations, and smallest relative decrease: first of all starts, then of the best one with distortion.
+_FIRST, _THEN = (15, 1e-3), (30, 1e-4)
 
 
 @dataclass(frozen=True)
@@ -45,26 +46,30 @@ class WindowFit:
 
 
 def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
-    """Return the best fit to a window over all starts; None where the focal length is undetermined.
+    """Return the fit to a window from the best start; None where the focal length is undetermined.
 
     assumed_focal_px : mean of its prior, whose standard deviation is a factor of e.
     """
     problem = _problem(window, assumed_focal_px)
-    fits = []
-    for fov_deg in _START_FOV_DEG:
-        log_focal = np.log(window.half_width_px / np.tan(np.radians(fov_deg) / 2))
-        start = problem.tracked._replace(lens=np.array([log_focal, 0.0]))
-        for sigma, iterations in ((_NO_DISTORTION_SIGMA, _FIRST_ITERATIONS), (_DISTORTION_SIGMA, _ITERATIONS)):
-            lens = UnknownLens(window.half_width_px, np.array([_LOG_FOCAL_SIGMA, sigma]))
-            problem = replace(problem, start=start, lens=lens)
-            start = adjust(problem, max_iterations=iterations, min_decrease=_MIN_DECREASE).state
-        fits.append(start)
-    state = min(fits, key=lambda state: state.sigma_px)
+    starts = [np.log(window.half_width_px / np.tan(np.radians(fov_deg) / 2)) for fov_deg in _START_FOV_DEG]
+    states = [problem.tracked._replace(lens=np.array([log_focal, 0.0])) for log_focal in starts]
+    states = [_adjusted(window, problem, state, _NO_DISTORTION_SIGMA, _FIRST)[1] for state in states]
+    best = min(states, key=lambda state: state.sigma_px)
+    problem, state = _adjusted(window, problem, best, _DISTORTION_SIGMA, _THEN)
     deviation = _log_focal_deviation(problem, state)
     if not np.isfinite(deviation):
         return None
     tilt_deg = float(np.degrees(np.arccos(np.clip(state.T_camera_world[:, 2, 2].min(), -1, 1))))
     return WindowFit(float(state.lens[0]), deviation, state.sigma_px, tilt_deg, float(state.lens[1]))
+
+
+def _adjusted(
+    window: Window, problem: BundleProblem, start: State, sigma: float, effort: tuple[int, float]
+) -> tuple[BundleProblem, State]:
+    """Return the problem with a prior of `sigma` for the distortion, and its solution; effort : as `_FIRST`."""
+    lens = UnknownLens(window.half_width_px, np.array([_LOG_FOCAL_SIGMA, sigma]))
+    problem = replace(problem, start=start, lens=lens)
+    return problem, adjust(problem, max_iterations=effort[0], min_decrease=effort[1]).state
 
 
 def _problem(window: Window, focal_px: float) -> BundleProblem:

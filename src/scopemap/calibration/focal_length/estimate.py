@@ -66,7 +66,9 @@ class FocalEstimate:
 
 
 def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[str]]:
-    """Return a sequence of unknown camera with the focal length estimated from its motion, and notes on the estimate.
+    """Return a sequence of unknown camera with the focal length estimated from its motion, and notes on the lens.
+
+    Where the estimate is not taken the focal length stays, and `camera_source` says why.
 
     `input.focal` "flow" takes any estimate, "auto" one of small deviation that contradicts the assumed focal length.
     Raises `CalibrationError` where there is no estimate for "flow".
@@ -84,13 +86,13 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     )
     kept = ""
     if estimate.reason:
-        kept = f"assumed, because the motion does not determine it: {estimate.reason}"
+        kept = f"the motion does not determine it: {estimate.reason}"
     elif not wanted and estimate.share > MAX_SHARE:
-        kept = f"assumed, because the estimate is uncertain: {described}"
+        kept = f"the estimate from the motion is uncertain: {described}"
     elif not wanted and not estimate.differs_from(assumed_px):
-        kept = f"assumed {assumed_px:.0f} px, consistent with the estimate: {described}"
+        kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept:
-        return sequence, [f"focal length: {kept}"]
+        return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
     distorted = (
         f"focal length: the lens has radial distortion, about {abs(estimate.distortion):.0%} at half the image's width "
         "from the centre; only a calibration corrects it (--camera)"

@@ -1,17 +1,23 @@
-"""Windows of a sequence: corners of a host frame and their observations in the frames after it, by optical flow."""
+"""Windows of a sequence: corners of a host frame and their observations in the frames after it.
+
+Corners are followed by pyramidal Lucas-Kanade (Bouguet, 2001) on locally normalised brightness: dense flow costs five
+times as much, and what is smooth in it reduces parallax, which biases the focal length.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 
+import cv2
 import numpy as np
 
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
 from scopemap.config import Config
-from scopemap.flow.corners import detect_corners, match_corners
-from scopemap.flow.dis import DisFlow
+from scopemap.errors import InputError
+from scopemap.flow.corners import detect_corners, normalised_brightness
 from scopemap.frame import Frame, is_constant
 from scopemap.io.sequence import Sequence
 from scopemap.masking.mask_files import create_masks
@@ -22,11 +28,13 @@ MAX_FRAMES = 120
 
 _EVERY, _MIN_KEPT = 4, 30  # of these frames every fourth is used, of a short sequence more of them
 _HOST_EVERY, _MAX_GAP = 5, 15  # used frames from one host to the next, and to its last partner at most
-_MAX_PARTNERS = 10
+_MAX_PARTNERS = 6
 _CELL_PX = 16
 _CONSISTENCY_PX = 1.0
 _MIN_SHARE = 0.35  # of a host's corners that a partner observes
 _MIN_CORNERS = 40
+_PATCH_PX, _LEVELS, _LEAST_EIGENVALUE = 21, 3, 1e-4
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 
 
 @dataclass(frozen=True)
@@ -48,13 +56,13 @@ class Window:
 def windows_of(sequence: Sequence, config: Config) -> Iterator[Window]:
     """Yield the windows of the first `MAX_FRAMES` frames, at the default working size or smaller.
 
-    A window ends where flow loses the host's corners; one with less than two partners or 40 corners is left out. Flow
-    is DIS without smoothing: smooth flow reduces parallax, which biases the focal length by 5 %.
+    A window ends where the host's corners are lost; one with less than two partners or 40 corners is left out.
     """
     frames = _kept(_at_default_size(sequence), config)
-    flow = DisFlow(smooth=False)
+    patterns = [normalised_brightness(frame.rgb) for frame in frames]
     for number in range(0, len(frames) - 2, _HOST_EVERY):
-        window = _window(frames[number : number + _MAX_GAP + 1], flow)
+        some = slice(number, number + _MAX_GAP + 1)
+        window = _window(frames[some], patterns[some])
         if window is not None:
             yield window
 
@@ -72,25 +80,31 @@ def _kept(sequence: Sequence, config: Config) -> list[Frame]:
     masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
     count = min(sequence.count or MAX_FRAMES, MAX_FRAMES)
     every = min(max(count // _MIN_KEPT, 1), _EVERY)
-    frames = islice(sequence.frames(), MAX_FRAMES)
-    # The masker sees all of them: it learns the field of view.
-    return [masked for number, masked in enumerate(map(masker, frames)) if number % every == 0]
+    step = every * (sequence.selection.step or 1)
+    selection = slice(sequence.selection.start, sequence.selection.stop, step)
+    # What is skipped here does not count as skipped in the run.
+    some = replace(sequence, selection=selection, choice=replace(sequence.choice, skipped={}))
+    kept: list[Frame] = []
+    with suppress(InputError):  # a video that breaks off at once; reading all of it says so
+        kept.extend(map(masker, islice(some.frames(), -(-MAX_FRAMES // every))))
+    return kept
 
 
-def _window(frames: list[Frame], flow: DisFlow) -> Window | None:
+def _window(frames: list[Frame], patterns: list[np.ndarray]) -> Window | None:
+    """Return the window of the first of some frames; patterns : `normalised_brightness` of each."""
     host, camera = frames[0], frames[0].camera
     if is_constant(host.rgb):
         return None
     corners = detect_corners(replace(host, depth_mm=np.ones_like(host.valid, dtype=np.float32)), _CELL_PX)
     seen: list[np.ndarray] = []
-    for partner in frames[1:] if len(corners) else []:
-        number, pixels = match_corners(
-            corners, flow.estimate_both(host.rgb, partner.rgb), partner.valid, _CONSISTENCY_PX
-        )
-        if len(number) < _MIN_SHARE * len(corners):
+    start = corners.astype(np.float32)
+    for partner, pattern in zip(frames[1:], patterns[1:], strict=True) if len(corners) else []:
+        pixels, good = _followed(patterns[0], pattern, corners, start)
+        good &= _valid_at(pixels, partner.valid)
+        if good.sum() < _MIN_SHARE * len(corners):
             break
-        seen.append(np.full(corners.shape, np.nan))
-        seen[-1][number] = pixels
+        seen.append(np.where(good[:, None], pixels, np.nan).astype(np.float64))
+        start = np.where(good[:, None], pixels, corners + np.median((pixels - corners)[good], 0)).astype(np.float32)
     if len(seen) < 2:
         return None
     chosen = np.unique(np.linspace(0, len(seen) - 1, _MAX_PARTNERS).round().astype(int))
@@ -100,3 +114,43 @@ def _window(frames: list[Frame], flow: DisFlow) -> Window | None:
         return None
     axis = np.array([camera.cx, camera.cy])
     return Window(corners[often] - axis, pixels[often] - axis, camera.width / 2, camera.fy / camera.fx)
+
+
+def _followed(
+    image_from: np.ndarray, image_to: np.ndarray, corners: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where corners (n, 2) of an image are in another one, (n, 2) float32, and which are found there and back.
+
+    image_from, image_to : (H, W) uint8. start : (n, 2) px where the search begins.
+    """
+    places = corners.astype(np.float32)
+    there, found = _searched(image_from, image_to, places, start)
+    back, found_back = _searched(image_to, image_from, there, places)
+    return there, found & found_back & (np.linalg.norm(back - places, axis=1) <= _CONSISTENCY_PX)
+
+
+def _searched(
+    image_from: np.ndarray, image_to: np.ndarray, places: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    # OpenCV writes the result over the start.
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        image_from,
+        image_to,
+        places[:, None],
+        start[:, None].copy(),
+        winSize=(_PATCH_PX, _PATCH_PX),
+        maxLevel=_LEVELS,
+        criteria=_STOP,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_LEAST_EIGENVALUE,
+    )
+    return moved[:, 0], status.ravel() > 0
+
+
+def _valid_at(pixels: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return which pixels (n, 2) are inside an image and valid (H, W) there."""
+    last = np.array(valid.shape[::-1]) - 1
+    nearest = np.clip(np.rint(pixels), 0, last).astype(int)
+    inside = ((pixels >= 0) & (pixels <= last)).all(1)
+    good: np.ndarray = inside & valid[nearest[:, 1], nearest[:, 0]]
+    return good

@@ -23,9 +23,8 @@ def write_calibration(
     `depth_scale_mm` is written as `depth_scale`: mm per unit of the depth files beside it; `focal_sigma_px` under its
     own name: the standard deviation of fx, for people. Raises `CalibrationError` where the file cannot be written.
     """
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
-    if not storage.isOpened():
-        raise CalibrationError(f"cannot write the calibration to {file}: is its folder there and writable?")
+    # In memory: OpenCV takes no names outside of the system's code page on Windows.
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
     storage.write("camera_matrix", (camera.plane if isinstance(camera, FovCamera) else camera.central).matrix)
@@ -43,4 +42,7 @@ def write_calibration(
         storage.write("depth_scale", float(depth_scale_mm))
     if focal_sigma_px is not None:
         storage.write("focal_sigma_px", float(focal_sigma_px))
-    storage.release()
+    try:
+        Path(file).write_text(storage.releaseAndGetString(), encoding="utf-8")
+    except OSError as error:
+        raise CalibrationError(f"cannot write the calibration to {file}: {error.strerror or error}") from None

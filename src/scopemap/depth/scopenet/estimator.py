@@ -75,8 +75,14 @@ def load_network(file: Path, threads: int = 0) -> onnxruntime.InferenceSession:
     """
     if not file.is_file():
         raise WeightsError(_missing(file))
+    return _loaded(file, threads or cpu_threads(), file.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _loaded(file: Path, threads: int, _: int) -> onnxruntime.InferenceSession:
+    """Return a network, the same for runs that follow each other in one process, until its file changes."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or cpu_threads()
+    options.intra_op_num_threads = threads
     # Threads that wait must sleep: the tracker needs the cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4  # what is wrong is raised, not printed

@@ -38,7 +38,7 @@ class Dicom(Source):
 
     def __init__(self, path: Path) -> None:
         if find_spec("pydicom") is None:
-            raise InputError(f"reading {path}: it is DICOM; install its reader: pip install 'scopemap[dicom]'")
+            raise InputError(f"reading {path}: it is DICOM; install its reader: pip install -e '.[dicom]'")
         super().__init__(path)
         self._headers = self._in_folder(path) if path.is_dir() else [read_header(path)]
         first = self._headers[0]

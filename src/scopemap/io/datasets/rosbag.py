@@ -89,7 +89,7 @@ class RosBag(Source):
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
         if find_spec("rosbags") is None:
-            raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install 'scopemap[ros]'")
+            raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install -e '.[ros]'")
         super().__init__(path)
         self._storage = _storage_of(path)
         self._lock = threading.Lock()

@@ -16,6 +16,14 @@ from typing import TypeAlias
 from scopemap.errors import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
+_MOST_MEMBERS, _LARGEST_HEADER_BYTES = 200_000, 1 << 20
+_HEADERS = (
+    tarfile.GNUTYPE_LONGNAME,
+    tarfile.GNUTYPE_LONGLINK,
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+    tarfile.SOLARIS_XHDTYPE,
+)
 ARCHIVES = (".tar.gz", ".tgz", ".tar")
 """Endings of the archives that are read, the preferred first."""
 
@@ -26,13 +34,16 @@ class FolderFiles:
     def __init__(self, path: Path, files: dict[int, Path]) -> None:
         self.path, self._files = path, dict(sorted(files.items()))
 
-    def read(self, number: int) -> bytes | None:
-        """Return the content of the file with this number, None where there is none; `InputError` if unreadable."""
+    def read(self, number: int, most_bytes: int | None = None) -> bytes | None:
+        """Return the content of the file with this number, None where there is none.
+
+        Raises `InputError` if it cannot be read or holds more than `most_bytes` (None: the limit of images).
+        """
         file = self._files.get(number)
         if file is None:
             return None
         with reporting(f"reading {file}"):
-            check_bytes(str(file), file.stat().st_size, LARGEST_FILE_BYTES)
+            check_bytes(str(file), file.stat().st_size, most_bytes or LARGEST_FILE_BYTES)
             return file.read_bytes()
 
     def numbers(self) -> list[int]:
@@ -51,20 +62,20 @@ class ArchiveFiles:
         self.path, self._prefix, self._suffixes = path, prefix, suffixes
         self._found: dict[int, tarfile.TarInfo] = {}
         self._tar: tarfile.TarFile | None = None
-        self._last_offset = -1
+        self._last_offset, self._passed = -1, 0
         self._complete = False
         # Frames are read ahead in a thread of their own, truth in another; the stream is one.
         self._lock = threading.Lock()
 
-    def read(self, number: int) -> bytes | None:
-        """Return the content of the file with this number, None where there is none."""
+    def read(self, number: int, most_bytes: int | None = None) -> bytes | None:
+        """Return the content of the file with this number, None where there is none; `InputError` as of a folder."""
         with self._lock, self._reporting():
             while number not in self._found and not self._complete:
                 self._advance()
             member = self._found.get(number)
             if member is None or self._tar is None:
                 return None
-            check_bytes(f"{self.path}, {member.name}", member.size, LARGEST_FILE_BYTES)
+            check_bytes(f"{self.path}, {member.name}", member.size, most_bytes or LARGEST_FILE_BYTES)
             stream = self._tar.extractfile(member)
             content = b"" if stream is None else stream.read()
             if len(content) < member.size:
@@ -83,7 +94,7 @@ class ArchiveFiles:
             return list(self._found)
 
     def _advance(self) -> None:
-        self._tar = self._tar or tarfile.open(self.path)  # noqa: SIM115
+        self._tar = self._tar or tarfile.open(self.path, tarinfo=_BoundedMember)  # noqa: SIM115
         member = self._tar.next()
         if member is None:
             self._complete = True
@@ -92,12 +103,25 @@ class ArchiveFiles:
         if member.size < 0 or member.offset <= self._last_offset:
             raise EOFError(f"{member.name} has no valid size")
         self._last_offset = member.offset
+        # Empty members compress a thousandfold, and `tarfile` keeps them all.
+        self._passed += 1
+        if self._passed > _MOST_MEMBERS:
+            raise EOFError(f"it holds more than {_MOST_MEMBERS} members")
         number = _number_of(member.name, self._prefix, self._suffixes)
         if number is not None and member.isreg():
             self._found.setdefault(number, member)
 
     def _reporting(self) -> AbstractContextManager[None]:
         return reporting(f"reading {self.path}: the archive is damaged or incomplete; download it again")
+
+
+class _BoundedMember(tarfile.TarInfo):
+    """A member whose long name and other headers, which `tarfile` reads at once, are of a size that headers have."""
+
+    def _proc_member(self, tarfile_: tarfile.TarFile) -> tarfile.TarInfo:
+        if self.type in _HEADERS and not 0 <= self.size <= _LARGEST_HEADER_BYTES:
+            raise EOFError(f"a header claims {self.size} bytes")
+        return super()._proc_member(tarfile_)  # type: ignore[misc]
 
 
 NumberedFiles: TypeAlias = FolderFiles | ArchiveFiles

@@ -49,6 +49,8 @@ def read_trajectory(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") 
     # Path.exists raises for names that no file system allows.
     if not os.path.exists(path):
         raise InputError(f"cannot read a trajectory: no file or folder {path}")
+    if not path.is_dir() and not path.is_file():  # a pipe would be waited for
+        raise InputError(f"cannot read a trajectory: {path} is no file and no folder")
     if kind != "auto":
         return READERS[kind](path, unit)
     return (_reader_of_folder(path) if path.is_dir() else _reader_of_file(path))(path, unit)

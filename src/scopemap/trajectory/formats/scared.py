@@ -32,6 +32,7 @@ SCARED_FILES = tuple(f"{place}{end}" for place in _PLACES for end in (f"/{_PREFI
 
 _SHORTEST_STEP_POWER = -2
 _LARGEST_STAMP = 1e30
+_LARGEST_FILE_BYTES = 1 << 20  # a file of poses and calibrations holds 2 kB
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ def find_frame_data(path: Path) -> NumberedFiles | None:
 
 def read_frame_data(files: NumberedFiles) -> list[FrameData]:
     """Return the content of all files, ascending; one that cannot be used is not an error but has a `fault`."""
-    found = [_parsed(f"{files.path}, {_PREFIX}{n:06d}.json", n, files.read(n) or b"") for n in files.stored()]
+    numbers = files.stored()
+    found = [_parsed(f"{files.path}, {_PREFIX}{n:06d}.json", n, files.read(n, _LARGEST_FILE_BYTES)) for n in numbers]
     return sorted(found, key=lambda frame: frame.index)
 
 
@@ -103,10 +105,10 @@ def read_scared(path: Path, unit: Unit) -> Trajectory:
     return stamped(np.stack(poses), indices, np.array(list(times_s.values())) if times_s else None, source)
 
 
-def _parsed(where: str, index: int, content: bytes) -> FrameData:
+def _parsed(where: str, index: int, content: bytes | None) -> FrameData:
     T_world_camera, stamp, fault = None, None, ""
     try:
-        document = json.loads(content)
+        document = json.loads(content or b"")
         stamp = document.get("timestamp")
         pose = np.array(document["camera-pose"], dtype=np.float64)
         if pose.shape != (4, 4):

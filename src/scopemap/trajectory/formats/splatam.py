@@ -15,13 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError, reporting
+from scopemap.errors import InputError, check_bytes, reporting
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.formats.poses import file_of, from_quaternions, rigid, stamped
 from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 PARAMS_FILE = "params.npz"
+_ARRAYS = ("cam_unnorm_rots", "cam_trans")
 _TRAINED_PER_HELD_OUT = 7
+_LARGEST = 1_000_000_000  # number of a frame, and step
+_MOST_BYTES = 64 << 20  # of an array: 4 million frames
 
 
 def read_params(path: Path, unit: Unit, split: str = "") -> Trajectory:
@@ -43,6 +46,8 @@ def read_params(path: Path, unit: Unit, split: str = "") -> Trajectory:
 def _settings_of(config: Path) -> tuple[str, int, int] | None:
     """Return train_or_test, start and stride of a run; None where they are missing or more than plain values."""
     found: dict[str, Any] = {"train_or_test": "all", "start": 0, "stride": 1}
+    if not config.is_file():
+        return None
     try:
         for node in ast.walk(ast.parse(config.read_bytes())):
             if isinstance(node, ast.keyword) and node.arg in found:
@@ -51,7 +56,7 @@ def _settings_of(config: Path) -> tuple[str, int, int] | None:
         return None
     split, start, stride = found.values()
     usable = split in ("all", "train") and isinstance(start, int) and isinstance(stride, int)
-    return (split, start, stride) if usable and start >= 0 and stride > 0 else None
+    return (split, start, stride) if usable and 0 <= start < _LARGEST and 0 < stride < _LARGEST else None
 
 
 def _read(path: Path, unit: Unit, split: str, start: int, stride: int) -> Trajectory:
@@ -77,7 +82,10 @@ def _columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
     wanted = "expected the arrays cam_unnorm_rots (1, 4, N) and cam_trans (1, 3, N), and no pickled objects"
     # Pickled objects in the file stay unread: loading them could run any code.
     with reporting(f"cannot read a trajectory from {path}: {wanted}"), np.load(path, allow_pickle=False) as arrays:
-        rotations, translations = (np.asarray(arrays[name], np.float64) for name in ("cam_unnorm_rots", "cam_trans"))
+        for member in arrays.zip.infolist():
+            if member.filename.removesuffix(".npy") in _ARRAYS:
+                check_bytes(f"{path}, {member.filename}", member.file_size, _MOST_BYTES)
+        rotations, translations = (np.asarray(arrays[name], np.float64) for name in _ARRAYS)
         count = rotations.shape[-1] if rotations.ndim else 0
         if not count or rotations.shape != (1, 4, count) or translations.shape != (1, 3, count):
             raise ValueError(f"found {rotations.shape} and {translations.shape}")

@@ -75,6 +75,8 @@ class NumberTable:
 def text_lines(path: Path) -> list[str]:
     """Return the lines of a text file, without a byte order mark; `InputError` where it cannot be read as text."""
     with reporting(f"cannot read {path}"):
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise ValueError("it is no file")
         return path.read_text(encoding="utf-8-sig").splitlines()
 
 

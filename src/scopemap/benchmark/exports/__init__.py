@@ -1,0 +1,1 @@
+"""A run's folder written in the layouts of other people's tools."""

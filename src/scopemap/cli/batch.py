@@ -1,0 +1,272 @@
+"""`scopemap batch`: many videos, each in a folder of its own."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import typer
+
+from scopemap.cli.figures import print_json
+from scopemap.cli.options import (
+    AsJson,
+    CameraFile,
+    Dataset,
+    Quiet,
+    SetPairs,
+    parse_settings,
+    parse_size,
+    parse_slice,
+)
+from scopemap.errors import SettingsError
+
+if TYPE_CHECKING:
+    from scopemap.config import Preset
+    from scopemap.io.inputs import NamedInput
+    from scopemap.report.batch_page import BatchRow
+    from scopemap.runner.batch import Video
+    from scopemap.runner.forecast import Forecast
+
+_COLUMNS = ("name", "preset", "config", "dataset", "camera", "fov", "frames", "size")
+
+
+def batch(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...",
+            help="Videos, folders of videos, patterns in quotes, lists (.txt, one a line), tables (.csv with a column "
+            "input; further columns are settings: name, preset, config, dataset, camera, fov, frames, size, or any of "
+            "--set).",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results, one folder per video.")],
+    preset: Annotated[
+        Literal["default", "paper", "paper-strict", "realtime"] | None, typer.Option(help="As for `scopemap run`.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings as TOML.")] = None,
+    dataset: Dataset = None,
+    camera: CameraFile = None,
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view, degrees.")] = None,
+    frames: Annotated[str | None, typer.Option(metavar="A:B:S", help="Which frames of each, a Python slice.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Working size, px.")] = None,
+    settings: SetPairs = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Videos at once; default: half as many as there are cores.")
+    ] = None,
+    time_limit: Annotated[
+        float | None, typer.Option(min=0.1, metavar="SECONDS", help="End a video that takes longer; it has failed.")
+    ] = None,
+    retries: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Further attempts where the process of a video dies.")
+    ] = 1,
+    part: Annotated[str | None, typer.Option(metavar="K/N", help="Only the K-th of N parts, for job arrays.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Run a second of each video, and print what all of them will take.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace results of other settings or inputs; finished ones stay.")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct many videos: look at index.html, or batch.csv, in the folder of the results.
+
+    The same command again goes on where it ended: what is finished is not run again, what failed is. Exit code 1 where
+    a video failed.
+    """
+    chosen = {"preset": preset, "config": config, "dataset": dataset, "camera": camera, "fov": fov}
+    chosen |= {"frames": frames, "size": size}
+    shared = {key: str(value) for key, value in chosen.items() if value is not None}
+    of_part = parse_part(part) if part else (1, 1)
+    from scopemap.io.inputs import named_inputs
+    from scopemap.runner.processes import ProcessLimits, usable_cores
+
+    videos = videos_of(named_inputs(inputs), shared, parse_settings(settings or []))
+    limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
+    with _ending_by_sigterm():
+        if dry_run:
+            _forecast(videos[of_part[0] - 1 :: of_part[1]], out, limits, as_json=as_json, quiet=quiet)
+            return
+        from scopemap.report.batch_page import counts_of
+        from scopemap.runner.batch import INDEX, TABLE, run_batch
+
+        with _lines(silent=quiet or as_json) as show:
+
+            def told(row: BatchRow, left: int) -> None:
+                show(row.folder, _row_line(row), left, row.status == "started")
+
+            rows = run_batch(videos, out, limits, overwrite=overwrite, part=of_part, told=told)
+    if as_json:
+        print_json([asdict(row) for row in rows])
+    elif not quiet:
+        typer.echo(counts_of(rows))
+        typer.echo(f"look at {out / INDEX} in a browser; {out / TABLE} has the same as a table")
+    if any(row.status != "done" for row in rows):
+        raise typer.Exit(1)
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """Return (k, n) of "K/N", 1 <= k <= n. Raises `SettingsError`."""
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
+        raise SettingsError(f"cannot read the part '{text[:80]}': expected K/N with K from 1 to N, such as 3/10")
+    return int(match[1]), int(match[2])
+
+
+def videos_of(inputs: list[NamedInput], shared: dict[str, str], settings: dict[str, Any]) -> list[Video]:
+    """Return the videos of a batch, their settings checked.
+
+    shared : texts of options by the names of a table's columns, which come before them. settings : of `--set`. Raises
+    `SettingsError`, with the input that it is about.
+    """
+    from scopemap.runner.batch import folder_names
+
+    configs: dict[str, Any] = {}
+    return [
+        _video(one, name, shared | one.columns, settings, configs)
+        for one, name in zip(inputs, folder_names(inputs), strict=True)
+    ]
+
+
+def _video(
+    one: NamedInput, name: str, columns: dict[str, str], settings: dict[str, Any], configs: dict[str, Any]
+) -> Video:
+    """Return a video with the settings of its columns; those that equal another's share its `Config`."""
+    from scopemap.config import Config
+    from scopemap.runner.batch import Video
+
+    try:
+        own = {key: value for key, value in columns.items() if key not in _COLUMNS}
+        if unknown := [key for key in own if "." not in key]:
+            raise SettingsError(
+                f"unknown column '{unknown[0]}': {', '.join(_COLUMNS)} or a setting such as depth.backend"
+            )
+        sources = (columns.get("preset"), columns.get("config"), tuple(sorted(own.items())))
+        if (text := repr(sources)) not in configs:
+            file = Path(columns["config"]) if "config" in columns else None
+            given = settings | parse_settings([f"{key}={value}" for key, value in own.items()])
+            configs[text] = Config.load(cast("Preset | None", columns.get("preset")), file, given)
+        return Video(
+            one.path,
+            name,
+            configs[text],
+            dataset=columns.get("dataset"),
+            camera=columns.get("camera"),
+            fov_deg=_number(columns["fov"]) if "fov" in columns else None,
+            size=parse_size(columns["size"]) if "size" in columns else None,
+            frames=parse_slice(columns["frames"]) if "frames" in columns else None,
+        )
+    except SettingsError as error:
+        raise SettingsError(f"{error}; for the input {one.path}") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise SettingsError(f"cannot read the field of view '{text[:80]}': expected degrees such as 90") from None
+
+
+def _forecast(videos: list[Video], out: Path, limits: Any, *, as_json: bool, quiet: bool) -> None:
+    from scopemap.runner.forecast import forecast
+
+    with _lines(silent=quiet or as_json) as show:
+        found = forecast(videos, out, limits, lambda one, left: show(one.name, _forecast_line(one), left, False))
+    if as_json:
+        print_json([asdict(one) for one in found])
+    elif not quiet:
+        for line in forecast_lines(found, limits.processes):
+            typer.echo(line)
+
+
+def forecast_lines(found: list[Forecast], processes: int) -> list[str]:
+    """Return the sum of forecasts, one fact per line."""
+    known = [one for one in found if one.seconds is not None]
+    failed = [one for one in found if one.fault]
+    unknown = len(found) - len(known) - len(failed)
+    work_s = [one.seconds or 0.0 for one in known]
+    # Videos are not divided: the longest one bounds the time.
+    least_s = max([sum(work_s) / processes, *work_s])
+    read, written = sum(one.input_bytes for one in found), sum(one.result_bytes or 0 for one in known)
+    lines = [
+        f"{len(found)} video{'s' * (len(found) != 1)}, {_span(sum(one.video_s or 0.0 for one in known))}, "
+        f"{read / 1e9:.2f} GB",
+        f"results: about {written / 1e9:.2f} GB",
+        f"time: about {_span(least_s)} with {processes} at once ({_span(sum(work_s))} one after the other)",
+    ]
+    lines += [f"not in these figures: {unknown} of unknown length"] if unknown else []
+    return lines + [f"fails: {one.name}: {one.fault}" for one in failed]
+
+
+def _span(seconds: float) -> str:
+    """Return a time in a unit in which it is a number of two digits or more."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} minutes" if seconds < 7200 else f"{seconds / 3600:.1f} hours"
+
+
+def _forecast_line(one: Forecast) -> str:
+    if one.seconds is None:
+        return f"{one.name}: {one.fault or 'of unknown length'}"
+    return f"{one.name}: {one.frames} frames, about {one.seconds:.0f} s"
+
+
+def _row_line(row: BatchRow) -> str:
+    if row.status == "done":
+        return f"{row.folder}: {row.verdict}, {row.tracked} of {row.frames} frames, {row.seconds:.0f} s"
+    return f"{row.folder}: {row.status}{': ' * bool(row.reason)}{row.reason}"
+
+
+@contextmanager
+def _lines(*, silent: bool) -> Iterator[Callable[[str, str, int, bool], None]]:
+    """Yield what shows a video on stderr: its name, line, how many are left, and whether it begins.
+
+    One line where a video ends; at a terminal below them those that are running, and a bar.
+    """
+    if silent:
+        yield lambda name, line, left, begins: None
+    elif not sys.stderr.isatty():
+        yield lambda name, line, left, begins: None if begins else typer.echo(f"{line} ({left} left)", err=True)
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}", markup=False),
+        )
+        with Progress(*columns, console=Console(stderr=True, markup=False)) as bar:
+            task, running, done = bar.add_task("", total=None), list[str](), 0
+
+            def show(name: str, line: str, left: int, begins: bool) -> None:
+                nonlocal done
+                running[:] = [other for other in running if other != name] + [name] * begins
+                if not begins:
+                    done += 1
+                    bar.console.print(line)
+                bar.update(task, description=", ".join(running), completed=done, total=done + left)
+
+            yield show
+
+
+@contextmanager
+def _ending_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM, by which clusters end a job, end the processes and write the table, as Ctrl-C does."""
+
+    def end(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

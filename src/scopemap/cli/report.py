@@ -1,0 +1,32 @@
+"""`scopemap report`: the page and the picture of a finished run, made again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(
+    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    pictures: Annotated[
+        bool,
+        typer.Option("--pictures", help="Take the frames' pictures from the input again; done where none were kept."),
+    ] = False,
+) -> None:
+    """Write report.html and summary.png of a run into its folder."""
+    from scopemap.benchmark.pictures_again import keep_pictures_again
+    from scopemap.errors import InputError
+    from scopemap.report.frame_pictures import pictured_frames
+    from scopemap.report.page import write_report
+
+    if pictures or not pictured_frames(run):
+        try:
+            keep_pictures_again(run)
+        except InputError as fault:
+            if pictures or not (run / "frames.csv").is_file():
+                raise
+            typer.echo(f"warning: the page shows no frames: {fault}", err=True)
+    for file in write_report(run):
+        typer.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

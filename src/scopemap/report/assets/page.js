@@ -1,0 +1,195 @@
+// The page: what is chosen, and who draws it.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const turbo = new Uint8Array(bytesOf(data.turbo)), ramp = new Uint8Array(bytesOf(data.ramp));
+const element = (id) => document.getElementById(id);
+const root = document.documentElement;
+const FIELD_OF_VIEW = 0.8;
+let run, panels, curves, view = null, row = 0, shown = 0, turn = { yaw: 0, pitch: 0, distance: 1, shift: [0, 0, 0] }, images = null, playing = null, due = false;
+
+function prepared(raw) {
+  const frames = raw.frames, floats = (text) => new Float32Array(bytesOf(text)), poses = floats(frames.pose);
+  const places = new Int16Array(bytesOf(frames.place)), curves = {};
+  for (const [name, text] of Object.entries(frames.curves)) curves[name] = floats(text);
+  const poseOf = (i) => {
+    const p = poses.subarray(12 * i, 12 * i + 12);
+    return Number.isFinite(p[0]) ? { R: [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]], t: [p[3], p[7], p[11]] } : null;
+  };
+  return {
+    ...raw, places, curves, poseOf, reasons: frames.reasons, indices: new Int32Array(bytesOf(frames.index)), times: floats(frames.time_s),
+    reasonOf: new Int16Array(bytesOf(frames.reason)), truth: raw.truth && { ...raw.truth, positions: floats(raw.truth.positions) },
+  };
+}
+
+// The ball around a map's surface and path: centre and radius.
+function ball(number) {
+  const map = run.maps[number], low = map.vertices ? [...map.low] : [Infinity, Infinity, Infinity], high = low.map((v, k) => (map.vertices ? map.high[k] : -Infinity));
+  run.places.forEach((place, i) => {
+    const pose = place === number && run.poseOf(i);
+    if (pose) pose.t.forEach((value, k) => ((low[k] = Math.min(low[k], value)), (high[k] = Math.max(high[k], value))));
+  });
+  const centre = low.map((value, k) => (value + high[k]) / 2);
+  return { centre, radius: Math.max(Math.hypot(...high.map((value, k) => value - low[k])) / 2, 1e-6) };
+}
+
+function colour(name) {
+  const hex = style(name);
+  return [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
+}
+
+// The path of the shown map; where frames are missing between two of its frames, a dashed line.
+function pathLines() {
+  const rows = [];
+  run.places.forEach((place, i) => place === shown && run.poseOf(i) && rows.push(i));
+  const every = Math.max(1, Math.floor(rows.length / 4000)), lines = [], [followed, lost, truth] = ["--in", "--lost", "--truth"].map(colour);
+  for (let k = every; k < rows.length; k += every) {
+    const missing = run.places.subarray(rows[k - every] + 1, rows[k]).some((place) => place !== NOT_USED && place !== shown);
+    lines.push({ from: run.poseOf(rows[k - every]).t, to: run.poseOf(rows[k]).t, colour: missing ? lost : followed, dashed: missing });
+  }
+  const true_ = shown === 0 && run.truth ? run.truth.positions : [];
+  for (let k = 3; k < true_.length; k += 3) lines.push({ from: true_.slice(k - 3, k), to: true_.slice(k, k + 3), colour: truth });
+  return lines;
+}
+
+// Corners of the camera's picture at a distance in front of it.
+function cornersOf(pose, distance) {
+  const c = run.camera, at = (u, v) => add(pose.t, rotated(pose.R, [((u - c.cx) / c.fx) * distance, ((v - c.cy) / c.fy) * distance, distance]));
+  return [at(-0.5, -0.5), at(c.width - 0.5, -0.5), at(-0.5, c.height - 0.5), at(c.width - 0.5, c.height - 0.5)];
+}
+
+function frustumLines(pose, corners) {
+  const now = colour("--now"), order = [[0, 1], [1, 3], [3, 2], [2, 0]];
+  return [...corners.map((corner) => ({ from: pose.t, to: corner, colour: now })), ...order.map(([a, b]) => ({ from: corners[a], to: corners[b], colour: now }))];
+}
+
+// Where one looks from: around the surface, or along with the camera.
+function eye(pose) {
+  const { centre, radius } = run.balls[shown], look = element("look").value, along = look !== "overview" && pose;
+  const R = product(along ? pose.R : IDENTITY, turned(turn.yaw, turn.pitch));
+  const target = add(along ? pose.t : centre, turn.shift);
+  const { clientWidth, clientHeight } = element("scene"), fit = Math.min(1, Math.max(0.72, (1.05 * clientHeight) / clientWidth));
+  const away = !along ? (fit * radius) / Math.sin(FIELD_OF_VIEW / 2) : look === "behind" ? 0.5 * radius : 0.002 * radius;
+  return { R, t: add(target, scaled(column(R, 2), -away * turn.distance)), through: along && look === "through" };
+}
+
+function drawScene() {
+  due = false;
+  if (!view) return;
+  const pose = run.places[row] === shown ? run.poseOf(row) : null, from = eye(pose), { radius, centre } = run.balls[shown];
+  const distance = Math.hypot(...add(from.t, scaled(centre, -1))), corners = pose && cornersOf(pose, 0.16 * radius);
+  view.background = colour("--scene");
+  view.paint = Number(element("paint").value);
+  view.cut = element("cut").checked;
+  const near = Math.max(0.004 * radius, distance - 2 * radius);
+  view.draw(run.maps[shown], from, {
+    near, far: distance + 3 * radius, fieldOfView: from.through ? 1.2 : FIELD_OF_VIEW, lines: pathLines(),
+    frustum: corners && !from.through ? frustumLines(pose, corners) : [], corners: from.through ? null : corners,
+  });
+  root.dataset.frustum = pose ? pose.t.map((value) => value.toFixed(4)).join(" ") : "";
+}
+
+function redraw() {
+  if (!due) requestAnimationFrame(drawScene);
+  due = true;
+}
+
+async function setRow(next) {
+  row = Math.max(0, Math.min(run.places.length - 1, next));
+  const at = row, place = run.places[row], picture = panels.nearest(row), map = place >= 0 && place < run.maps.length ? place : shown;
+  if (map !== shown) showMap(map);
+  element("slider").value = row;
+  const time = `${run.times[row].toFixed(2)} s`, status = statusOf(run, row);
+  element("slider").setAttribute("aria-valuetext", `frame ${run.indices[row]}, ${time}, ${status}`);
+  put("frame-title", `Frame ${run.indices[row]} · ${time}`);
+  put("frame-status", status[0].toUpperCase() + status.slice(1));
+  element("frame-status").dataset.place = kindOf(place);
+  curves.forEach((curve) => curve.draw(row));
+  redraw();
+  const near = picture && Math.abs(picture.row - row) <= run.spacing ? picture : null, decoded = near && (await panels.decode(near));
+  if (at !== row) return;
+  images = decoded;
+  // The pictures are those of the nearest frame that was kept, and so is the pose that they are compared at.
+  const of = near ? near.row : row, pose = run.places[of] === shown ? run.poseOf(of) : null;
+  put("video-note", near && near.row !== row ? `of frame ${run.indices[near.row]}` : "");
+  view?.setPicture(images ? images.video : null);
+  const median = panels.draw(images, run.maps[shown], view && pose, { showMask: element("mask").checked, far: 8 * run.balls[shown].radius + 2 * run.depth_range[1] });
+  put("residual-note", median === null ? "" : `differs by ${(100 * median).toFixed(1)} %`);
+  redraw();
+  root.dataset.shown = String(row);
+}
+
+function showMap(number) {
+  shown = number;
+  turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
+  put("piece", run.maps.length > 1 ? (number ? `Piece ${number}: where it lies is unknown` : "The result") : "");
+  document.querySelectorAll("#piece-list button").forEach((button, k) => button.setAttribute("aria-pressed", String(k === number)));
+  writeLegend();
+}
+
+function writeLegend() {
+  const words = legendOf(run, run.maps[shown], Number(element("paint").value)), box = element("scene-legend");
+  box.replaceChildren();
+  if (!words) return;
+  const bar = document.createElement("span"), stops = [0, 64, 128, 192, 255].map((k) => `rgb(${ramp.subarray(3 * k, 3 * k + 3).join(" ")})`);
+  bar.className = "ramp";
+  bar.style.background = `linear-gradient(to right, ${stops.join(", ")})`;
+  box.append(words[0], bar, words[1]);
+}
+
+function writePieces() {
+  element("pieces").hidden = run.maps.length < 2;
+  const buttons = run.maps.map((map, number) => {
+    const button = document.createElement("button"), canvas = document.createElement("canvas"), first = run.places.indexOf(number);
+    const note = document.createElement("small");
+    button.type = "button";
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", number ? `Surface of piece ${number}` : "Surface of the result");
+    note.textContent = `${map.frames} frames, from ${run.times[Math.max(first, 0)].toFixed(1)} s on`;
+    button.append(canvas, number ? `Piece ${number} (maps/${number})` : "The result", note);
+    button.addEventListener("click", () => (showMap(number), setRow(first)));
+    if (view && map.vertices) {
+      const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius));
+      dimensioned(canvas, 320, 240).putImageData(new ImageData(view.pixels(map, { R, t }, lensOf(320, 240, 0.9), 0.05 * radius, 9 * radius, { cut: true }), 320, 240), 0, 0);
+    }
+    return button;
+  });
+  element("piece-list").replaceChildren(...buttons);
+}
+
+function open(number) {
+  run = prepared(data.runs[number]);
+  run.licences = data.licences;
+  run.balls = run.maps.map((_, k) => ball(k));
+  run.spacing = run.pictures.length > 1 ? Math.max(...run.pictures.slice(1).map((picture, k) => picture.row - run.pictures[k].row)) : 0;
+  panels = new FramePanels(run, view, turbo);
+  put("name", run.name);
+  writeVerdict(run);
+  writeDetails(run);
+  writePieces();
+  element("truth-key").hidden = !run.truth;
+  const [near, far] = run.depth_range, unit = run.scale_known ? " mm" : "";
+  put("depth-note", run.scale_known ? `red ${short(near)} to blue ${short(far)}${unit}` : "red near, blue far");
+  element("curves").replaceChildren();
+  curves = curvesOf(run).map((curve) => new Curve(element("curves"), run, curve, setRow));
+  element("slider").max = run.places.length - 1;
+  showMap(0);
+  drawStrip(element("strip"), run);
+  setRow(Math.max(run.places.indexOf(0), 0));
+}
+
+function setTheme(dark) {
+  root.dataset.theme = dark ? "dark" : "light";
+  element("theme").setAttribute("aria-pressed", String(dark));
+  put("theme", dark ? "Light" : "Dark");
+  if (!run) return;
+  drawStrip(element("strip"), run);
+  setRow(row);
+}
+
+function play() {
+  const stop = playing !== null;
+  clearInterval(playing);
+  playing = stop ? null : setInterval(() => setRow(row + 1 < run.places.length ? row + Math.max(1, Math.round(run.places.length / 400)) : 0), 80);
+  put("play", stop ? "▶" : "❚❚");
+  element("play").setAttribute("aria-label", stop ? "Play" : "Pause");
+}

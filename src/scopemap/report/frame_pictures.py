@@ -1,0 +1,125 @@
+"""Small pictures of a run's frames, and what is measured on each frame, for its report.
+
+DIR/frames/  000012.jpg (the rectified frame)  000012_mask.png (white: usable)  measures.csv (one row per frame)
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from scopemap.errors import reporting
+from scopemap.frame import Frame
+
+FOLDER = "frames"
+_MOST = 64
+_MOST_MEASURES = 100_000
+_LONGEST_SIDE_PX = 320
+_QUALITY = 80
+_COLUMNS = ("index", "sharpness", "ms")
+
+
+class HasFrame(Protocol):
+    """What a run shows to its observers: a step."""
+
+    @property
+    def frame(self) -> Frame:
+        """The frame."""
+
+
+class FramePictures:
+    """Keeps small pictures of frames spread over a run, at most 64 (n, of every n-th, doubles), and their measures.
+
+    A measure is kept of every frame (of 100,000; beyond it fewer of the older ones): `sharpness`, the standard
+    deviation of the Laplacian of the grey picture inside the mask, and, where the run itself is `timed`, `ms`, the time
+    since the frame before.
+    """
+
+    NOT_IN_CHECKPOINT = ("_before",)
+    """Not in a checkpoint: the time between runs is no frame's."""
+
+    def __init__(self, *, timed: bool = True) -> None:
+        self._pictures: dict[int, tuple[bytes, bytes]] = {}
+        self._measures: list[tuple[int, float, float]] = []
+        self._every, self._timed, self._before = 1, timed, time.perf_counter()
+        self._count = 0
+
+    def observe(self, step: HasFrame) -> None:
+        """Put the frame of a step in: an observer for `reconstruct`."""
+        self.put(step.frame.index, step.frame.rgb, step.frame.valid)
+
+    def put(self, index: int, rgb: np.ndarray, valid: np.ndarray) -> None:
+        """Measure a frame, its picture (H, W, 3) uint8 and usable pixels (H, W) bool, and keep it where it is due."""
+        now = time.perf_counter()
+        mask = valid.astype(np.uint8)
+        laplacian = cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_16S)
+        sharpness = float(cv2.meanStdDev(laplacian, mask=mask)[1][0, 0])
+        if self._count % self._every == 0:
+            small = _shrunk(rgb, cv2.INTER_AREA)
+            self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", _shrunk(mask, cv2.INTER_NEAREST)))
+        self._measures.append((index, sharpness, 1000 * (now - self._before) if self._timed else np.nan))
+        self._count += 1
+        if len(self._measures) > _MOST_MEASURES:
+            del self._measures[1 : _MOST_MEASURES // 2 : 2]
+        if len(self._pictures) > _MOST:
+            self._pictures = dict(list(self._pictures.items())[::2])
+            self._every *= 2
+        self._before = now
+
+    def save(self, run: Path) -> None:
+        """Write them to a run's folder in place of those that it has. Raises `InputError` where that fails."""
+        folder = run / FOLDER
+        with reporting(f"cannot write to {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for index in pictured_frames(run):
+                picture_file(run, index).unlink()
+                mask_of(picture_file(run, index)).unlink(missing_ok=True)
+            for index, (picture, mask) in self._pictures.items():
+                picture_file(run, index).write_bytes(picture)
+                mask_of(picture_file(run, index)).write_bytes(mask)
+            with (folder / "measures.csv").open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file)
+                writer.writerow(_COLUMNS)
+                writer.writerows((index, f"{sharp:.4g}", f"{ms:.4g}") for index, sharp, ms in self._measures)
+
+
+def picture_file(run: Path, index: int) -> Path:
+    """Return the file of a frame's picture."""
+    return run / FOLDER / f"{index:06d}.jpg"
+
+
+def mask_of(picture: Path) -> Path:
+    """Return the file of the mask of a frame, by that of its picture."""
+    return picture.with_name(f"{picture.stem}_mask.png")
+
+
+def pictured_frames(run: Path) -> list[int]:
+    """Return the numbers of the frames that have a picture, ascending."""
+    return sorted(int(file.stem) for file in (run / FOLDER).glob("*.jpg") if file.stem.isdecimal())
+
+
+def read_measures(run: Path) -> dict[int, tuple[float, float]]:
+    """Return sharpness and milliseconds by frame number; {} where a run kept none."""
+    file = run / FOLDER / "measures.csv"
+    if not file.is_file():
+        return {}
+    with reporting(f"cannot read {file}"):
+        rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+        return {int(row["index"]): (float(row["sharpness"]), float(row["ms"])) for row in rows}
+
+
+def _shrunk(image: np.ndarray, interpolation: int) -> np.ndarray:
+    scale = min(1.0, _LONGEST_SIDE_PX / max(image.shape[:2]))
+    size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
+    return cv2.resize(image, size, interpolation=interpolation)
+
+
+def _encoded(ending: str, image: np.ndarray) -> bytes:
+    if ending == ".jpg":
+        return cv2.imencode(ending, image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return cv2.imencode(ending, image * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()

@@ -1,0 +1,111 @@
+"""report.html and summary.png of a run: one page without any request to a network, and one picture."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scopemap.errors import reporting
+from scopemap.io.checksums import SUMS, write_checksums
+from scopemap.report.frame_pictures import FOLDER as PICTURES
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.report.kept_run import read_run
+from scopemap.report.page_data import MOST_FACES, page_data, shown_meshes
+from scopemap.report.shown_mesh import base64_of
+from scopemap.report.summary_picture import summary_picture
+
+PAGE, PICTURE = "report.html", "summary.png"
+_SCRIPTS = ("matrices", "surface_view", "frame_panels", "curves", "words", "page", "gestures")
+_LICENCES = (
+    "Licences: scopemap and its depth network scopenet are under Apache-2.0. Weights of other networks have licences "
+    "of their own, named by `scopemap models list`; some forbid commercial use. The video and its data set keep theirs."
+)
+
+
+def write_report(folder: Path | str, pictures: FramePictures | None = None) -> list[Path]:
+    """Write report.html and summary.png into a run's folder, from what the folder holds; return the two files.
+
+    pictures : of the run's frames, saved to the folder first; by default those that it holds.
+    Raises `InputError` where it holds no finished run, or cannot be written.
+    """
+    if pictures is not None:
+        pictures.save(Path(folder))
+    run = read_run(folder)
+    meshes = shown_meshes(run, MOST_FACES)
+    page, picture = Path(folder) / PAGE, Path(folder) / PICTURE
+    with reporting(f"cannot write {page}"):
+        page.write_text(page_html([page_data(run, meshes)]), encoding="utf-8")
+    with reporting(f"cannot write {picture}"):
+        summary_picture(run, meshes[0]).save(picture, compress_level=1)
+    if (Path(folder) / SUMS).is_file():
+        write_checksums(Path(folder), only=(PAGE, PICTURE, PICTURES))
+    return [page, picture]
+
+
+def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) -> Path:
+    """Write one page of several runs, where each is chosen by its name, and return its file.
+
+    They share the triangles and pictures of one page.
+
+    Raises `InputError` where a folder holds no finished run, or the file cannot be written.
+    """
+    share = 1 / len(folders)
+    runs = [read_run(folder) for folder in folders]
+    data = [
+        page_data(run, shown_meshes(run, int(share * MOST_FACES)), name=name, share=share)
+        for run, name in zip(runs, names, strict=True)
+    ]
+    with reporting(f"cannot write {file}"):
+        file.write_text(page_html(data), encoding="utf-8")
+    return file
+
+
+def full_page(folder: Path | str) -> str:
+    """Return the page of a run with all faces of its surface and all kept pictures, however large that is.
+
+    Raises `InputError` where the folder holds no finished run.
+    """
+    run = read_run(folder)
+    return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))])
+
+
+def page_html(runs: list[dict[str, Any]]) -> str:
+    """Return the page of runs, each from `page_data`."""
+    levels = np.arange(256, dtype=np.uint8)
+    maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
+    colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
+    content = _plain({"runs": runs, "licences": _LICENCES} | colours)
+    parts = {
+        "title": _escaped(", ".join(run["name"] for run in runs)),
+        "style": _asset("page.css"),
+        "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
+        # "<" would end the script that holds the data, wherever a name in it contains "</script>".
+        "data": json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], _asset("page.html"))
+
+
+def _asset(name: str) -> str:
+    return (files("scopemap.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _escaped(text: str) -> str:
+    # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _plain(tree: Any) -> Any:
+    """Return nested dictionaries and lists with None for numbers that are not finite."""
+    if isinstance(tree, dict):
+        return {str(key): _plain(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_plain(value) for value in tree]
+    return None if isinstance(tree, float) and not abs(tree) < float("inf") else tree

@@ -1,0 +1,208 @@
+"""What the report's page shows, as JSON: verdict, frames, poses, pictures, meshes, settings."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.errors import ScopemapError
+from scopemap.geometry.align import align_trajectories
+from scopemap.io.datasets.reference import read_reference
+from scopemap.report.frame_pictures import mask_of
+from scopemap.report.kept_run import NOT_USED, KeptRun
+from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
+from scopemap.report.verdict import scale_is_known, scale_source, verdict
+from scopemap.trajectory.trajectory import Trajectory
+
+MOST_FACES = 100_000
+_FACES_OF_OTHERS = 20_000
+_MOST_MAPS = 8
+_MOST_BYTES = 7_500_000
+"""Of pictures, before base64, which makes them a third longer."""
+_DEPTH_WIDTH_PX = 160
+_LOOKED_AT = 25
+_CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale"}
+_LEVELS = 254
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A frame with a picture: its row, files' contents, and its depth (h, w), mm, or None."""
+
+    row: int
+    jpg: bytes
+    mask: bytes
+    depth_mm: np.ndarray | None
+
+
+def shown_meshes(run: KeptRun, most_faces: int | None) -> list[trimesh.Trimesh]:
+    """Return the meshes of the maps that the page shows, the result's first, with most faces; None: all of their faces.
+
+    Others are simplified.
+    """
+    if most_faces is None:
+        return [kept.mesh for kept in run.maps[:_MOST_MAPS]]
+    most = [most_faces] + [min(most_faces, _FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
+    return [simplified(kept.mesh, faces) for kept, faces in zip(run.maps, most, strict=False)]
+
+
+def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
+    """Return what the page shows of a run.
+
+    meshes : from `shown_meshes`. name : by default that of the input. share : of the page's size that is the run's.
+    """
+    camera = _camera(run)
+    pictures = _within_budget(_pictures(run), share * _MOST_BYTES)
+    near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
+    source = str(run.provenance.get("input", ""))
+    found = verdict(run)
+    return {
+        "name": name or Path(source).name or source,
+        "input": source,
+        "verdict": asdict(found) | {"word": found.word},
+        "scale_known": scale_is_known(run.provenance),
+        "scale_source": scale_source(run.provenance),
+        "notes": list(map(str, run.provenance.get("notes", []))),
+        "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+        "frames": _frames(run),
+        "depth_range": [near_mm, far_mm],
+        "pictures": [_picture_data(picture, near_mm, far_mm) for picture in pictures],
+        "maps": _maps(run, meshes, camera, pictures),
+        "not_shown_maps": max(len(run.maps) - _MOST_MAPS, 0),
+        "albedo": 'fusion.colours = "raw"' not in run.config,
+        "truth": _truth(run),
+        "config": run.config,
+        "provenance": run.provenance,
+    }
+
+
+def _camera(run: KeptRun) -> PinholeCamera:
+    facts = run.provenance["camera"]
+    fx, fy, cx, cy = (float(facts[name]) for name in ("fx", "fy", "cx", "cy"))
+    return PinholeCamera(fx, fy, cx, cy, int(facts["width"]), int(facts["height"]))
+
+
+def _frames(run: KeptRun) -> dict[str, Any]:
+    """Return the columns of all frames; a pose is (3, 4), row by row, NaN where there is none."""
+    poses = np.full((len(run.rows), 3, 4), np.nan)
+    for number, kept in enumerate(run.maps):
+        pose_of = dict(zip(kept.indices.tolist(), kept.T_world_camera, strict=True))
+        for row in np.flatnonzero(run.place == number):
+            poses[row] = pose_of[int(run.indices[row])][:3]
+    sharpness, ms = run.measures()
+    curves = {name: run.column(column) for name, column in _CURVES.items()}
+    # A lost frame has no scale of its own.
+    curves["scale"] = np.where(np.isnan(poses[:, 0, 0]), np.nan, curves["scale"])
+    curves |= {"sharpness": sharpness, "ms": ms}
+    return {
+        "count": len(run.rows),
+        "index": base64_of(run.indices, "i4"),
+        "time_s": base64_of(run.column("time_s"), "f4"),
+        "place": base64_of(run.place, "i2"),
+        "pose": base64_of(poses, "f4"),
+        "curves": {name: base64_of(values, "f4") for name, values in curves.items()},
+    } | _reasons(run)
+
+
+def _reasons(run: KeptRun) -> dict[str, Any]:
+    """Return the different reasons why frames are not in a map, and for each frame the number of its own, or -1."""
+    reasons = [row["reason"] if place < 0 else "" for row, place in zip(run.rows, run.place, strict=True)]
+    different = sorted({reason for reason in reasons if reason})
+    number = {reason: place for place, reason in enumerate(different)} | {"": -1}
+    return {"reasons": different, "reason": base64_of(np.array([number[reason] for reason in reasons]), "i2")}
+
+
+def _pictures(run: KeptRun) -> list[_Picture]:
+    row_of = {int(index): row for row, index in enumerate(run.indices)}
+    found = []
+    for index, file in run.pictures.items():
+        row, mask = row_of.get(index), mask_of(file)
+        if row is not None and run.place[row] != NOT_USED and mask.is_file():
+            depth_mm = _small_depth(run.depth_mm(index))
+            found.append(_Picture(row, file.read_bytes(), mask.read_bytes(), depth_mm))
+    return found
+
+
+def _small_depth(depth_mm: np.ndarray | None) -> np.ndarray | None:
+    if depth_mm is None:
+        return None
+    height, width = depth_mm.shape
+    shown = min(width, _DEPTH_WIDTH_PX)
+    size = (shown, max(1, round(height * shown / width)))
+    return cv2.resize(depth_mm, size, interpolation=cv2.INTER_NEAREST)
+
+
+def _within_budget(pictures: list[_Picture], most_bytes: float) -> list[_Picture]:
+    """Leave every second picture out until the others fit on the page."""
+    sizes = [len(p.jpg) + len(p.mask) + (0 if p.depth_mm is None else p.depth_mm.size) for p in pictures]
+    while len(pictures) > 1 and sum(sizes) > most_bytes:
+        pictures, sizes = pictures[::2], sizes[::2]
+    return pictures
+
+
+def _depth_range(depths_mm: list[np.ndarray]) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of all depths, mm, one range for the whole run."""
+    known = [depth_mm[np.isfinite(depth_mm)][::7] for depth_mm in depths_mm]
+    some = np.concatenate([*known, np.empty(0, np.float32)])
+    if not some.size:
+        return 1.0, 100.0
+    near_mm, far_mm = (float(value) for value in np.percentile(some, [1, 99]))
+    return round(near_mm, 3), round(max(far_mm, 1.2 * near_mm), 3)
+
+
+def _picture_data(picture: _Picture, near_mm: float, far_mm: float) -> dict[str, Any]:
+    """Return a picture for the page; depth: 1..255 = near..far, logarithmic, 0 = unknown."""
+    data = {"row": picture.row, "jpg": b64encode(picture.jpg).decode(), "mask": b64encode(picture.mask).decode()}
+    if picture.depth_mm is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            level = 1 + _LEVELS * np.log(picture.depth_mm / near_mm) / np.log(far_mm / near_mm)
+        code = np.where(np.isnan(level), 0, np.clip(np.round(level), 1, 255)).astype(np.uint8)
+        data["depth"] = b64encode(cv2.imencode(".png", code)[1].tobytes()).decode()
+    return data
+
+
+def _maps(
+    run: KeptRun, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
+) -> list[dict[str, Any]]:
+    """Return the meshes of the maps, the result first."""
+    found = []
+    for number, (kept, mesh) in enumerate(zip(run.maps, meshes, strict=False)):
+        pose_of = dict(zip(kept.indices.tolist(), kept.T_world_camera, strict=True))
+        looking = [p for p in pictures if run.place[p.row] == number and p.depth_mm is not None]
+        looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
+        seen = [SeenFrame(pose_of[int(run.indices[p.row])], p.depth_mm) for p in looking if p.depth_mm is not None]
+        data = mesh_data(mesh, seen, camera)
+        found.append(data | {"frames": len(kept.indices), "all_faces": len(kept.mesh.faces)})
+    return found
+
+
+def _truth(run: KeptRun) -> dict[str, Any] | None:
+    """Return the true camera positions of the result's frames, moved and scaled onto it; None where none are known."""
+    source, kept = run.provenance.get("input", ""), run.maps[0]
+    try:
+        reference = read_reference(Path(source)) if source and Path(source).is_dir() else None
+        return None if reference is None else _aligned(reference, kept.indices, kept.T_world_camera)
+    except ScopemapError:  # no poses, or too few or too straight a path to be aligned
+        return None
+
+
+def _aligned(reference: Trajectory, indices: np.ndarray, T_world_camera: np.ndarray) -> dict[str, Any] | None:
+    """Return positions and the error of the estimate as a share of the path's length."""
+    common, of_truth, of_estimate = np.intersect1d(reference.indices, indices, return_indices=True)
+    if len(common) < 3:
+        return None
+    estimate = T_world_camera[of_estimate]
+    moved, _ = align_trajectories(reference.T_world_camera[of_truth], estimate, "sim3")
+    error = np.linalg.norm(moved[:, :3, 3] - estimate[:, :3, 3], axis=1)
+    length = float(np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum())
+    return {
+        "positions": base64_of(moved[:, :3, 3], "f4"),
+        "error_share": float(np.sqrt((error**2).mean())) / max(length, 1e-9),
+    }

@@ -1,0 +1,105 @@
+"""A run's mesh as the page shows it: few faces, numbers of few bits, and how often each vertex was seen."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.geometry.rendering import vertex_colours
+from scopemap.geometry.se3 import inverse
+
+_SAME_SURFACE = 0.1
+_CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
+_LARGEST_16_BIT = 65535
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A frame that looks at a mesh: its pose (4, 4), world mm, and its depth (h, w), mm, NaN = unknown, any size."""
+
+    T_world_camera: np.ndarray
+    depth_mm: np.ndarray
+
+
+def base64_of(values: np.ndarray, dtype: str) -> str:
+    """Return an array as base64 of its little-endian numbers."""
+    return b64encode(np.ascontiguousarray(values, np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+def simplified(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
+    """Return a mesh with at most so many faces: vertices in one cell of a grid become their mean, with its colour.
+
+    A twentieth of the time of quadric edge collapses, and colours are means, not those of single vertices (Rossignac
+    and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993). Attributes are means, too.
+    """
+    cell = np.sqrt(_CELLS_PER_FACE * mesh.area / most_faces) if len(mesh.faces) > most_faces else 0.0
+    while len(mesh.faces) > most_faces:
+        fewer = _clustered(mesh, cell)
+        if len(fewer.faces) <= most_faces:
+            return fewer
+        cell *= np.sqrt(max(len(fewer.faces) / most_faces, 1.04))
+    return mesh
+
+
+def _clustered(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
+    """Return a mesh whose vertices are the means of those in each cube of a grid; `cell` is the cube's side."""
+    vertices = np.asarray(mesh.vertices)
+    places = np.floor((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
+    across, along, _ = places.max(axis=0) + 1
+    keys = places[:, 0] + across * (places[:, 1] + along * places[:, 2])
+    cluster_of, count = np.unique(keys, return_inverse=True, return_counts=True)[1:]
+
+    def mean(values: Any) -> np.ndarray:
+        columns = np.asarray(values, np.float64).reshape(len(vertices), -1).T
+        return np.stack([np.bincount(cluster_of, column, len(count)) / count for column in columns], axis=-1)
+
+    faces = cluster_of[np.asarray(mesh.faces)]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    attributes: dict[str, Any] = {name: mean(values).ravel() for name, values in mesh.vertex_attributes.items()}
+    colours = np.round(mean(vertex_colours(mesh)[:, :3])).astype(np.uint8)
+    return trimesh.Trimesh(mean(vertices), faces, vertex_colors=colours, vertex_attributes=attributes, process=False)
+
+
+def times_seen(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera) -> np.ndarray:
+    """Return in how many of the frames each vertex is seen, (V,) int64: where their depth is within 10 % of its own."""
+    count = np.zeros(len(mesh.vertices), np.int64)
+    vertices = np.asarray(mesh.vertices, np.float32)
+    for frame in frames:
+        height, width = frame.depth_mm.shape
+        T_camera_world = inverse(frame.T_world_camera).astype(np.float32)
+        points = vertices @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+        ahead = np.flatnonzero(points[:, 2] > 0)
+        pixels = camera.project(points[ahead]) * np.array([width / camera.width, height / camera.height], np.float32)
+        inside = ((pixels >= -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=1)
+        ahead, (column, row) = ahead[inside], np.round(pixels[inside]).astype(int).T
+        with np.errstate(invalid="ignore"):
+            count[ahead] += np.abs(frame.depth_mm[row, column] / points[ahead, 2] - 1) < _SAME_SURFACE
+    return count
+
+
+def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera) -> dict[str, Any]:
+    """Return a mesh for the page: base64 arrays; `seen` is how often each vertex was seen, 255 = in all frames.
+
+    positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, seen: uint8. faces: uint32.
+    """
+    low, high = (np.zeros(3), np.ones(3)) if not len(mesh.vertices) else np.asarray(mesh.bounds)
+    spread = np.maximum(high - low, 1e-9)
+    confidence = np.asarray(mesh.vertex_attributes.get("confidence", np.ones(len(mesh.vertices))), np.float64)
+    seen = times_seen(mesh, frames, camera)
+    return {
+        "vertices": len(mesh.vertices),
+        "low": np.round(low, 4).tolist(),
+        "high": np.round(high, 4).tolist(),
+        "positions": base64_of(np.round((np.asarray(mesh.vertices) - low) / spread * _LARGEST_16_BIT), "u2"),
+        "normals": base64_of(np.round(127 * np.asarray(mesh.vertex_normals)), "i1"),
+        "colours": base64_of(vertex_colours(mesh)[:, :3], "u1"),
+        "confidence": base64_of(np.round(255 * np.clip(confidence.ravel(), 0, 1)), "u1"),
+        "seen": base64_of(np.round(255 * seen / max(len(frames), 1)), "u1"),
+        "looked": len(frames),
+        "faces": base64_of(mesh.faces, "u4"),
+    }

@@ -1,0 +1,202 @@
+"""Whether a run can be trusted: one word, what it may be used for, and the reasons; docs/report.md has the rules."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
+
+Level = Literal["good", "doubtful", "bad", "note"]
+WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
+
+LEAST_FRAMES = 10
+GOOD_SHARE, LEAST_SHARE = 0.8, 0.3
+"""Share of the frames that are in the result."""
+GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
+"""Mean share of what the frames see that the surface covers."""
+GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
+"""Median relative difference between the surface's depth and the frames' depth."""
+
+_PLAIN_WORDS: list[tuple[str, Level, str]] = [
+    ("^[0-9]+ submaps: the camera was lost", "note", ""),
+    ("^interrupted at frame", "note", ""),
+    ("in the result: too few to judge it by", "note", ""),
+    ("most of the scene is not fused", "doubtful", "Most of what was seen is too far away to be in the surface"),
+    ("^masks: .* frames have none", "doubtful", "Most frames have no mask: instruments may be part of the surface"),
+    ("pictures are interlaced", "doubtful", "The video is interlaced: what moves has combed edges (see --deinterlace)"),
+    ("burned into the images", "note", "Text is burned into the images, perhaps a patient's name: hand none on"),
+]
+"""A part of a run's warning, its level, and how it is put to a reader; "" where another reason says the same."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One fact of a verdict: its level ("note": it does not change the word), and a sentence."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a run.
+
+    level : the worst of its reasons. advice : what the result may be used for. sentence : the main facts.
+    reasons : the worst first; the run's warnings are among them, in plain words, unless another reason says the same.
+    """
+
+    level: Level
+    advice: str
+    sentence: str
+    reasons: list[Reason]
+
+    @property
+    def word(self) -> str:
+        """good, doubtful or not usable."""
+        return WORDS[self.level]
+
+
+def verdict(run: KeptRun) -> Verdict:
+    """Return the verdict on a run, from its frames and its provenance."""
+    found = [*_of_end(run), *_of_warnings(run), _of_frames(run), *_of_maps(run), *_of_surface(run), *_of_camera(run)]
+    order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
+    reasons = sorted(found, key=lambda reason: order.index(reason.level))
+    level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
+    return Verdict(level, _advice(run, level), _sentence(run), reasons)
+
+
+def frames_in_result(run: KeptRun) -> tuple[int, int]:
+    """Return how many frames are in the result, and of how many that were used."""
+    return int(np.sum(run.place == 0)), int(np.sum(run.place != NOT_USED))
+
+
+def scale_is_known(provenance: dict[str, Any]) -> bool:
+    """Return whether sizes were measured or anchored to a given range; predicted millimetres are a guess."""
+    if "scale" in provenance:
+        return bool(provenance["scale"]["known"])
+    return scale_source(provenance).startswith(("measured", "near-far"))  # a run of an earlier version
+
+
+def scale_source(provenance: dict[str, Any]) -> str:
+    """Return what the scale comes from, in words."""
+    scale = provenance.get("scale") or {"source": provenance.get("estimators", {}).get("anchor", "unknown")}
+    return str(scale["source"])
+
+
+def longest_stretch(outside: np.ndarray) -> int:
+    """Return the length of the longest run of True in (N,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _advice(run: KeptRun, level: Level) -> str:
+    if level == "bad":
+        return "Do not use this result."
+    use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+    if scale_is_known(run.provenance):
+        return f"{use} Sizes are known (by {scale_source(run.provenance)})."
+    return f"{use} Sizes are unknown: compare shapes, do not measure."
+
+
+def _sentence(run: KeptRun) -> str:
+    inside, used = frames_in_result(run)
+    surface = run.provenance.get("surface") or {}
+    parts = [f"{inside} of {used} frames in one map"]
+    parts.append("scale known" if scale_is_known(run.provenance) else "scale unknown")
+    if not len(run.maps[0].mesh.faces):
+        parts.append("no surface")
+    elif "coverage_mean" in surface:
+        parts.append(f"surface covers {_percent(surface['coverage_mean'])} of what was seen")
+    return "; ".join(parts)
+
+
+def _of_frames(run: KeptRun) -> Reason:
+    inside, used = frames_in_result(run)
+    share = inside / max(used, 1)
+    if inside < LEAST_FRAMES:
+        return Reason("bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
+    lost_in_a_row = longest_stretch(run.place[run.place != NOT_USED] != 0)
+    longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
+    until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
+    text = f"{_percent(share)} of the frames{until} are in the result ({inside} of {used}).{longest}"
+    return Reason(_level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
+
+
+def _of_maps(run: KeptRun) -> list[Reason]:
+    other = int(np.sum((run.place > 0) | (run.place == OTHER_MAP)))
+    lost = int(np.sum(run.place == LOST))
+    found = []
+    if other:
+        kept = len(run.maps) - 1
+        shown = f"; {kept} {'piece is' if kept == 1 else 'pieces are'} shown below" if kept else ""
+        text = f"After losses {other} more frames form pieces of their own: where they belong is unknown{shown}."
+        found.append(Reason("note", text))
+    if lost:
+        found.append(Reason("note", f"In {lost} frames the camera could not be followed at all."))
+    return found
+
+
+def _of_surface(run: KeptRun) -> list[Reason]:
+    if not len(run.maps[0].mesh.faces):
+        return [Reason("bad", "There is no surface.")]
+    surface, found = run.provenance.get("surface") or {}, []
+    if "coverage_mean" in surface:
+        coverage = float(surface["coverage_mean"])
+        text = f"The surface covers {_percent(coverage)} of what its frames show"
+        text += f" (worst frame: {_percent(float(surface['coverage_least']))})."
+        found.append(Reason(_level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
+    if "depth_error" in surface:
+        error = float(surface["depth_error"])
+        level = _level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)
+        words = {"good": "fits", "doubtful": "fits only roughly", "bad": "contradicts"}[level]
+        text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median)."
+        found.append(Reason(level, text))
+    return found
+
+
+def _of_camera(run: KeptRun) -> list[Reason]:
+    found, facts = [], run.provenance
+    source = str(facts.get("camera", {}).get("source", ""))
+    if source.startswith("assumed"):
+        text = "The lens is a guess (no calibration): depth against width may be wrong."
+        found.append(Reason("doubtful", text))
+    notes = " ".join(map(str, facts.get("notes", [])))
+    if "the scene is not rigid or the focal length is wrong" in notes:
+        text = "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed."
+        found.append(Reason("doubtful", text))
+    if "the camera is at rest while the tissue moves" in notes:
+        found.append(Reason("doubtful", "The camera hardly moves while the tissue does: the path means little."))
+    if "the lens has radial distortion" in notes:
+        found.append(Reason("doubtful", "The lens bends straight lines: shapes are bent, too. A calibration mends it."))
+    return found
+
+
+def _of_warnings(run: KeptRun) -> list[Reason]:
+    """Return the run's warnings, each once; those without a plainer wording here as the run worded them."""
+    found = []
+    for warning in dict.fromkeys(map(str, run.provenance.get("warnings", []))):
+        known = (plain for plain in _PLAIN_WORDS if re.search(plain[0], warning))
+        _, level, words = next(known, (warning, "note", warning))
+        if words:
+            found.append(Reason(level, f"{words[0].upper()}{words[1:].rstrip('.')}."))
+    return found
+
+
+def _of_end(run: KeptRun) -> list[Reason]:
+    last = run.provenance.get("interrupted_at_frame")
+    return [] if last is None else [Reason("doubtful", f"The run was stopped at frame {last}: the rest is missing.")]
+
+
+def _level(value: float, good: float, bad: float) -> Level:
+    """Return the level of a value of which less is better; the limits themselves belong to the better side."""
+    return "good" if value <= good else "doubtful" if value <= bad else "bad"
+
+
+def _percent(share: float, digits: int = 0) -> str:
+    """Return a share as text; rounded down, so that not even a pixel short of all is all."""
+    factor = 10.0**digits
+    return f"{np.floor(100 * share * factor + 1e-9) / factor:.{digits}f} %"

@@ -1,0 +1,160 @@
+"""Writes checkpoints during a run, and resumes a run from the last one."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+from scopemap.config import Config
+from scopemap.errors import InputError, reporting
+from scopemap.estimators import package_versions
+from scopemap.io.checkpoint import CHECKPOINT, SavedState, is_committed
+from scopemap.io.checksums import input_checksum
+from scopemap.io.result_folder import UNFINISHED
+from scopemap.io.sequence import Sequence
+from scopemap.pipeline import Pipeline
+
+# A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
+_LEAST_S, _SHARE = 5.0, 0.02
+_RUN = ("records", "median_depths_mm", "checked", "forgotten", "map", "frames_of_map", "write")
+_SHOWN_DIFFERENCES = 4
+
+
+class HasState(Protocol):
+    """A run: what its attributes `_RUN` hold, and its pipeline."""
+
+    sequence: Sequence
+    pipeline: Pipeline
+
+
+class Checkpoints:
+    """Writes the state of a run as it goes, and restores it.
+
+    The stages of the pipeline are some frames apart: the state of each is written when a certain frame has passed it,
+    so that together they are the state of the run after that frame.
+
+    folder : where the file is. identity : what a run must have in common with this one to resume it, as JSON holds it.
+    kept : further objects that go with the run, such as observers. Raises `InputError` as `SavedState` does.
+    """
+
+    def __init__(self, folder: Path, identity: dict[str, Any], run: HasState, kept: tuple[object, ...] = ()) -> None:
+        self._file = SavedState(folder / CHECKPOINT)
+        self._identity, self._run, self._kept = identity, run, kept
+        self._first_s = self._next_s = time.perf_counter() + _LEAST_S
+        self._open = False
+
+    @property
+    def exist(self) -> bool:
+        """Whether there is a state to go on with."""
+        return bool(self._file.facts)
+
+    def due(self) -> bool:
+        """Return whether the frame that is read now should be one after which the state is written."""
+        if self._open or time.perf_counter() < self._next_s:
+            return False
+        self._open, self._file.seconds = True, 0.0
+        return True
+
+    def keep(self, stage: str) -> None:
+        """Write the state of a stage of the pipeline, called in the thread that changes it."""
+        if stage == "track":
+            self._run.pipeline.mapper.settle()
+        self._file.put(stage, self._stage(stage))
+
+    def commit(self, last: int, *, complete: bool = False) -> None:
+        """Write the rest; the state of the run is now that after the frame `last`, `complete`: after all frames."""
+        with reporting("cannot write the stored frames"):
+            self._run.pipeline.fusion.store.sync()
+        self._file.put("run", self._rest())
+        self._file.commit({"identity": self._identity, "last": last, "complete": complete})
+        self._next_s, self._open = time.perf_counter() + max(_LEAST_S, self._file.seconds / _SHARE), False
+
+    def commit_all(self, last: int) -> None:
+        """Write the state after all frames, when no stage is at work; that of a short run is not worth it."""
+        if time.perf_counter() < self._first_s:
+            return
+        for stage in self._run.pipeline.STATES:
+            self.keep(stage)
+        self.commit(last, complete=True)
+
+    def restore(self) -> tuple[int, bool]:
+        """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
+        pipeline, facts = self._run.pipeline, self._file.facts
+        for stage in pipeline.STATES:
+            for name, value in self._file.restore(stage, self._stage(stage)).items():
+                setattr(pipeline, name, value)
+        found = self._file.restore("run", self._rest())
+        for name in _RUN:
+            setattr(self._run, name, found[name])
+        self._run.sequence.choice.skipped.update(found["skipped"])
+        if facts["complete"]:
+            self._run.sequence.source.warnings[:] = found["warnings"]
+        with reporting("cannot resume with the stored frames"):
+            pipeline.fusion.store.reopen()
+        return int(facts["last"]), bool(facts["complete"])
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _stage(self, stage: str) -> dict[str, Any]:
+        return {name: getattr(self._run.pipeline, name) for name in self._run.pipeline.STATES[stage]}
+
+    def _rest(self) -> dict[str, Any]:
+        sequence = self._run.sequence
+        found = {name: getattr(self._run, name) for name in _RUN}
+        read = {"skipped": dict(sequence.choice.skipped), "warnings": list(sequence.source.warnings)}
+        return found | read | {"fusion": self._run.pipeline.fusion, "kept": self._kept}
+
+
+def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> dict[str, Any]:
+    """Return what two runs have in common that have the same result, as JSON holds it."""
+    kind, _, folder = config.depth.backend.partition(":")
+    content = input_checksum(sequence.path)
+    facts = {
+        # What is too large to be told by its content is told by its place.
+        "input": content if "sha256" in content else content | {"path": str(sequence.path.resolve())},
+        "frames": str(sequence.selection),
+        "camera": f"{sequence.rectifier.source} at {sequence.camera.width}x{sequence.camera.height}",
+        "depth files": input_checksum(Path(folder)) if kind == "files" else {},
+        "tracker": type(tracker).__name__,
+    }
+    groups = config.model_dump(mode="json", exclude={"preset"})
+    return (
+        facts
+        | {f"{group}.{key}": value for group, part in groups.items() for key, value in part.items()}
+        | package_versions()
+    )
+
+
+def can_resume(folder: Path, identity: dict[str, Any]) -> bool:
+    """Return whether a folder holds a checkpoint of a run that would have the same result."""
+    return is_committed(folder / CHECKPOINT) and not _differences(folder, identity)
+
+
+def check_resumable(out: Path, sequence: Sequence, config: Config) -> None:
+    """Raise `InputError` with the difference where a run in `out` was ended that would have another result."""
+    if not (out / UNFINISHED / CHECKPOINT).is_file():
+        return
+    other = _differences(out / UNFINISHED, identity_of(sequence, config))
+    if other:
+        raise InputError(
+            f"cannot resume the run in {out}: {'; '.join(other[:_SHOWN_DIFFERENCES])}; --no-resume begins a new one"
+        )
+
+
+def discard_unfinished(out: Path) -> None:
+    """Have the next run in `out` begin anew."""
+    with suppress(FileNotFoundError):
+        (out / UNFINISHED / CHECKPOINT).unlink()
+
+
+def _differences(folder: Path, identity: dict[str, Any]) -> list[str]:
+    """Return in words in what a run that was ended in a folder differs from one with this identity."""
+    file = SavedState(folder / CHECKPOINT)
+    before = file.facts.get("identity", identity)
+    file.close()
+    names = [name for name in sorted({*before, *identity}) if before.get(name) != identity.get(name)]
+    return [f"{name} was {before.get(name)}, is {identity.get(name)}" for name in names]

@@ -1,0 +1,31 @@
+"""A run with its report: what `scopemap run` does, and `scopemap batch` with each video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scopemap.config import Config
+from scopemap.io.sequence import Sequence
+from scopemap.reconstruction import Reconstruction
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.report.page import write_report
+from scopemap.runner.preparation import Progress
+from scopemap.runner.run import Observer, reconstruct
+
+
+def reconstruct_with_report(
+    sequence: Sequence,
+    config: Config,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    observers: tuple[Observer, ...] = (),
+    progress: Progress = lambda doing, done, total: None,
+) -> Reconstruction:
+    """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
+    pictures = FramePictures()
+    seen = (pictures.observe, *observers)
+    result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
+    progress("writing the report", 0, 0)
+    write_report(out, pictures)
+    return result

@@ -1,0 +1,115 @@
+"""A run's folder, drawn: a camera flies through a coloured tube, is lost, and goes on in a second map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.config import Config
+from scopemap.frame import Frame
+from scopemap.geometry.rendering import render_mesh
+from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.tracking.track import Track
+
+CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
+IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
+LOST = FRAMES - IN_RESULT - IN_FIRST_MAP
+GOOD_SURFACE = {"frames": 9, "coverage_mean": 0.94, "coverage_least": 0.9, "depth_error": 0.01}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What `FramePictures.observe` looks at."""
+
+    frame: Frame
+
+
+def tube() -> trimesh.Trimesh:
+    """A closed tube along z, its faces towards the inside, with dark and bright rings."""
+    around, along = 48, 61
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(5.0, 85.0, along))
+    wall = np.stack([10 * np.cos(angle), 10 * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    here = np.arange(around * (along - 1)).reshape(-1, around)
+    beside, behind = np.roll(here, -1, axis=1), here + around
+    faces = np.stack([here, behind, beside, beside, behind, np.roll(behind, -1, axis=1)], axis=-1).reshape(-1, 3)
+    far = np.arange(around * (along - 1), around * along)
+    lid = np.stack([far, np.full(around, len(wall)), np.roll(far, -1)], axis=-1)
+    vertices = np.concatenate([wall, [[0.0, 0.0, 85.0]]])
+    bright = (vertices[:, 2] // 8).astype(int) % 2
+    colours = np.array([[110, 50, 40], [230, 180, 130]], np.uint8)[bright]
+    confidence = {"confidence": np.linspace(0, 1, len(vertices)).astype(np.float32)}
+    faces = np.concatenate([faces, lid])
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, vertex_attributes=confidence, process=False)
+
+
+def pose_of(index: int) -> np.ndarray:
+    """The camera-to-world pose of a frame."""
+    return se3(so3_exp(np.array([0.0, 0.01 * index, 0.0])), np.array([0.01 * index**2, 0.0, float(index)]))
+
+
+def drawn_result(name: str = "video.mp4", **facts: Any) -> Reconstruction:
+    """The run in memory; `facts` replace those of its provenance."""
+    provenance = {
+        "input": name,
+        "dataset": "video",
+        "frames": FRAMES,
+        "camera": {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        | {"source": "calibration file camera.yaml"},
+        "estimators": {"depth": "scopenet", "flow": "dis"},
+        "scale": {"known": False, "source": "millimetres as scopenet gives them"},
+        "notes": ["a note"],
+        "warnings": ["a warning"],
+        "seconds": {"total": 3.0},
+        "versions": {"scopemap": "0.1.0"},
+        "surface": GOOD_SURFACE,
+    } | facts
+    # The pictures are drawn without a lamp.
+    config, mesh, second = Config.load(settings={"fusion.colours": "raw"}), tube(), range(IN_RESULT + LOST, FRAMES)
+    other = Reconstruction(CAMERA, [_record(index, 1) for index in second], mesh, config, provenance)
+    records = [_record(index, 0) for index in range(FRAMES)]
+    return Reconstruction(CAMERA, records, mesh, config, provenance, others=[other])
+
+
+def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **facts: Any) -> Path:
+    """Write the run's folder with its frames' pictures; `facts` replace those of its provenance."""
+    mesh, kept, write = tube(), FramePictures(), DepthWriter(folder)
+    for index in range(FRAMES):
+        seen = render_mesh(mesh, CAMERA, pose_of(index))
+        valid = np.isfinite(seen.depth_mm)
+        valid[:, :4] = False
+        frame = Frame(index, index / 25, seen.rgb, CAMERA, valid, seen.depth_mm, pose_of(index))
+        write(frame)
+        kept.observe(Shown(frame))
+    if pictures:
+        kept.save(folder)
+    drawn_result(name, **facts).save(folder)
+    return folder
+
+
+def draw_run_of_frames(root: Path) -> Path:
+    """Write the run's folder, and the folder of pictures that it is of, both under `root`."""
+    frames, mesh = root / "frames", tube()
+    frames.mkdir()
+    write_calibration(CAMERA, frames / "camera.yaml")
+    for index in range(FRAMES):
+        cv2.imwrite(str(frames / f"{index:06d}.png"), render_mesh(mesh, CAMERA, pose_of(index)).rgb[..., ::-1])
+    return draw_run(root / "result", name=str(frames))
+
+
+def _record(index: int, number: int) -> FrameRecord:
+    """The record of a frame in the map with this number."""
+    place = 0 if index < IN_RESULT else None if index < IN_RESULT + LOST else 1
+    pose = pose_of(index) if place == number else None
+    status = "lost" if place is None else "other-map" if place != number else "initial" if index == 0 else "ok"
+    reason = "too blurred" if place is None else f"tracked in maps/{place}" if place != number else ""
+    track = Track(index, status, reason, pose_of(index), 0, 0.5, 0.8 - 0.01 * index, 0.9, 0.9, 3)  # type: ignore[arg-type]
+    return FrameRecord(index, index / 25, "", track, pose, 1 + 0.01 * index, 0.5, place)

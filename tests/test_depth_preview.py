@@ -1,0 +1,115 @@
+"""Pictures of a run's depth, and what the result says of its scale."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from tiny_phantom import FRAMES, only_images, write_tiny
+
+from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap.cli.run import summary_lines
+from scopemap.config import Config
+from scopemap.frame import Frame
+from scopemap.io.sequence import Sequence
+from scopemap.reconstruction import DepthReader, DepthWriter, scale_words
+
+UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+    folder = tmp_path_factory.mktemp("scale")
+    return open_sequence(only_images(write_tiny(folder / "phantom"), folder / "images"))
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run") / "out"
+
+
+@pytest.fixture(scope="module")
+def result(images: Sequence, out: Path) -> Reconstruction:
+    return reconstruct(images, Config.load(settings={"input.focal": "assume"}), out=out)
+
+
+def _frame(images: Sequence, index: int, depth_mm: float) -> Frame:
+    frame = next(iter(images.frames()))
+    ramp_mm = np.linspace(depth_mm, 2 * depth_mm, frame.rgb[..., 0].size, dtype=np.float32)
+    ramp_mm = ramp_mm.reshape(frame.rgb.shape[:2])
+    ramp_mm[:10] = np.nan
+    return replace(frame, index=index, depth_mm=ramp_mm, depth_sigma_mm=None)
+
+
+def test_previews_have_one_range_for_all_frames_and_unknown_is_black(images: Sequence, tmp_path: Path) -> None:
+    write = DepthWriter(tmp_path)
+    for index, depth_mm in enumerate((10.0, 40.0)):
+        write(_frame(images, index, depth_mm))
+    write.finish(scale_known=False)
+    facts = json.loads((tmp_path / "depth" / "depth.json").read_text())
+    near_mm, far_mm = facts["preview_mm"]
+    assert 10 <= near_mm < 12
+    assert 75 < far_mm <= 80
+    assert facts["scale_known"] is False
+    near, far = (cv2.imread(str(tmp_path / "depth_preview" / f"00000{n}.jpg")) for n in (0, 1))
+    assert near.dtype == np.uint8
+    assert max(near[:6].max(), far[:6].max()) < 20
+    assert near[11, 5, 2] > 100 > near[11, 5, 0]  # red, as OpenCV orders colours
+    assert far[-2, -5, 0] > far[-2, -5, 2]
+    assert np.median(near[12:].max(axis=-1)) > 100
+    depth_mm = DepthReader(tmp_path).read(1)
+    assert depth_mm is not None
+    np.testing.assert_allclose(depth_mm[10:].min(), np.nanmin(_frame(images, 1, 40.0).depth_mm), atol=0.01)
+
+
+def test_without_depth_there_is_no_preview(tmp_path: Path) -> None:
+    DepthWriter(tmp_path).finish(scale_known=True)
+    assert not (tmp_path / "depth_preview").exists()
+    assert json.loads((tmp_path / "depth" / "depth.json").read_text())["scale_known"] is True
+
+
+def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out: Path) -> None:
+    assert result.provenance["scale"] == {"known": False, "source": "millimetres as scopenet gives them"}
+    assert scale_words(result.provenance["scale"]) == UNKNOWN
+    lines = summary_lines(result)
+    assert lines[0].endswith("(scale unknown)")
+    assert lines[1].startswith(UNKNOWN)
+    assert f"# {UNKNOWN}" in (out / "trajectory.tum").read_text().splitlines()
+    assert f"comment {UNKNOWN}\n".encode() in (out / "mesh.ply").read_bytes()[:600]
+    assert json.loads((out / "depth" / "depth.json").read_text())["scale_known"] is False
+    assert json.loads((out / "provenance.json").read_text())["scale"]["known"] is False
+    assert UNKNOWN.encode() in (out / "mesh.glb").read_bytes()
+    assert len(trimesh.load_mesh(out / "mesh.ply").faces) == len(result.mesh.faces)
+    assert len(list((out / "depth_preview").iterdir())) == FRAMES
+
+
+def test_the_assumed_view_is_said_once_and_no_option_is_named_that_was_not_given(result: Reconstruction) -> None:
+    lines = [line for line in summary_lines(result) if "field of view" in line or "focal" in line]
+    assert len(lines) == 1
+    assert lines[0] == "camera: assumed: horizontal field of view 70 deg"
+
+
+@pytest.mark.parametrize(
+    ("settings", "known"),
+    [
+        ({"depth.near_far_mm": [5, 80]}, True),
+        ({"depth.backend": "shading"}, False),
+        ({"depth.anchor": "factor", "depth.backend": "scopenet"}, False),
+    ],
+)
+def test_what_is_anchored_is_known(images: Sequence, settings: dict[str, object], known: bool) -> None:
+    config = Config.load(settings={"input.focal": "assume", "fusion.enabled": False, **settings})
+    facts = reconstruct(images, config).provenance["scale"]
+    assert facts["known"] is known
+    assert scale_words(facts).startswith("scale: near-far 5:80 mm" if known else "scale unknown (")
+
+
+def test_depth_of_a_run_of_unknown_scale_is_not_measured(images: Sequence, result: Reconstruction, out: Path) -> None:
+    settings = {"input.focal": "assume", "fusion.enabled": False, "depth.backend": f"files:{out / 'depth'}"}
+    facts = reconstruct(images, Config.load(settings=settings)).provenance["scale"]
+    assert facts == {"known": False, "source": "measured depth of unknown unit"}

@@ -1,0 +1,119 @@
+"""Commands and Python in the documents: all are understood, and those about the demonstration run on a small one."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import typer.main
+from front_door import call
+
+from scopemap.benchmark import demonstration
+from scopemap.cli import app
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+DOCUMENTS = sorted({*DOCUMENTS, *(ROOT / "benchmarks").glob("*.md")} - {ROOT / "CHANGELOG.md"})
+# ClickException, wherever typer has it.
+REFUSED = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+# Not the name of an image, nor of an import.
+CALLED = re.compile(r"(?!podman )(?:.*[\s!(])?scopemap ((?!import)[a-z-].*)")
+ABOUT_THE_DEMO = re.compile(r"scopemap-demo/")
+
+
+def _blocks(text: str, language: str = r"\w*") -> list[str]:
+    """Return the content of code blocks: fenced ones of the language, and indented ones where any will do."""
+    fenced = re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+    plain = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    indented = re.findall(r"(?:^ {4}.*\n)+", plain, flags=re.MULTILINE) if language == r"\w*" else []
+    return fenced + indented
+
+
+def _commands(document: Path) -> list[list[str]]:
+    """Return the arguments of each `scopemap` in the document's blocks of code."""
+    found = []
+    for block in _blocks(document.read_text(encoding="utf-8")):
+        for line in block.replace("\\\n", " ").splitlines():
+            parts = re.split(r"\s(?:&&|\||>|&)\s|;\s", re.sub(r"\s#.*", "", line))
+            called = [
+                re.search(r"^(?!podman )(?:.*[\s!(])?scopemap ((?!import)[a-z-].*)", part.strip()) for part in parts
+            ]
+            found += [shlex.split(match[1]) for match in called if match]
+    return found
+
+
+def _parse(command: Any, arguments: list[str], parent: Any = None, name: str = "scopemap") -> None:
+    """Parse arguments as the command line does, without running anything."""
+    context = command.make_context(name, list(arguments), parent=parent)
+    if hasattr(command, "resolve_command"):
+        called, below, rest = command.resolve_command(context, [*context._protected_args, *context.args])
+        _parse(below, rest, context, called)
+
+
+def test_what_is_not_understood_is_found() -> None:
+    for wrong in (["run", "my.mp4", "--out", "result", "--fast"], ["run", "my.mp4"], ["models", "show"], ["walk"]):
+        with pytest.raises(REFUSED):
+            _parse(typer.main.get_command(app), wrong)
+
+
+@pytest.mark.parametrize("document", [one for one in DOCUMENTS if _commands(one)], ids=lambda path: path.name)
+def test_commands_in_blocks_are_understood(document: Path) -> None:
+    faults = []
+    for arguments in _commands(document):
+        try:
+            _parse(typer.main.get_command(app), arguments)
+        except typer.Exit:  # --help
+            continue
+        except REFUSED as error:
+            faults.append(f"scopemap {shlex.join(arguments)}: {error}")
+    assert faults == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_options_of_commands_in_the_text_exist(document: Path) -> None:
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    text = re.sub(r"^```.*?^```", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for name, rest in re.findall(r"`scopemap ([a-z]+)([^`]*)`", text):
+        assert name in commands, f"scopemap {name}"
+        inner = getattr(commands[name], "commands", {}).values()
+        known = {option for one in (commands[name], *inner) for param in one.params for option in param.opts}
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", rest)) <= known | {"--help"}, f"scopemap {name}{rest}"
+
+
+@pytest.fixture(scope="module")
+def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what `scopemap demo` makes in `scopemap-demo`, of 16 small frames."""
+    folder = tmp_path_factory.mktemp("documents")
+    spec = replace(demonstration.PHANTOM, frames=16, width=160, height=128)
+    demonstration.prepare_out(folder / "scopemap-demo", overwrite=False)
+    demonstration.render(folder / "scopemap-demo", spec)
+    assert call("run", folder / "scopemap-demo/phantom", "--out", folder / "scopemap-demo/run", "--quiet") == 0
+    return folder
+
+
+def test_commands_about_the_demonstration_run(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_demo)
+    called = [one for document in DOCUMENTS for one in _commands(document) if ABOUT_THE_DEMO.search(" ".join(one))]
+    assert {"inspect", "run", "evaluate", "export"} <= {arguments[0] for arguments in called}
+    for arguments in called:
+        assert call(*arguments) == 0, arguments
+
+
+def test_python_about_the_demonstration_runs(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_demo)
+    blocks = [block for one in DOCUMENTS for block in _blocks(one.read_text(encoding="utf-8"), "python")]
+    about = [block for block in blocks if ABOUT_THE_DEMO.search(block)]
+    assert about
+    for block in about:
+        exec(compile(block, "document", "exec"), {})
+
+
+def test_python_in_blocks_is_python() -> None:
+    for document in DOCUMENTS:
+        for block in _blocks(document.read_text(encoding="utf-8"), "python"):
+            compile(block, document.name, "exec")

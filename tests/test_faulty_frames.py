@@ -1,0 +1,129 @@
+"""A frame with which a stage fails is lost, with the reason; the run goes on, unless many fail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_phantom import FRAMES, with_true_depth, write_tiny
+
+from scopemap import open_sequence, reconstruct
+from scopemap.config import Config
+from scopemap.depth.correspondence import DenseMatcher
+from scopemap.depth.estimate import DepthEstimate
+from scopemap.depth.files import FilesDepth
+from scopemap.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.frame import Frame
+from scopemap.masking.masker import Masker
+from scopemap.reconstruction import Reconstruction
+from scopemap.tracking.tracker import Tracker
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("phantom"))
+
+
+def _break(patch: pytest.MonkeyPatch, kind: type, name: str, calls: set[int], error: BaseException) -> None:
+    """Have a method fail at some of its calls, counted from 0."""
+    method: Callable[..., Any] = getattr(kind, name)
+    count = iter(range(1000))
+
+    def failing(*arguments: Any, **named: Any) -> Any:
+        if next(count) in calls:
+            raise error
+        return method(*arguments, **named)
+
+    patch.setattr(kind, name, failing)
+
+
+def _lost(result: Reconstruction) -> dict[int, str]:
+    return {record.index: record.track.reason for record in result.lost}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "reason"),
+    [
+        (Masker, "__call__", "depth failed: it broke"),
+        (FilesDepth, "estimate", "depth failed: it broke"),
+        (Tracker, "track", "tracking failed: it broke"),
+        (Tracker, "needs_keyframe", "tracking failed: it broke"),
+    ],
+)
+@pytest.mark.parametrize("error", [RuntimeError("it broke"), np.linalg.LinAlgError("it\nbroke")])
+def test_a_frame_with_which_a_stage_fails_is_lost_with_the_reason(
+    kind: type, name: str, reason: str, error: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break(monkeypatch, kind, name, {4}, error)
+    result = reconstruct(open_sequence(folder), with_true_depth(folder))
+    assert _lost(result) == {4: reason}
+    assert result.provenance["warnings"][0] == (f"1 frame(s) could not be processed whole (first: frame 4, {reason})")
+    assert len(result.mesh.faces) > 100
+
+
+@pytest.mark.parametrize("at", [0, FRAMES - 1])
+def test_the_first_and_the_last_frame_may_fail(at: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _break(monkeypatch, FilesDepth, "estimate", {at}, RuntimeError("it broke"))
+    result = reconstruct(open_sequence(folder), with_true_depth(folder))
+    assert _lost(result) == {at: "depth failed: it broke"}
+    assert result.provenance["tracked"] == FRAMES - 1
+
+
+def test_a_frame_without_flow_to_the_one_before_is_still_tracked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _break(monkeypatch, DenseMatcher, "match", {4}, RuntimeError("it broke"))
+    result = reconstruct(open_sequence(folder), Config())
+    assert result.provenance["tracked"] == FRAMES
+    assert "frame 4, flow failed: it broke" in result.provenance["warnings"][0]
+
+
+@pytest.mark.parametrize("kind", [FilesDepth, Tracker])
+def test_where_many_frames_fail_the_run_ends_with_the_reason(
+    kind: type, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break(
+        monkeypatch, kind, "estimate" if kind is FilesDepth else "track", set(range(2, 99)), RuntimeError("it broke")
+    )
+    with pytest.raises(RuntimeError, match="it broke") as caught:
+        reconstruct(open_sequence(folder), with_true_depth(folder), out=tmp_path / "out")
+    assert "the run ends at frame 5: 4 frames failed, first frame 2, " in caught.value.__notes__[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_end_of_a_stages_thread_ends_the_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, name in ((FilesDepth, "estimate"), (Tracker, "track")):
+        with monkeypatch.context() as patch:
+            _break(patch, kind, name, {3}, SystemExit("the thread ends"))
+            with pytest.raises(SystemExit, match="the thread ends"):
+                reconstruct(open_sequence(folder), with_true_depth(folder))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0])
+def test_depth_that_is_no_number_is_unknown_and_told(
+    value: float, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate = ScopeNetDepth.estimate
+
+    def spoilt(self: ScopeNetDepth, frame: Frame) -> DepthEstimate:
+        found = estimate(self, frame)
+        return replace(found, values=np.full_like(found.values, value)) if frame.index == 4 else found
+
+    monkeypatch.setattr(ScopeNetDepth, "estimate", spoilt)
+    result = reconstruct(open_sequence(folder), Config())
+    assert result.provenance["tracked"] == FRAMES
+    assert np.isfinite(result.mesh.vertices).all()
+    told = "1 frame(s) got no depth from the network (first: frame 4)"
+    assert (told in result.provenance["warnings"]) == (value != 0)
+
+
+def test_frames_are_stored_in_the_folder_of_the_result(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not on a small disk for temporary files."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "absent"))
+    result = reconstruct(open_sequence(folder), with_true_depth(folder), out=tmp_path / "out")
+    assert len(result.mesh.faces) > 100
+    assert not [file for file in (tmp_path / "out").iterdir() if file.name.startswith((".", "scopemap"))]

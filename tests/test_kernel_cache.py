@@ -1,0 +1,71 @@
+"""Compiled kernels where neither the installation nor the user's cache can be written: containers, clusters."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from numba import njit
+
+from scopemap.cli.run import compiling_words
+from scopemap.estimators import compiling_s
+
+_READ_ONLY = """
+import os
+os.access = lambda *_: False
+import scopemap
+from numba.core import caching
+for kind in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
+    kind.from_function = classmethod(lambda *_: None)
+import numpy as np
+from scopemap.geometry import warp
+print(os.environ["NUMBA_CACHE_DIR"])
+"""
+
+
+def _import(**environment: str) -> str:
+    """Import kernels where the usual folders are read-only; return where they are cached."""
+    known = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    ran = subprocess.run(
+        [sys.executable, "-c", _READ_ONLY], env=known | environment, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.strip()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="users and permissions are those of POSIX systems")
+def test_kernels_are_cached_in_a_private_folder_where_the_usual_ones_are_read_only(tmp_path: Path) -> None:
+    chosen = Path(_import(TMPDIR=str(tmp_path)))
+    assert chosen.parent == tmp_path
+    assert chosen.stat().st_mode & 0o777 == 0o700
+    # Another user who may write there could put code into it.
+    chosen.chmod(0o777)
+    assert _import(TMPDIR=str(tmp_path)) != str(chosen)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="users and permissions are those of POSIX systems")
+def test_without_any_folder_nothing_is_cached_and_all_works(tmp_path: Path) -> None:
+    code = "from pathlib import Path\nPath.mkdir = lambda *_, **__: (_ for _ in ()).throw(OSError(30, 'read-only'))\n"
+    ran = subprocess.run(
+        [sys.executable, "-c", code + _READ_ONLY],
+        env={name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ran.returncode, ran.stdout) == (0, "\n"), ran.stderr
+
+
+def test_the_summary_names_what_compiling_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    before_s, before = compiling_s(), time.perf_counter()
+    assert njit(lambda x: x + 1)(1) == 2
+    assert 0 < compiling_s() - before_s < time.perf_counter() - before
+    assert compiling_words(0.0) == ""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/cache")
+    assert compiling_words(11.04) == "; 11.0 s of it to compile kernels, once"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    assert "every time: set NUMBA_CACHE_DIR" in compiling_words(11.0)

@@ -1,0 +1,250 @@
+"""The report of a run: what its page holds, its size, and that nothing in it asks for a network."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from base64 import b64decode
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, draw_run, drawn_result, pose_of, tube
+
+from scopemap.errors import InputError
+from scopemap.report.frame_pictures import FramePictures, picture_file, pictured_frames, read_measures
+from scopemap.report.kept_run import read_run
+from scopemap.report.page import page_html, write_comparison, write_report
+from scopemap.report.page_data import page_data, shown_meshes
+from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return draw_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> str:
+    files = write_report(folder)
+    assert [file.name for file in files] == ["report.html", "summary.png"]
+    return files[0].read_text(encoding="utf-8")
+
+
+def shown(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])["runs"][0]
+
+
+def numbers(text: str, dtype: str) -> np.ndarray:
+    return np.frombuffer(b64decode(text), np.dtype(dtype).newbyteorder("<"))
+
+
+def test_every_frame_is_on_the_page_with_its_pose_and_place(page: str) -> None:
+    frames = shown(page)["frames"]
+    assert frames["count"] == FRAMES
+    assert numbers(frames["index"], "i4").tolist() == list(range(FRAMES))
+    assert numbers(frames["place"], "i2").tolist() == [0] * IN_RESULT + [-1] * LOST + [1] * IN_FIRST_MAP
+    poses = numbers(frames["pose"], "f4").reshape(-1, 3, 4)
+    lost = slice(IN_RESULT, IN_RESULT + LOST)
+    assert np.isnan(poses[lost]).all()
+    np.testing.assert_allclose(poses[5], pose_of(5)[:3], atol=1e-5)
+    np.testing.assert_allclose(poses[-1], pose_of(FRAMES - 1)[:3], atol=1e-5)
+    assert {frames["reasons"][k] for k in numbers(frames["reason"], "i2")[lost]} == {"too blurred"}
+    assert set(frames["curves"]) == {"inliers", "agreement", "scale", "sharpness", "ms"}
+    assert np.isfinite(numbers(frames["curves"]["sharpness"], "f4")).all()
+
+
+def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
+    maps = shown(page)["maps"]
+    assert [one["frames"] for one in maps] == [IN_RESULT, IN_FIRST_MAP]
+    mesh = read_run(folder).maps[0].mesh
+    low, high = np.array(maps[0]["low"]), np.array(maps[0]["high"])
+    positions = low + numbers(maps[0]["positions"], "u2").reshape(-1, 3) / 65535 * (high - low)
+    np.testing.assert_allclose(positions, mesh.vertices, atol=1e-3)
+    np.testing.assert_array_equal(numbers(maps[0]["faces"], "u4").reshape(-1, 3), mesh.faces)
+    confidence = numbers(maps[0]["confidence"], "u1") / 255
+    np.testing.assert_allclose(confidence, np.linspace(0, 1, len(mesh.vertices)), atol=3e-3)
+
+
+def test_pictures_and_depth_are_those_of_the_frames(page: str, folder: Path) -> None:
+    data = shown(page)
+    assert [picture["row"] for picture in data["pictures"]] == pictured_frames(folder) == list(range(FRAMES))
+    near, far = data["depth_range"]
+    code = cv2.imdecode(np.frombuffer(b64decode(data["pictures"][3]["depth"]), np.uint8), cv2.IMREAD_UNCHANGED)
+    depth = read_run(folder).depth_mm(3)
+    assert depth is not None
+    inside = (code > 1) & (code < 255)
+    assert inside.mean() > 0.5
+    back = near * (far / near) ** ((code[inside] - 1.0) / 254)
+    np.testing.assert_allclose(back, depth[inside], rtol=0.02)
+
+
+def test_the_page_asks_for_nothing_and_a_name_cannot_end_its_script(tmp_path: Path, page: str) -> None:
+    assert not re.findall(r"https?://|//cdn|@import|<link|<iframe|src=\"(?!data:)", page)
+    assert "default-src 'none'" in page
+    hostile = "</script><script>alert(1)</script>{{style}}<!--.mp4"
+    text = write_report(draw_run(tmp_path, name=hostile))[0].read_text(encoding="utf-8")
+    assert shown(text)["name"] == "script>{{style}}<!--.mp4"
+    assert shown(text)["input"] == hostile
+    assert text.count("<script") == page.count("<script") == 2
+    assert "alert(1)</script>" not in text
+
+
+def test_a_name_may_be_no_utf8(tmp_path: Path) -> None:
+    name = os.fsdecode(b"video\xe4.mp4")
+    file = write_report(draw_run(tmp_path / "run", pictures=False, name=name))[0]
+    text = file.read_text(encoding="utf-8")
+    assert "<title>video?.mp4" in text
+    assert shown(text)["name"] == name
+
+
+@pytest.mark.parametrize(("name", "kept_name"), [(b'"\xe4\n, .png', '"?\n, .png'), (b"\xe2\x80\xa8.png", "\u2028.png")])
+def test_frames_names_may_be_anything_that_files_names_are(tmp_path: Path, name: bytes, kept_name: str) -> None:
+    result = drawn_result()
+    records = [replace(record, name=os.fsdecode(name)) for record in result.records]
+    replace(result, records=records).save(tmp_path)
+    kept = read_run(tmp_path)
+    assert [row["name"] for row in kept.rows] == [kept_name] * FRAMES
+    assert (kept.place == 0).sum() == IN_RESULT
+
+
+def test_a_long_run_stays_small(tmp_path: Path) -> None:
+    pictures, noise = FramePictures(), np.random.default_rng(0).integers(0, 255, (256, 320, 3), dtype=np.uint8)
+    for index in range(450):
+        pictures.put(index, noise, np.ones((256, 320), bool))
+    pictures.save(tmp_path)
+    kept = pictured_frames(tmp_path)
+    assert kept == list(range(0, 450, 8))
+    fewer = FramePictures()
+    fewer.put(3, noise, np.ones((256, 320), bool))
+    fewer.save(tmp_path / "again")
+    pictures.save(tmp_path / "again")
+    assert pictured_frames(tmp_path / "again") == kept
+    assert len(read_measures(tmp_path)) == 450
+    run = read_run(draw_run(tmp_path / "run"))
+    for index in range(FRAMES):  # the heaviest pictures that there are
+        run.pictures[index].write_bytes(picture_file(tmp_path, 0).read_bytes())
+    share = page_data(run, shown_meshes(run, 1000), share=0.05)
+    assert 0 < len(share["pictures"]) < FRAMES
+    assert len(json.dumps(share["pictures"])) < 0.05 * 12e6
+    assert len(page_data(run, shown_meshes(run, 1000), share=1e-6)["pictures"]) == 1
+    assert run.indices is run.indices  # made once: the page asks for each frame's
+
+
+def test_a_fine_mesh_is_simplified_and_keeps_its_colours() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=10)
+    above = ball.vertices[:, 2] > 0
+    colours = np.where(above[:, None], np.uint8([250, 0, 0]), np.uint8([0, 0, 250]))
+    values = {"confidence": above.astype(np.float32)}
+    ball = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=colours, vertex_attributes=values, process=False)
+    few = simplified(ball, 2000)
+    assert 1500 < len(few.faces) <= 2100
+    np.testing.assert_allclose(np.linalg.norm(few.vertices, axis=1), 10, atol=0.1)
+    above = few.vertices[:, 2] > 1
+    assert (few.visual.vertex_colors[above, 0] == 250).all()
+    assert (few.vertex_attributes["confidence"][above] == 1).all()
+    assert simplified(few, 2500) is few
+
+
+def test_a_run_without_pictures_mesh_or_depth_has_a_page(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, pictures=False, surface={})
+    for name in ("mesh.ply", "maps/1/mesh.ply", "depth/depth.json", "config.toml"):
+        (folder / name).unlink()
+    data = shown(write_report(folder)[0].read_text(encoding="utf-8"))
+    assert data["pictures"] == []
+    assert [one["vertices"] for one in data["maps"]] == [0, 0]
+    assert data["verdict"]["word"] == "not usable"
+
+
+def test_no_run_no_report(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no finished run"):
+        write_report(tmp_path)
+
+
+def test_several_runs_share_a_page(tmp_path: Path, folder: Path) -> None:
+    other = draw_run(tmp_path / "other", surface={"coverage_mean": 0.3, "coverage_least": 0.1})
+    write_comparison([folder, other], ["ours", "theirs"], tmp_path / "compare.html")
+    text = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert "<title>ours, theirs" in text
+    runs = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["runs"]
+    assert [(run["name"], run["verdict"]["word"]) for run in runs] == [("ours", "doubtful"), ("theirs", "not usable")]
+
+
+def test_truth_is_shown_where_it_is_known(tmp_path: Path) -> None:
+    truth = tmp_path / "truth"
+    truth.mkdir()
+    rows = [pose_of(i) for i in range(FRAMES)]
+    for i, row in enumerate(rows):
+        row[:3, 3] *= 2
+        row[1, 3] += 0.3 * i**1.5
+    # C3VD's form: one pose a line, column by column.
+    (truth / "pose.txt").write_text("\n".join(" ".join(f"{v:.9f}" for v in row.T.ravel()) for row in rows))
+    run = read_run(draw_run(tmp_path / "run", name=str(truth)))
+    found = page_data(run, shown_meshes(run, 1000))["truth"]
+    assert found is not None
+    assert numbers(found["positions"], "f4").size == 3 * IN_RESULT
+    assert 0.001 < found["error_share"] < 0.2
+
+
+def test_vertices_are_counted_where_a_frame_sees_them() -> None:
+    mesh = tube()
+    depth = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
+    none = times_seen(mesh, [SeenFrame(pose_of(0), depth)], CAMERA)
+    assert not none.any()
+    points = np.asarray(mesh.vertices)
+    wall = points[:, 2] > 60  # in view from z = 0, at this distance
+    depth[:] = 70.0
+    seen = times_seen(mesh, [SeenFrame(pose_of(0), depth)] * 3, CAMERA)
+    assert set(seen.tolist()) == {0, 3}
+    assert seen[wall].max() == 3
+    assert not seen[points[:, 2] < 60].any()
+
+
+def test_summary_picture_has_the_verdicts_colour_frames_and_the_mesh(page: str, folder: Path) -> None:
+    picture = cv2.imread(str(folder / "summary.png"))[..., ::-1].astype(int)
+    assert picture.shape[1] == 1596
+    assert np.abs(picture[2, 100] - (163, 90, 0)).max() < 3  # doubtful: 14 of 24 frames
+    frame = cv2.imread(str(picture_file(folder, 0)))[..., ::-1].astype(int)
+    corner = picture[104 + 26 : 104 + 26 + 307, 12 : 12 + 384]
+    assert np.abs(corner.mean((0, 1)) - frame.mean((0, 1))).max() < 6
+    mesh_row = picture[-380:]
+    assert (mesh_row.min(-1) < 240).mean() > 0.2
+
+
+def test_only_json_numbers_are_written() -> None:
+    text = page_html([{"name": "a<b", "figure": float("nan"), "list": [1.0, float("inf")]}])
+    assert "NaN" not in text.partition('id="data">')[2].partition("</script>")[0]
+    assert "<title>a&lt;b" in text
+
+
+@pytest.mark.usefixtures("page")  # writes summary.png
+def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> None:
+    result = drawn_result(name="<b>video</b>.mp4")
+    assert repr(result) == (
+        "<Reconstruction, doubtful: 14 of 24 frames in one map; scale unknown; surface covers 94 % of what was seen>"
+    )
+    assert "7 of 7 frames in one map" in repr(result.others[0])
+    html = result._repr_html_()
+    assert "&lt;Reconstruction" in html
+    assert "<Reconstruction" not in html
+    content = b64decode(re.findall(r"data:image/jpeg;base64,([^\"]+)", html)[0])
+    inline = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    written = cv2.imread(str(folder / "summary.png")).astype(int)
+    # The same sheet without frames and depth, which are not in memory: head, then the views of the mesh.
+    assert inline.shape[1] == written.shape[1]
+    assert inline.shape[0] < 600
+    assert np.abs(inline[-380:] - written[-380:]).mean() < 4
+    assert np.abs(inline[:100] - written[:100]).mean() < 4
+
+
+def test_a_result_without_a_surface_has_a_picture() -> None:
+    result = replace(drawn_result(), mesh=trimesh.Trimesh(), provenance={}, others=[])
+    assert repr(result).startswith("<Reconstruction, not usable: 14 of 24 frames in one map; scale unknown; no surface")
+    assert "data:image/jpeg" in result._repr_html_()

@@ -1,0 +1,271 @@
+"""A run that was killed goes on where it was, and ends in the same bytes as one that nothing disturbed."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from front_door import call, refused
+from tiny_phantom import FRAMES, write_tiny
+
+from scopemap import Config, Reconstruction, open_sequence, reconstruct
+from scopemap.errors import InputError
+from scopemap.estimators import create_estimators
+from scopemap.io import result_folder
+from scopemap.io.checkpoint import CHECKPOINT
+from scopemap.io.result_folder import LOCK, UNFINISHED
+from scopemap.pipeline import Pipeline, Step
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.runner.checkpoints import Checkpoints, check_resumable, discard_unfinished, identity_of
+from scopemap.runner.run import Clock, Run
+
+# Seconds, and sums of files that hold some.
+_OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
+
+
+class _Killed(BaseException):
+    """What ends a run at once."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("phantom") / "sound")
+
+
+@pytest.fixture(autouse=True)
+def _often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
+    monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
+
+
+@pytest.fixture(scope="module", params=["default", "realtime"])
+def whole(request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    out = tmp_path_factory.mktemp("whole") / "run"
+    _run(folder, out, request.param)
+    return request.param, out
+
+
+def _run(folder: Path, out: Path, preset: Any, **options: Any) -> Reconstruction:
+    return reconstruct(open_sequence(folder), Config.load(preset), out=out, **options)
+
+
+def _bytes(out: Path) -> dict[str, bytes]:
+    files = [file for file in out.rglob("*") if file.is_file() and file.name not in _OF_ITS_TIME]
+    return {str(file.relative_to(out)): file.read_bytes() for file in files}
+
+
+def _killing(at: int) -> Callable[[Step], None]:
+    def kill(step: Step) -> None:
+        if step.frame.index >= at:
+            raise _Killed
+
+    return kill
+
+
+def _kill(folder: Path, out: Path, preset: str, at: int, **options: Any) -> None:
+    with pytest.raises(_Killed):
+        _run(folder, out, preset, observers=(_killing(at),), **options)
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(folder: Path, whole: tuple[str, Path], tmp_path: Path) -> None:
+    preset, wanted = whole
+    out = tmp_path / "run"
+    for at in (3, 5, FRAMES - 1):
+        _kill(folder, out, preset, at)
+    assert [path.name for path in out.iterdir()] == [UNFINISHED]
+    seen: list[int] = []
+    result = _run(folder, out, preset, observers=(lambda step: seen.append(step.frame.index),))
+    after = result.provenance["resumed_after_frame"]
+    assert after >= 1
+    assert seen == list(range(after + 1, FRAMES))
+    assert _bytes(out) == _bytes(wanted)
+
+
+@pytest.mark.parametrize("doing", ["adjusting keyframes", "fusing", "writing"])
+def test_a_run_killed_after_the_last_frame_tracks_none_again(
+    doing: str, folder: Path, whole: tuple[str, Path], tmp_path: Path
+) -> None:
+    preset, wanted = whole
+    if (preset, doing) == ("realtime", "fusing"):
+        pytest.skip("realtime has fused when the last frame is tracked")
+    out = tmp_path / "run"
+
+    def kill(stage: str, done: int, total: int) -> None:
+        if stage == doing and done in (0, 2):
+            raise _Killed
+
+    with pytest.raises(_Killed):
+        _run(folder, out, preset, progress=kill)
+    seen: list[Step] = []
+    _run(folder, out, preset, observers=(seen.append,))
+    assert not seen
+    assert _bytes(out) == _bytes(wanted)
+
+
+def test_a_run_killed_while_it_is_put_in_place_is_put_there_again(
+    folder: Path, whole: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset, wanted = whole
+    out, real, undo_moves = tmp_path / "run", result_folder._move, result_folder._undo_moves
+    for most in (1, 4):
+        moved: list[str] = []
+
+        def move(names: list[str], source: Path, target: Path, most: int = most, moved: list[str] = moved) -> None:
+            for name in names:
+                if len(moved) == most:
+                    raise _Killed
+                real([name], source, target)
+                moved.append(name)
+
+        def undo(unfinished: Path, folder: Path, moved: list[str] = moved) -> None:
+            if not moved:  # a process that ends undoes nothing
+                undo_moves(unfinished, folder)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(result_folder, "_move", move)
+            patched.setattr(result_folder, "_undo_moves", undo)
+            with pytest.raises(_Killed):
+                _run(folder, out, preset, overwrite=most == 4)
+    _run(folder, out, preset)
+    assert _bytes(out) == _bytes(wanted)
+
+
+def test_an_earlier_result_survives_a_kill_at_any_move(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    _run(folder, out, "realtime")
+    before = _bytes(out)
+    unfinished = out / UNFINISHED
+    unfinished.mkdir()
+    (unfinished / "mesh.ply").write_text("new")
+    real = result_folder._move
+    for most in range(12):
+        count = iter(range(most))
+
+        def move(names: list[str], source: Path, target: Path, count: Any = count) -> None:
+            for name in names:
+                if next(count, None) is None:
+                    raise _Killed
+                real([name], source, target)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(result_folder, "_move", move)
+            patched.setattr(result_folder, "_undo_moves", lambda unfinished, folder: None)
+            with pytest.raises(_Killed):
+                result_folder._put_in_place(unfinished, out)
+        result_folder._undo_moves(unfinished, out)
+        assert (unfinished / "mesh.ply").read_text() == "new"
+        assert {name: content for name, content in _bytes(out).items() if UNFINISHED not in name} == before
+
+
+def test_a_run_killed_when_it_was_in_place_goes_on_from_nowhere(
+    folder: Path, whole: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset, wanted = whole
+    out = tmp_path / "run"
+
+    remove = shutil.rmtree
+
+    def kill(path: Path, **options: Any) -> None:
+        if path.name == UNFINISHED:
+            raise _Killed
+        remove(path, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(result_folder.shutil, "rmtree", kill)
+        with pytest.raises(_Killed):
+            _run(folder, out, preset)
+    assert (out / UNFINISHED / LOCK).is_file()
+    _run(folder, out, preset, overwrite=True)
+    assert _bytes(out) == _bytes(wanted)
+
+
+def test_frames_that_fail_between_the_states_of_two_stages_are_counted(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, config = open_sequence(folder), Config.load("realtime")
+    runs = [
+        Run(sequence, config, Pipeline(config, create_estimators(config, sequence)), Clock(), None, lambda *_: None)
+        for _ in range(2)
+    ]
+    pipeline, frame = runs[0].pipeline, next(sequence.frames())
+    checkpoints = Checkpoints(tmp_path, {}, runs[0])
+    estimated = pipeline.estimate(frame)
+    checkpoints.keep("preprocess")
+    monkeypatch.setattr(pipeline._matcher, "match", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(pipeline._tracker, "track", lambda _: 1 / 0)
+    matched = pipeline.match(estimated)
+    checkpoints.keep("match")
+    pipeline.track(matched)
+    checkpoints.keep("track")
+    checkpoints.commit(frame.index)
+    checkpoints.close()
+    Checkpoints(tmp_path, {}, runs[1]).restore()
+    assert runs[1].pipeline.warnings == pipeline.warnings
+    assert pipeline.warnings[0].startswith("2 frame(s) could not be processed")
+
+
+def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    _kill(folder, out, "realtime", 4)
+    other = Config.load("realtime", settings={"fusion.voxel_mm": 2.5})
+    with pytest.raises(InputError, match=r"cannot resume .* fusion\.voxel_mm was 1\.5, is 2\.5; --no-resume"):
+        check_resumable(out, open_sequence(folder), other)
+    # The refusal has left what there was.
+    check_resumable(out, open_sequence(folder), Config.load("realtime"))
+    seen: list[Step] = []
+    _run(folder, out, "realtime", observers=(seen.append,))
+    assert 0 < len(seen) < FRAMES
+
+
+def test_another_input_and_no_resume_begin_anew(folder: Path, tmp_path: Path) -> None:
+    out, other = tmp_path / "run", write_tiny(tmp_path / "phantom", "black:6-6")
+    _kill(folder, out, "realtime", 4)
+    assert _run(other, out, "realtime").provenance["resumed_after_frame"] is None
+    _kill(folder, out, "realtime", 4, overwrite=True)
+    discard_unfinished(out)
+    assert _run(folder, out, "realtime", overwrite=True).provenance["resumed_after_frame"] is None
+
+
+def test_two_inputs_without_a_checksum_are_two(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.runner.checkpoints.input_checksum", lambda _: {"files": "more than 20000"})
+    inputs = [open_sequence(folder), open_sequence(write_tiny(tmp_path / "other"))]
+    one, other = (identity_of(sequence, Config()) for sequence in inputs)
+    assert one["input"] != other["input"]
+
+
+def test_a_damaged_checkpoint_is_one_sentence(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    _kill(folder, out, "realtime", 5)
+    file = out / UNFINISHED / CHECKPOINT
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("update blobs set bytes = zeroblob(length(bytes))")
+    with pytest.raises(InputError, match=r"the checkpoint .* is damaged"):
+        _run(folder, out, "realtime")
+    file.write_bytes(file.read_bytes()[:3000])
+    assert _run(folder, out, "realtime").provenance["resumed_after_frame"] is None
+
+
+def test_observers_go_on_and_no_file_of_the_run_is_left(folder: Path, tmp_path: Path) -> None:
+    out, pictures = tmp_path / "run", FramePictures()
+    with pytest.raises(_Killed):
+        _run(folder, out, "realtime", observers=(pictures.observe, _killing(5)))
+    pictures = FramePictures()
+    _run(folder, out, "realtime", observers=(pictures.observe,))
+    pictures.save(out)
+    assert len(list((out / "frames").glob("*_mask.png"))) == FRAMES
+    left = {CHECKPOINT, LOCK, "stored_frames", UNFINISHED, "replaced", "moving"}
+    assert not left & {path.name for path in out.rglob("*")}
+
+
+def test_the_command_line_goes_on_and_says_so(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    _kill(folder, out, "realtime", 4)
+    ask = ("run", folder, "--out", out, "--preset", "realtime", "--resume")
+    assert "input.fps was None, is 3.0" in refused(capfd, *ask, "--fps", "3")
+    assert call(*ask) == 0
+    assert "resuming after" in capfd.readouterr().err

@@ -1,0 +1,109 @@
+"""A run opens no socket, a result has nothing of a patient's data, and what is installed has a known licence."""
+
+from __future__ import annotations
+
+import re
+import socket
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+import av
+import pytest
+from drawn_dicom import PATIENT, write_dicom_video
+from drawn_inputs import picture
+from front_door import call
+from PIL import Image
+from tiny_phantom import only_images, write_tiny
+
+from docs.licences_page import PAGE, ROOT, dependencies
+
+# Of the core; what each allows: use, change and distribution, also in closed programs.
+PERMISSIVE = {
+    *("0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0"),
+    *("CC0-1.0", "CNRI-Python", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib", "any-OSI"),
+}
+OF_EXTRAS = PERMISSIVE | {"MPL-2.0", "LicenseRef-NVIDIA-Proprietary"}
+EXTRAS = [
+    name
+    for name in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    if name != "dev"
+]
+
+
+def _parts(licence: str) -> set[str]:
+    return set(re.split(r" AND | OR ", licence.replace("(", "").replace(")", "")))
+
+
+def test_a_run_and_its_report_open_no_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Of images without a calibration, with the embedded network: all that a newcomer's first run does."""
+
+    def forbidden(*_: object, **__: object) -> NoReturn:
+        raise AssertionError("a socket was opened")
+
+    source = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "in")
+    for name in ("socket", "create_connection", "getaddrinfo", "gethostbyname"):
+        monkeypatch.setattr(socket, name, forbidden)
+    assert call("run", source, "--out", tmp_path / "out", "--quiet") == 0, capfd.readouterr().err
+    assert call("report", tmp_path / "out") == 0
+    assert call("verify", tmp_path / "out") == 0
+    with pytest.raises(AssertionError, match="a socket was opened"):
+        socket.socket()
+
+
+def _texts(folder: Path) -> str:
+    """All that is in the files of a folder, and their names."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    return "".join(f"{file.name}\n{file.read_bytes().decode('latin-1')}" for file in files)
+
+
+def _write_video(folder: Path) -> None:
+    folder.mkdir()
+    with av.open(str(folder / "clip.mp4"), "w") as container:
+        container.metadata.update({"title": PATIENT, "comment": PATIENT})
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for number in range(6):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number, (160, 120)), format="rgb24")))
+        container.mux(stream.encode())
+
+
+def _write_pictures(folder: Path) -> None:
+    folder.mkdir()
+    exif = Image.Exif()
+    exif[0x010E] = PATIENT  # ImageDescription
+    for number in range(6):
+        Image.fromarray(picture(number, (160, 120))).save(folder / f"{number}.jpg", exif=exif)
+
+
+@pytest.mark.parametrize("write", [write_dicom_video, _write_video, _write_pictures])
+def test_nothing_of_an_inputs_metadata_is_in_the_result(
+    write: Callable[[Path], object], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "in")
+    assert PATIENT in _texts(tmp_path / "in")
+    (source,) = [tmp_path / "in"] if write is _write_pictures else (tmp_path / "in").iterdir()
+    settings = ("--set", "tracking.min_sharpness=0", "--set", "input.skip_duplicates=false")
+    code, said = call("run", source, "--out", tmp_path / "out", *settings), capfd.readouterr()
+    assert code == 0, said.err
+    for text in (_texts(tmp_path / "out"), said.out, said.err):
+        assert PATIENT not in text
+
+
+def test_the_licences_of_the_core_are_permissive() -> None:
+    found = dependencies()
+    assert {"numpy", "scipy", "onnxruntime", "av", "pydantic-core"} < found.keys()
+    assert {name: licence for name, licence in found.items() if not _parts(licence) <= PERMISSIVE} == {}
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_the_licences_of_an_extra_are_allowed(extra: str) -> None:
+    assert {name: text for name, text in dependencies(extra).items() if not _parts(text) <= OF_EXTRAS} == {}
+
+
+def test_the_page_of_licences_names_what_the_core_needs() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert [name for name in dependencies() if f"| {name} | " not in page] == []
