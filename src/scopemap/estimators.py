@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -124,6 +125,7 @@ def estimators_provenance(estimators: Estimators) -> dict[str, str]:
     return parts | masks | {"keyframe_flow": estimators.keyframe_flow.name, "anchor": estimators.anchor.description}
 
 
+@cache
 def package_versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that a result depends on; of `networks` if present."""
     installed = [name for name in _VERSIONS_OF_NETWORKS if find_spec(name) is not None]

@@ -147,7 +147,10 @@ def check_result_folder(folder: Path, *, overwrite: bool) -> None:
 def _refuse(folder: Path, overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"cannot write a run to {folder}: a file has that name")
-    if not folder.is_dir():
+    if not folder.exists():
+        parent = next(path for path in folder.parents if path.exists())
+        if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+            raise InputError(f"cannot write a run to {folder}: nothing can be written to {parent}; name another folder")
         return
     # A run that was killed while it was put in place is taken back before the folder is used.
     is_empty = all(path.name == UNFINISHED for path in folder.iterdir())
