@@ -62,7 +62,7 @@ def _text(value: Any) -> str:
     match value:
         case None:
             return "not set"
-        case "":
+        case "" | ():
             return "empty"
         case bool():
             return str(value).lower()

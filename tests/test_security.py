@@ -10,14 +10,20 @@ from pathlib import Path
 from typing import NoReturn
 
 import av
+import cv2
+import numpy as np
 import pytest
+import trimesh
 from drawn_dicom import PATIENT, write_dicom_video
 from drawn_inputs import picture
-from front_door import call
+from front_door import call, refused
 from PIL import Image
-from tiny_phantom import only_images, write_tiny
+from tiny_phantom import FRAMES, only_images, write_tiny
 
 from docs.licences_page import PAGE, ROOT, dependencies
+from scopemap.depth.estimate import DepthEstimate
+from scopemap.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.frame import Frame
 
 # Of the core; what each allows: use, change and distribution, also in closed programs.
 PERMISSIVE = {
@@ -91,6 +97,77 @@ def test_nothing_of_an_inputs_metadata_is_in_the_result(
     assert code == 0, said.err
     for text in (_texts(tmp_path / "out"), said.out, said.err):
         assert PATIENT not in text
+
+
+def test_folders_around_the_input_are_not_in_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The input's own name is, as it was given: `evaluate --against-video` opens it again."""
+    around = tmp_path / PATIENT
+    around.mkdir()
+    write_tiny(around / "clip")
+    monkeypatch.chdir(around)
+    code, said = call("run", "clip", "--out", tmp_path / "out"), capfd.readouterr()
+    assert code == 0, said.err
+    assert '"input": "clip"' in (tmp_path / "out" / "provenance.json").read_text()
+    for text in (_texts(tmp_path / "out"), said.out, said.err):
+        assert PATIENT not in text
+
+
+_BOX = (40, 30, 60, 24)
+
+
+def _with_secret(folder: Path) -> Path:
+    """Images of a phantom with white writing in a box, of twice the working size."""
+    x, y, width, height = _BOX
+    for file in sorted(folder.glob("*.png")):
+        rgb = cv2.resize(cv2.imread(str(file)), None, fx=2, fy=2)
+        rgb[y : y + height, x : x + width] = (0, 255, 0)
+        cv2.imwrite(str(file), rgb)
+    return folder
+
+
+def test_what_is_redacted_is_black_wherever_pictures_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    source = _with_secret(only_images(write_tiny(tmp_path / "phantom"), tmp_path / "in"))
+    x, y, width, height = (number // 2 for number in _BOX)
+    seen: list[np.ndarray] = []
+    estimate = ScopeNetDepth.estimate
+
+    def spied(self: ScopeNetDepth, frame: Frame) -> DepthEstimate:
+        seen.append(frame.rgb)
+        return estimate(self, frame)
+
+    monkeypatch.setattr(ScopeNetDepth, "estimate", spied)
+    size, boxes = ("--size", "160x128"), ("--redact", ",".join(map(str, _BOX)), "--redact", "0,0,4,4")
+    code, said = call("run", source, "--out", tmp_path / "out", *size, *boxes), capfd.readouterr()
+    assert code == 0, said.err
+    assert "note: redacted: 2 box(es) of each picture are black" in said.out
+    kept = [cv2.imread(str(file)) for file in (tmp_path / "out" / "frames").glob("*[0-9].jpg")]
+    assert len(kept) == FRAMES
+    assert len(seen) >= FRAMES
+    for rgb in (*kept, *seen):
+        factor = 160 // rgb.shape[1]
+        inside = rgb[y // factor + 1 : (y + height) // factor - 1, x // factor + 1 : (x + width) // factor - 1]
+        assert inside.size
+        assert inside.max() < 24  # coding
+    for file in (tmp_path / "out").rglob("*"):
+        if file.suffix in (".jpg", ".png") and "depth" not in str(file) and "mask" not in file.name:
+            picture = cv2.imread(str(file)).astype(int)
+            green = picture[..., 1] - picture[..., [0, 2]].max(-1)
+            assert (green > 150).mean() < 0.001, file
+    colours = trimesh.load_mesh(tmp_path / "out" / "mesh.ply", process=False).visual.vertex_colors.astype(int)
+    assert (colours[:, 1] - colours[:, [0, 2]].max(-1)).max() < 150
+
+
+@pytest.mark.parametrize(("box", "fault"), [("400,0,9,9", "is outside of the pictures of"), ("1,2,3", "cannot read")])
+def test_a_box_that_blackens_nothing_is_refused(
+    box: str, fault: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    source = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "in")
+    assert fault in refused(capfd, "run", source, "--out", tmp_path / "out", "--redact", box)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_licences_of_the_core_are_permissive() -> None:

@@ -68,6 +68,15 @@ Frames = Annotated[
 ]
 
 
+def parse_box(text: str) -> tuple[int, ...]:
+    """Return (x, y, width, height) of "X,Y,WIDTH,HEIGHT", px."""
+    if not re.fullmatch(r"\d{1,6}(,\d{1,6}){3}", text):
+        raise SettingsError(
+            f"cannot read the box '{text[:_QUOTED]}': expected X,Y,WIDTH,HEIGHT in px such as 0,0,300,40"
+        )
+    return tuple(int(part) for part in text.split(","))
+
+
 def parse_near_far(text: str) -> tuple[float, float]:
     """Return (nearest, farthest) of "NEAR:FAR", mm."""
     try:

@@ -17,6 +17,7 @@ from scopemap.cli.options import (
     Frames,
     Quiet,
     SetPairs,
+    parse_box,
     parse_near_far,
     parse_settings,
     parse_size,
@@ -72,6 +73,12 @@ def run(
         bool,
         typer.Option("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
     ] = False,
+    redact: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y,W,H", help="Blacken a box of the input's pictures, px, before anything sees it; repeatable."
+        ),
+    ] = None,
     near_far: Annotated[
         str | None,
         typer.Option(
@@ -128,6 +135,7 @@ def run(
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
+        "input.redact": [parse_box(box) for box in redact] if redact else None,
         "input.fps": fps,
         "depth.backend": depth,
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
@@ -197,8 +205,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         f"depth: {facts['estimators']['depth']}",
         f"flow: {facts['estimators']['flow']}; perceptual distance: {facts['estimators']['perceptual']}",
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
-        f"time: {facts['seconds']['total']:.1f} s, {facts['frames'] / facts['seconds']['total']:.1f} frames/s"
-        + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
+        _time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
@@ -207,6 +214,14 @@ def summary_lines(result: Reconstruction) -> list[str]:
     if len(result.lost) > 5:
         lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]
+
+
+def _time_words(result: Reconstruction) -> str:
+    """Return how long the run took and its frames per second; of a resumed one since then."""
+    seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
+    done = len(result.records) if after is None else sum(record.index > after for record in result.records)
+    since = "" if after is None else f" since it was resumed after frame {after}"
+    return f"time: {seconds:.1f} s{since}, {done / seconds:.1f} frames/s"
 
 
 def compiling_words(seconds: float) -> str:

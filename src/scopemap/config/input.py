@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from scopemap.config.settings import Settings
+
+Box = tuple[
+    Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
+]
+"""Left, top, width and height, px."""
 
 
 class InputSettings(Settings):
@@ -28,6 +33,11 @@ class InputSettings(Settings):
         description="two views in one image, of which the left or upper is used; auto: detected in a video",
     )
     deinterlace: bool = Field(False, description="use one field of each interlaced image, interpolate the missing rows")
+    redact: tuple[Box, ...] = Field(
+        (),
+        description="boxes of the input's pictures, x y width height, px, that are blackened before anything else is "
+        "done with them: names and numbers of patients",
+    )
     longest_side_px: int = Field(
         400,
         ge=0,

@@ -33,6 +33,7 @@ class LiveSource(Source):
 
     name = "live"
     stamped = True
+    frame_limit_s = None  # it may be paused
 
     def __init__(self, address: str) -> None:
         super().__init__(Path(address))

@@ -1,4 +1,7 @@
-"""One view and one field per picture: stereo packing and interlacing undone, as the settings ask or as detected."""
+"""What is used of each picture: boxes blackened first; then one view and one field of it.
+
+Stereo packing and interlacing are undone as the settings ask or as detected.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.config import InputSettings
+from scopemap.config.input import Box
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.images import ImageFolder
 from scopemap.io.source import Source, SourceFrame
@@ -29,23 +33,32 @@ _FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
 # Attributes and methods of a source that are the same for one view of it.
 _KEPT = (
     *("name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings"),
+    "frame_limit_s",
     *("quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media", "pose", "truth"),
 )
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
 def prepared(source: Source, settings: InputSettings) -> Source:
-    """Return the source with one view and one field per picture; the source itself where it is so already.
+    """Return the source with boxes blackened, one view and one field per picture; the source itself where it is so.
 
     With `stereo` = auto, the packing is detected in videos and folders of images of no data set; a warning names
-    interlaced ones. Raises `InputError` where `stereo` names the views of a data set, whose reader defines them.
+    interlaced ones. Raises `InputError` where `stereo` names the views of a data set, whose reader defines them, and
+    for a box outside of the pictures.
     """
     if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
         raise InputError(
             f"reading {source.path}: the reader of the data set '{source.name}' defines the view; leave "
             f"input.stereo={settings.stereo} (--stereo) out"
         )
+    for x, y, width, height in settings.redact:
+        if x >= source.width or y >= source.height:
+            raise InputError(
+                f"reading {source.path}: the box {x},{y},{width},{height} to blacken (--redact, X,Y,WIDTH,HEIGHT) is "
+                f"outside of the pictures of {source.width}x{source.height} px"
+            )
     samples = sample_pictures(source) if source.name in UNKNOWN_MAKE else []
+    samples = [redacted(rgb, settings.redact) for rgb in samples]
     packed, note = _packing(source, settings, samples)
     if not settings.deinterlace and is_interlaced(samples):
         source.warnings.append(
@@ -54,22 +67,25 @@ def prepared(source: Source, settings: InputSettings) -> Source:
         )
     if note:
         source.notes.append(note)
-    if packed is None and not settings.deinterlace:
+    if packed is None and not (settings.deinterlace or settings.redact):
         return source
     return PreparedSource(source, packed, settings)
 
 
 class PreparedSource(Source):
-    """A source of which one view and one field of each picture is used; all else is the source's own.
+    """A source of which a part of each picture is used; all else is the source's own.
 
     packed : the packing of two views, of which the left eye's is used; None: the picture is one view.
     """
 
     def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
         self._source, self.packed, self._deinterlace = source, packed, settings.deinterlace
+        self._redact = settings.redact
         super().__init__(source.path)
         for attribute in _KEPT:
             setattr(self, attribute, getattr(source, attribute))
+        if settings.redact:
+            self.notes.append(f"redacted: {len(settings.redact)} box(es) of each picture are black (input.redact)")
         if settings.deinterlace:
             self.notes.append("deinterlaced: the even rows of each picture are used, the odd ones interpolated")
         if packed is not None:
@@ -90,8 +106,19 @@ class PreparedSource(Source):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, each with what is used of its picture."""
         for frame in self._source.frames(selection):
-            rgb = deinterlaced(frame.rgb) if self._deinterlace else frame.rgb
+            rgb = redacted(frame.rgb, self._redact)
+            rgb = deinterlaced(rgb) if self._deinterlace else rgb
             yield replace(frame, rgb=rgb if self.packed is None else self.packed.first(rgb))
+
+
+def redacted(rgb: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray:
+    """Return a picture (h, w, 3) with black boxes; the picture itself without any."""
+    if not boxes:
+        return rgb
+    rgb = rgb.copy()
+    for x, y, width, height in boxes:
+        rgb[y : y + height, x : x + width] = 0
+    return rgb
 
 
 def of_one_view(source: Source) -> str:

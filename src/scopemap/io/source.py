@@ -74,6 +74,7 @@ class Source:
     poses : true poses, camera to world, (4, 4) float64, mm, by frame number. quality : how poses and depth came about.
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
+    frame_limit_s : longest time that a frame may take to read, s, and a second for each that is passed over; None: any.
     masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
@@ -87,6 +88,7 @@ class Source:
     numbers: Sequence[int] | None = None
     stamped = False
     rate_hz = ASSUMED_RATE_HZ
+    frame_limit_s: float | None = 120.0
     calibration: Calibration | None = None
     camera: CameraModel | None = None
     camera_source = ""
