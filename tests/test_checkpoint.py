@@ -15,12 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scopemap.config import MappingSettings, TrackingSettings
+from scopemap.config import TrackingSettings
 from scopemap.errors import InputError
 from scopemap.flow.dis import DisFlow
 from scopemap.fusion.tsdf import VoxelBlocks
 from scopemap.io.checkpoint import SavedState
-from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.tracking.track import Track
 
 _LEAVES = st.one_of(
@@ -106,13 +105,6 @@ def test_a_volume_grows_after_it_came_back(tmp_path: Path) -> None:
     found = _through(tmp_path / "state", blocks, VoxelBlocks())
     assert found.slots(more).tolist() == blocks.slots(more).tolist()
     assert _same(tuple(found.voxels), tuple(blocks.voxels))
-
-
-def test_keyframes_of_a_new_map_come_after_those_that_came_back(tmp_path: Path) -> None:
-    tracks, now = (FeatureTracks(MappingSettings(), DisFlow()) for _ in range(2))
-    assert not tracks._recent[0]
-    found = _through(tmp_path / "state", tracks, now)
-    assert found._recent[1].maxlen == tracks._recent[0].maxlen
 
 
 def test_what_is_not_committed_does_not_count(tmp_path: Path) -> None:

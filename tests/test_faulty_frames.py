@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +19,10 @@ from scopemap.depth.correspondence import DenseMatcher
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.errors import InputError
 from scopemap.frame import Frame
+from scopemap.io.images import ImageFolder
+from scopemap.io.source import Source
 from scopemap.masking.masker import Masker
 from scopemap.reconstruction import Reconstruction
 from scopemap.tracking.tracker import Tracker
@@ -117,6 +122,46 @@ def test_depth_that_is_no_number_is_unknown_and_told(
     assert np.isfinite(result.mesh.vertices).all()
     told = "1 frame(s) got no depth from the network (first: frame 4)"
     assert (told in result.provenance["warnings"]) == (value != 0)
+
+
+def _hang_at(name: str, patch: pytest.MonkeyPatch) -> threading.Event:
+    """Have reading one image take until the event is set; the limit is seconds then."""
+    read, gate = ImageFolder._image, threading.Event()
+
+    def hanging(self: ImageFolder, file: Path) -> np.ndarray | None:
+        if file.name == name:
+            gate.wait(60)
+        return read(self, file)
+
+    patch.setattr(ImageFolder, "_image", hanging)
+    patch.setattr(Source, "frame_limit_s", 2.0)
+    return gate
+
+
+def test_a_reader_that_hangs_ends_the_frames_and_what_was_tracked_is_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, started = open_sequence(folder), time.monotonic()
+    gate = _hang_at("0006_color.png", monkeypatch)
+    try:
+        result = reconstruct(sequence, with_true_depth(folder))
+    finally:
+        gate.set()
+    assert time.monotonic() - started < 50
+    assert [record.index for record in result.records if record.track.status != "lost"] == [*range(6)]
+    (warning,) = [warning for warning in result.provenance["warnings"] if "hangs" in warning]
+    late = "its picture after frame 5 did not come within 3 s: a decoder or a disk hangs; the frames until then"
+    assert warning == f"{folder}: {late} were used"
+    assert len(result.mesh.faces) > 100
+
+
+def test_a_reader_that_hangs_at_once_is_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence, gate = open_sequence(folder), _hang_at("0000_color.png", monkeypatch)
+    try:
+        with pytest.raises(InputError, match="its first picture did not come within 2 s: a decoder or a disk hangs"):
+            reconstruct(sequence, with_true_depth(folder))
+    finally:
+        gate.set()
 
 
 def test_frames_are_stored_in_the_folder_of_the_result(

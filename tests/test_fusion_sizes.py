@@ -14,7 +14,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, FusionSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.errors import InputError
-from scopemap.frame import Frame
+from scopemap.frame import Frame, Rows
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion, TsdfVolume, choose_parameters
 
@@ -72,6 +72,41 @@ def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
     for advice, said in (("", "free space there"), ("or fuse at once", "free space there, or fuse at once")):
         with pytest.raises(InputError, match=rf"cannot store frames in .*gone: No such file.*; {said}$"):
             FrameStore(tmp_path / "gone", advice).put(wall(30.0))
+
+
+_KIND = np.dtype([("number", np.int64), ("at", np.float64, (2,))])
+
+
+def _rows(*numbers: int) -> np.ndarray:
+    return np.array([(number, (0.5, number)) for number in numbers], _KIND)
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_rows_come_back_in_order_in_parts_and_without_those_forgotten(on_disk: bool, tmp_path: Path) -> None:
+    rows = FrameStore(tmp_path).table("some", _KIND) if on_disk else Rows(_KIND)
+    assert len(rows.read()) == 0
+    for number in range(0, 300, 3):
+        rows.append(_rows(number, number + 1, number + 2))
+    rows.append(_rows())
+    assert len(rows) == 300
+    np.testing.assert_array_equal(rows.read(), _rows(*range(300)))
+    np.testing.assert_array_equal(rows.read(7, 2), _rows(7, 8))
+    rows.keep(np.arange(300) % 2 == 1)
+    rows.append(_rows(300))
+    np.testing.assert_array_equal(rows.read(), _rows(*range(1, 300, 2), 300))
+
+
+def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
+    store = FrameStore(tmp_path, name="stored")
+    store.put(wall(30.0))
+    store.reopen()
+    assert [frame.index for frame in store.frames()] == [0]
+    for file in ("frames", "frame_entries"):
+        whole = (tmp_path / "stored" / file).read_bytes()
+        (tmp_path / "stored" / file).write_bytes(whole[:-1])
+        with pytest.raises(InputError, match=f"are damaged: {file} has {len(whole) - 1} of {len(whole)} bytes"):
+            store.reopen()
+        (tmp_path / "stored" / file).write_bytes(whole)
 
 
 def test_depth_beyond_the_range_is_unknown() -> None:

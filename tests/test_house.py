@@ -274,6 +274,13 @@ def test_the_library_neither_prints_nor_exits() -> None:
     _none(faults)
 
 
+def test_no_time_is_told_by_a_clock_that_may_jump() -> None:
+    """`time.monotonic` and `time.perf_counter` go on where the time of day is set."""
+    jumping = re.compile(r"^(time\.(time|time_ns|localtime|ctime)|(datetime\.)?(datetime|date)\.(now|utcnow|today))$")
+    calls = [(m, node) for m in MODULES for node in ast.walk(m.tree) if isinstance(node, ast.Call)]
+    _none([module.at(call) for module, call in calls if jumping.match(ast.unparse(call.func))])
+
+
 def test_nothing_is_left_for_later() -> None:
     later = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b")
     found = [(module, later.search(module.path.read_text())) for module in MODULES + OTHERS]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -231,6 +233,32 @@ def test_another_input_and_no_resume_begin_anew(folder: Path, tmp_path: Path) ->
     assert _run(folder, out, "realtime", overwrite=True).provenance["resumed_after_frame"] is None
 
 
+@pytest.mark.parametrize("setting", ["mask.files", "depth.model", "depth.anchor_model"])
+def test_files_beside_the_input_are_part_of_a_run(setting: str, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    file = tmp_path / "own" / "0001.png"
+    file.write_bytes(b"one")
+    config, sequence = Config.load(settings={setting: str(tmp_path / "own")}), open_sequence(folder)
+    before = identity_of(sequence, config)
+    assert identity_of(sequence, config) == before
+    file.write_bytes(b"two")
+    changed = {name for name, value in identity_of(sequence, config).items() if before[name] != value}
+    assert changed == {f"content of {setting}"}
+
+
+def test_an_input_that_changes_while_it_is_read_is_told(folder: Path, tmp_path: Path) -> None:
+    source = shutil.copytree(folder, tmp_path / "in")
+
+    def grow(step: Step) -> None:
+        (source / "0100_color.png").write_bytes((source / "0000_color.png").read_bytes())
+
+    for observers, told in (((), False), ((grow,), True)):
+        result = _run(source, tmp_path / "run", "realtime", observers=observers, overwrite=True)
+        assert any("changed while it was read" in text for text in result.provenance["warnings"]) == told
+        kept = json.loads((tmp_path / "run" / "provenance.json").read_text())["warnings"]
+        assert kept == result.provenance["warnings"]
+
+
 def test_two_inputs_without_a_checksum_are_two(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.runner.checkpoints.input_checksum", lambda _: {"files": "more than 20000"})
     inputs = [open_sequence(folder), open_sequence(write_tiny(tmp_path / "other"))]
@@ -268,4 +296,8 @@ def test_the_command_line_goes_on_and_says_so(folder: Path, tmp_path: Path, capf
     ask = ("run", folder, "--out", out, "--preset", "realtime", "--resume")
     assert "input.fps was None, is 3.0" in refused(capfd, *ask, "--fps", "3")
     assert call(*ask) == 0
-    assert "resuming after" in capfd.readouterr().err
+    said = capfd.readouterr()
+    assert "resuming after" in said.err
+    found = re.search(r"time: ([\d.]+) s since it was resumed after frame (\d), ([\d.]+) frames/s", said.out)
+    assert found is not None
+    assert float(found[3]) == pytest.approx((FRAMES - 1 - int(found[2])) / float(found[1]), rel=0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -122,8 +123,11 @@ def test_a_run_names_its_input_by_its_content(out: Path, tmp_path: Path, monkeyp
     (tmp_path / "out" / "depth" / "000001.png").write_bytes(b"")
     assert input_checksum(tmp_path / "out")["sha256"] != first["sha256"]
     monkeypatch.setattr(checksums, "_MOST_INPUT_BYTES", 100)
-    part = hashlib.sha256(bytes(range(100))).hexdigest()
-    assert input_checksum(file) == {"bytes": 200, "sha256": part, "hashed_bytes": 100}
+    part, changed = hashlib.sha256(bytes([*range(50), *range(150, 200)])).hexdigest(), file.stat().st_mtime_ns
+    assert input_checksum(file) == {"bytes": 200, "sha256": part, "hashed_bytes": 100, "changed_ns": changed}
+    before = input_checksum(file)
+    os.utime(file, ns=(0, changed + 10**9))
+    assert input_checksum(file) != before
     monkeypatch.setattr(checksums, "_MOST_INPUT_FILES", 3)
     assert input_checksum(tmp_path / "out") == {"files": "more than 3"}
     assert input_checksum(tmp_path / "absent") == {}

@@ -1,11 +1,13 @@
 """Frame: the data type that flows through all stages. Truth: known poses and depth, for evaluation only.
 
-A stage takes a Frame and returns a new one (`dataclasses.replace`); frames are never changed in place.
+A stage takes a Frame and returns a new one (`dataclasses.replace`); frames are never changed in place. What is kept of
+every frame of a run is in `Rows`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -101,6 +103,55 @@ class Truth:
     T_world_camera: np.ndarray | None = None
     depth_mm: np.ndarray | None = None
     quality: TruthQuality = "exact"
+
+
+class Rows:
+    """Rows of one type, put in one after the other, packed: objects would take ten times as much memory.
+
+    kind : numpy's type of a row.
+    """
+
+    def __init__(self, kind: np.dtype) -> None:
+        self._kind, self._count = kind, 0
+        # Bytes: a checkpoint knows no names of columns.
+        self._bytes = np.zeros((0, kind.itemsize), np.uint8)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._count
+
+    def append(self, rows: np.ndarray) -> None:
+        """Put rows (n,) of the kind in."""
+        end = self._count + len(rows)
+        if end > len(self._bytes):
+            larger = np.zeros((max(end, len(self._bytes) * 5 // 4), self._kind.itemsize), np.uint8)
+            larger[: self._count] = self._bytes[: self._count]
+            self._bytes = larger
+        self._bytes[self._count : end] = self._raw(rows)
+        self._count = end
+
+    def read(self, first: int = 0, count: int | None = None) -> np.ndarray:
+        """Return `count` rows from the row `first` on, a copy; None: all of them."""
+        end = self._count if count is None else first + count
+        found: np.ndarray = self._bytes[first:end].reshape(-1).view(self._kind).copy()
+        return found
+
+    def keep(self, kept: np.ndarray) -> None:
+        """Forget the rows where `kept`, (N,) bool, is False."""
+        rows, self._count = self.read()[kept], 0
+        self.append(rows)
+
+    def _raw(self, rows: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(rows, self._kind).view(np.uint8).reshape(len(rows), self._kind.itemsize)
+
+
+RowTable = Callable[[str, np.dtype], Rows]
+"""Returns new rows by name and kind: in memory, or on disk."""
+
+
+def rows_in_memory(_: str, kind: np.dtype) -> Rows:
+    """Return new rows in memory."""
+    return Rows(kind)
 
 
 def is_constant(rgb: np.ndarray) -> bool:

@@ -111,7 +111,7 @@ class Pipeline:
         self._tracker = tracker or Tracker(config.tracking, estimators.corner_flow)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self.mapper = Mapper(config.mapping, estimators.keyframe_flow)
+        self.mapper = Mapper(config.mapping, estimators.keyframe_flow, store.table)
         self._last_track: Track | None = None
         self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
 

@@ -29,6 +29,8 @@ class DepthPro:
     """
 
     name = "depth-pro"
+    NOT_IN_CHECKPOINT = ("_last",)
+    """Not in a checkpoint: tensors, without which the image would be taken for known."""
 
     def __init__(
         self,

@@ -1,12 +1,14 @@
-"""The frame store: tracked frames on disk (about 5 bytes a pixel) until the last one, so that memory stays bounded."""
+"""The frame store: tracked frames on disk (about 5 bytes a pixel) until the last one, so that memory stays bounded.
+
+So is what else grows with a run and is needed at its end alone: rows in tables.
+"""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -17,7 +19,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.frame import Frame
+from scopemap.frame import Frame, Rows
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP, _MIN_MM = 3e-4, 1e-4
@@ -26,40 +28,97 @@ _MAX_CODE = 65535
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """Small data of a frame, the offset of its images in the file, and their sizes in bytes."""
+_ENTRY = np.dtype(
+    [
+        ("index", np.int64),
+        ("time_s", np.float64),
+        ("camera", np.int64),
+        ("has_pose", np.int64),
+        ("T_world_camera", np.float64, (4, 4)),
+        ("offset", np.int64),
+        ("sizes", np.int64, (5,)),
+        ("median_depth_mm", np.float64),
+    ]
+)
+"""Small data of a frame, the number of its camera, and its images: offset in the file, sizes in bytes (0: none)."""
 
-    index: int
-    time_s: float
-    camera: PinholeCamera
-    T_world_camera: np.ndarray | None
-    offset: int
-    sizes: list[int]
-    median_depth_mm: float
+
+class StoredRows(Rows):
+    """Rows in a file of a frame store, which is created with the first; one thread at a time may use them."""
+
+    NOT_IN_CHECKPOINT = ("_store",)
+    """Not in a checkpoint: a store holds its tables."""
+
+    def __init__(self, kind: np.dtype, store: FrameStore, name: str) -> None:
+        super().__init__(kind)
+        self._store, self._name = store, name
+        self._file: IO[bytes] | None = None
+
+    def append(self, rows: np.ndarray) -> None:
+        """Put rows (n,) of the kind in. Raises `InputError` where the folder is full or read-only."""
+        with self._store.storing():
+            if self._file is None:
+                self._file = self._store.opened(self._name, "w+b")
+            self._file.seek(self._count * self._kind.itemsize)
+            self._file.write(self._raw(rows).tobytes())
+            self._file.flush()
+        self._count += len(rows)
+
+    def read(self, first: int = 0, count: int | None = None) -> np.ndarray:
+        """Return `count` rows from the row `first` on; None: all of them."""
+        if self._file is None:
+            return np.zeros(0, self._kind)
+        self._file.seek(first * self._kind.itemsize)
+        size = (self._count - first if count is None else count) * self._kind.itemsize
+        return np.frombuffer(bytearray(self._file.read(size)), self._kind)
+
+    def sync(self) -> None:
+        """Have the disk hold what was put in."""
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+
+    def reopen(self) -> None:
+        """Open the file of the rows that these were restored from; rows put in later are cut off."""
+        if self._count:
+            self._file = self._store.reopened(self._name, self._count * self._kind.itemsize)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            with suppress(OSError):  # a full disk, which `append` has told
+                self._file.close()
 
 
 class FrameStore:
-    """Stores frames with depth in one file, which is created with the first frame.
+    """Stores frames with depth in one file, which is created with the first frame, and tables in files beside it.
 
-    folder : where that file is; None: the system's temporary folder. advice : what else helps where that is full.
-    name : of the file, which then stays when the store is closed, for a run to resume; "": it is deleted then.
+    folder : where these are; None: the system's temporary folder. advice : what else helps where that is full.
+    name : of a folder in it for the files, which then stay when the store is closed, for a run to resume; "": they are
+    deleted then.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder",)
-    """Not in a checkpoint: a run may go on under another name of its folder."""
+    NOT_IN_CHECKPOINT = ("_folder", "_tables", "_known")
+    """Not in a checkpoint: a run may go on under another name of its folder, and who made a table holds its state."""
 
     def __init__(self, folder: Path | None = None, advice: str = "", name: str = "") -> None:
         self._folder, self._name = Path(tempfile.gettempdir() if folder is None else folder), name
         self._advice = f", {advice}" if advice else ""
         self._file: IO[bytes] | None = None
-        self._entries: list[_Entry] = []
-        self._place: dict[int, int] = {}
+        self._tables: list[StoredRows] = []
+        self._entries = self.table("frame_entries", _ENTRY)
+        self._cameras: list[PinholeCamera] = []
+        self._end = 0
+        self._known: tuple[np.ndarray, dict[int, int]] | None = None
         self._reading = Lock()
 
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self._entries)
+
+    def table(self, name: str, kind: np.dtype) -> StoredRows:
+        """Return new rows of a kind in a file of that name."""
+        self._tables.append(StoredRows(kind, self, name))
+        return self._tables[-1]
 
     def put(self, frame: Frame) -> None:
         """Store a frame. Raises `InputError` where the folder is full or read-only."""
@@ -70,91 +129,121 @@ class FrameStore:
             np.packbits(np.zeros_like(frame.valid) if frame.highlights is None else frame.highlights).tobytes(),
             *(_encoded(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
         ]
-        try:
+        with self.storing():
             if self._file is None:
-                self._file = self._opened("w+b")
-            self._file.seek(0, os.SEEK_END)
+                self._file = self.opened("frames", "w+b")
+            self._file.seek(self._end)
             self._file.write(b"".join(parts))
             self._file.flush()
+        if frame.camera not in self._cameras:
+            self._cameras.append(frame.camera)
+        entry = np.zeros(1, _ENTRY)
+        entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, self._end
+        entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), _median_depth_mm(frame)
+        entry["sizes"][0, : len(parts)] = [len(part) for part in parts]
+        if frame.T_world_camera is not None:
+            entry["has_pose"], entry["T_world_camera"] = True, frame.T_world_camera
+        self._entries.append(entry)
+        self._end += int(entry["sizes"].sum())
+        self._known = None
+
+    @contextmanager
+    def storing(self) -> Iterator[None]:
+        """Turn an `OSError` of writing into the `InputError` that names the folder."""
+        try:
+            yield
         except OSError as error:
             raise InputError(
                 f"cannot store frames in {self._folder}: {error.strerror or error}; free space there{self._advice}"
             ) from None
-        sizes = [len(part) for part in parts]
-        entry = (
-            frame.index,
-            frame.time_s,
-            frame.camera,
-            frame.T_world_camera,
-            self._end,
-            sizes,
-            _median_depth_mm(frame),
-        )
-        self._place[frame.index] = len(self._entries)
-        self._entries.append(_Entry(*entry))
 
-    def _opened(self, mode: str) -> IO[bytes]:
+    def opened(self, name: str, mode: str) -> IO[bytes]:
+        """Open a file of the store."""
         if not self._name:
             return tempfile.TemporaryFile(dir=self._folder, prefix="scopemap")
-        return (self._folder / self._name).open(mode)
-
-    @property
-    def _end(self) -> int:
-        return self._entries[-1].offset + sum(self._entries[-1].sizes) if self._entries else 0
+        (self._folder / self._name).mkdir(exist_ok=True)
+        return (self._folder / self._name / name).open(mode)
 
     def sync(self) -> None:
         """Have the disk hold what was stored. Raises `OSError` where it cannot."""
         if self._file is not None:
             os.fsync(self._file.fileno())
+        for table in self._tables:
+            table.sync()
 
     def reopen(self) -> None:
-        """Open the file of the store that this one was restored from; frames put later are cut off."""
-        if self._entries:
-            self._file = self._opened("r+b")
-            self._file.truncate(self._end)
+        """Open the files of the store that this one was restored from; what was put in later is cut off."""
+        for table in self._tables:
+            table.reopen()
+        if len(self):
+            self._file = self.reopened("frames", self._end)
+
+    def reopened(self, name: str, size: int) -> IO[bytes]:
+        """Open a file of the store that was restored, and cut it off after so many bytes.
+
+        Raises `InputError` where it has fewer.
+        """
+        file = self.opened(name, "r+b")
+        if (found := file.seek(0, os.SEEK_END)) < size:
+            file.close()
+            raise InputError(f"the stored frames in {self._folder} are damaged: {name} has {found} of {size} bytes")
+        file.truncate(size)
+        return file
 
     def frame(self, index: int) -> Frame:
         """Return the frame with this number; any thread may call it."""
-        return self._read(self._entries[self._place[index]])
+        entries, place = self._index()
+        return self._read(entries[place[index]])
 
     def poses(self, among: Collection[int]) -> dict[int, np.ndarray]:
         """Return the poses (4, 4) of the frames with the given numbers that have one, by number."""
-        some = [entry for entry in self._entries if entry.index in among]
-        return {entry.index: entry.T_world_camera for entry in some if entry.T_world_camera is not None}
+        some = [entry for entry in self._index()[0] if entry["has_pose"] and int(entry["index"]) in among]
+        return {int(entry["index"]): entry["T_world_camera"] for entry in some}
 
     def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
         """Yield the frames, or those with the given numbers, in order; depth to 0.015 %, colours to a few levels."""
-        for entry in self._entries:
-            if among is None or entry.index in among:
+        for entry in self._index()[0]:
+            if among is None or int(entry["index"]) in among:
                 yield self._read(entry)
 
     def median_depth_mm(self, among: Collection[int] | None = None) -> float | None:
         """Return the median of the frames' median depths, mm, None where no depth is known; `among` as in `frames`."""
-        some = [entry.median_depth_mm for entry in self._entries if among is None or entry.index in among]
+        some = [e["median_depth_mm"] for e in self._index()[0] if among is None or int(e["index"]) in among]
         medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
         return float(np.median(medians_mm)) if medians_mm else None
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the files."""
         if self._file is not None:
             with suppress(OSError):  # a full disk, which `put` has told
                 self._file.close()
+        for table in self._tables:
+            table.close()
 
-    def _read(self, entry: _Entry) -> Frame:
-        assert self._file is not None
-        shape = (entry.camera.height, entry.camera.width)
+    def _index(self) -> tuple[np.ndarray, dict[int, int]]:
+        """Return the entries of all frames, and the place of each by its number."""
         with self._reading:
-            self._file.seek(entry.offset)
-            parts = [np.frombuffer(self._file.read(size), np.uint8) for size in entry.sizes]
+            if self._known is None:
+                entries = self._entries.read()
+                self._known = entries, {index: place for place, index in enumerate(entries["index"].tolist())}
+            return self._known
+
+    def _read(self, entry: np.void) -> Frame:
+        assert self._file is not None
+        camera = self._cameras[entry["camera"]]
+        shape = (camera.height, camera.width)
+        with self._reading:
+            self._file.seek(int(entry["offset"]))
+            parts = [np.frombuffer(self._file.read(size), np.uint8) for size in entry["sizes"].tolist() if size]
         colours, valid, highlights, depth, *sigma = parts
         return Frame(
-            entry.index,
-            entry.time_s,
+            int(entry["index"]),
+            float(entry["time_s"]),
             cv2.cvtColor(np.asarray(cv2.imdecode(colours, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB),
-            entry.camera,
+            camera,
             _bits(valid, shape),
             _decoded(depth, shape),
-            entry.T_world_camera,
+            entry["T_world_camera"] if entry["has_pose"] else None,
             depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
             highlights=_bits(highlights, shape),
         )

@@ -44,14 +44,15 @@ class Verified:
 def write_checksums(folder: Path, *, only: Collection[str] = (), without: Collection[str] = ()) -> None:
     """Write the checksums of all files in a result's folder to `SHA256SUMS` there.
 
-    only : names of files and folders in it that are new; the others keep their checksums. without : names of files that
-    are none of the result's. Raises `InputError` where the folder cannot be written.
+    only : names of files and folders in it that are new; the others keep their checksums. without : names of files and
+    folders in it that are none of the result's. Raises `InputError` where the folder cannot be written.
     """
     sums = _read(folder) if only else {}
     sums = {name: digest for name, digest in sums.items() if name.split("/")[0] not in only}
     with reporting(f"cannot write {folder / SUMS}"):
         for name in _files_in(folder):
-            if name not in (SUMS, *without) and (not only or name.split("/")[0] in only):
+            first = name.split("/")[0]
+            if name != SUMS and first not in without and (not only or first in only):
                 sums[name] = _digest(folder / name)
         # What every result has comes last: a list that breaks off lacks it.
         names = sorted(sums, key=lambda name: (name in _NEEDED, name))
@@ -84,13 +85,13 @@ def input_checksum(path: Path) -> dict[str, Any]:
     """Return the size of an input and a SHA-256 of its content, {} for what is neither file nor folder.
 
     At most 256 MB are read, and 20,000 files counted. A file up to that size has its own SHA-256; of a larger one it is
-    that of its first 256 MB. A folder's is that of lines "SIZE NAME" in the order of their names, each followed by the
-    file's own while the files before it hold less than 256 MB.
+    that of its first and its last 128 MB. A folder's is that of lines "SIZE NAME" in the order of their names, each
+    followed by the file's own while the files before it hold less than 256 MB. Where not all is read there is
+    `hashed_bytes`, and `changed_ns`, the latest time of change.
     """
     try:
         if path.is_file():
-            size = path.stat().st_size
-            return {"bytes": size, "sha256": _digest(path, _MOST_INPUT_BYTES)} | _part(size)
+            return {"bytes": path.stat().st_size, "sha256": _digest(path, _MOST_INPUT_BYTES)} | _part([path])
         if not path.is_dir():
             return {}
         total, found, count = 0, hashlib.sha256(), 0
@@ -102,13 +103,18 @@ def input_checksum(path: Path) -> dict[str, Any]:
             if total < _MOST_INPUT_BYTES:
                 found.update(_digest(path / name, _MOST_INPUT_BYTES - total).encode())
             total += size
-        return {"files": count, "bytes": total, "sha256": found.hexdigest()} | _part(total)
+        files = [path / name for name in _files_in(path)]
+        return {"files": count, "bytes": total, "sha256": found.hexdigest()} | _part(files)
     except OSError:  # it was read, and is gone
         return {}
 
 
-def _part(size: int) -> dict[str, int]:
-    return {"hashed_bytes": _MOST_INPUT_BYTES} if size > _MOST_INPUT_BYTES else {}
+def _part(files: list[Path]) -> dict[str, int]:
+    """Return what tells files apart that are too large to be hashed; {} for smaller ones."""
+    stats = [file.stat() for file in files]
+    if sum(stat.st_size for stat in stats) <= _MOST_INPUT_BYTES:
+        return {}
+    return {"hashed_bytes": _MOST_INPUT_BYTES, "changed_ns": max(stat.st_mtime_ns for stat in stats)}
 
 
 def _files_in(folder: Path) -> Iterator[str]:
@@ -121,14 +127,17 @@ def _files_in(folder: Path) -> Iterator[str]:
 
 
 def _digest(file: Path, most_bytes: int | None = None) -> str:
-    """Return the SHA-256 of a file, or of its first bytes, 64 hexadecimal digits."""
+    """Return the SHA-256 of a file, of a larger one of so many of its bytes at both ends; 64 hexadecimal digits."""
     with file.open("rb") as stream:
-        if most_bytes is None or file.stat().st_size <= most_bytes:
+        size = file.stat().st_size
+        if most_bytes is None or size <= most_bytes:
             return hashlib.file_digest(stream, "sha256").hexdigest()
         found = hashlib.sha256()
-        while most_bytes > 0 and (part := stream.read(min(most_bytes, 1 << 20))):
-            found.update(part)
-            most_bytes -= len(part)
+        for start, end in ((0, most_bytes // 2), (size - (most_bytes - most_bytes // 2), size)):
+            stream.seek(start)
+            while start < end and (part := stream.read(min(end - start, 1 << 20))):
+                found.update(part)
+                start += len(part)
         return found.hexdigest()
 
 

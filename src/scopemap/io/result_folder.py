@@ -26,10 +26,10 @@ LOCK = "process"
 """File there by which the folder is locked; it is not of the result."""
 
 STORED = "stored_frames"
-"""File there with the frames that are fused after the last one; it is not of the result."""
+"""Folder there with the frames that are fused after the last one; it is not of the result."""
 
 NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, f"{CHECKPOINT}-journal")
-"""Files there that a run needs to go on, and that go with the folder."""
+"""Files and folders there that a run needs to go on, and that go with the folder."""
 
 _REPLACED, _MOVING = "replaced", "moving"
 _OWN_FILES = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,8 @@ from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth
 from scopemap.io.frame_choice import FrameChoice, SkippedFrame
-from scopemap.io.source import Source, assumed_camera
+from scopemap.io.source import Source, SourceFrame, assumed_camera
+from scopemap.io.waiting import HangingError, in_time
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Sequence:
 
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
-        for frame in self.frames():
+        for frame in self._rectified(self.source.frames(self.selection), -1):
             truth = self.source.truth(frame.index)
             if truth is None:
                 yield frame, None
@@ -101,21 +102,43 @@ class Sequence:
     def frames(self, after: int = -1) -> Iterator[Frame]:
         """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two.
 
+        Where a picture does not come in time the frames end with a warning.
+
         after : number of a frame; it and those before are read, so that later ones are chosen as ever, but not yielded.
         """
+        return self._rectified(self._in_time(), after)
+
+    def _rectified(self, pictures: Iterable[SourceFrame], after: int) -> Iterator[Frame]:
         found = 0
-        for item in self.choice(self.source.frames(self.selection)):
-            if item.index <= after:
-                found += 1
-                continue
-            rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
-            yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
+        for item in self.choice(pictures):
+            if item.index > after:
+                rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
+                yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
             found += 1
         if found < 2:
             skipped = "".join(f"; frame {frame.index} {frame.reason}" for frame in self.skipped[-1:])
             remedy = "; a higher input.fps or input.skip_duplicates=false uses more" * bool(skipped)
             few = f"{found} readable frame(s) in the selection, two are needed"
             raise InputError(f"reading {self.path}: {few}{skipped}{remedy}")
+
+    def _in_time(self) -> Iterator[SourceFrame]:
+        """Yield the selected pictures until one does not come in time."""
+        pictures, limit_s = iter(self.source.frames(self.selection)), self.source.frame_limit_s
+        if limit_s is None or not isinstance(pictures, Generator):
+            yield from pictures
+            return
+        # Pictures that are passed over are decoded, too.
+        step_s, start_s, read, last = self.selection.step or 1, abs(self.selection.start or 0), 0, -1
+        try:
+            for picture in in_time(pictures, limit_s + start_s, limit_s + step_s):
+                yield picture
+                read, last = read + 1, picture.index
+        except HangingError as error:
+            which = f"picture after frame {last}" if read else "first picture"
+            late = f"{self.path}: its {which} did not come within {error}: a decoder or a disk hangs"
+            if read < 2:
+                raise InputError(f"reading {late}") from None
+            self.source.warnings.append(f"{late}; the frames until then were used")
 
     def with_focal(self, focal_px: float, source: str, sigma_px: float | None = None) -> Sequence:
         """Return the sequence with another guess of an unknown camera.

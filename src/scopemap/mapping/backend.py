@@ -15,7 +15,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame
+from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
@@ -27,7 +27,7 @@ from scopemap.mapping.depth_correction import (
     fit_depth_correction,
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.loop_closure import Loop, LoopFinder
+from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
@@ -68,17 +68,17 @@ class Backend:
 
     Feature tracks and loop closures are computed in a thread of their own; no other thread may use `flow` meanwhile.
     Loop closures between maps merge them. A pose graph spreads all loop closures over the keyframes before bundle
-    adjustment.
+    adjustment. table : where observations are kept until then.
     """
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
         self.settings = settings.advanced
         self._frames: list[int] = []
         self._tracked: list[TrackedPose] = []
-        self._depth_grids: list[np.ndarray] = []
-        self._tracks = FeatureTracks(settings, flow)
-        self._finder = LoopFinder(settings) if settings.min_loop_inliers > 0 else None
-        self._loops: list[Loop] = []
+        self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
+        self._tracks = FeatureTracks(settings, flow, table)
+        self._finder = LoopFinder(settings, table) if settings.min_loop_inliers > 0 else None
+        self._loops = table("loops", LOOP)
         self._camera: PinholeCamera | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
         self._pending: deque[Future[None]] = deque()
@@ -100,7 +100,9 @@ class Backend:
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
         self._tracked.append(tracked)
-        self._depth_grids.append(depth_grid(keyframe.depth_mm, keyframe.valid))
+        grid = depth_grid(keyframe.depth_mm, keyframe.valid)
+        self._depths_mm.append(grid.ravel())
+        self._grid_shape = grid.shape
         while self._pending and self._pending[0].done():
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map))
@@ -167,7 +169,7 @@ class Backend:
         self._tracks.add(keyframe, map_number)
         for loop in self._finder.add(keyframe, map_number) if self._finder is not None else []:
             self._tracks.add_loop(loop)
-            self._loops.append(loop)
+            self._loops.append(loop.row())
 
     def _merged(self, map_number: int, allowed: Collection[int]) -> dict[int, Similarity]:
         """Return Sim(3) to the common world of the map and of the allowed maps that loop closures merge with it."""
@@ -176,7 +178,8 @@ class Backend:
         if len(set(map_of)) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
         T_world_camera = np.stack([pose.T_world_camera for pose in self._tracked])
-        loops = [loop for loop in self._loops if map_of[loop.past] in allowed and map_of[loop.new] in allowed]
+        found = map(Loop.of_row, self._loops.read())
+        loops = [loop for loop in found if map_of[loop.past] in allowed and map_of[loop.new] in allowed]
         return merge_maps(T_world_camera, map_of, loops, map_number, _median_depth_mm(points))
 
     def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> _Adjusted:
@@ -224,7 +227,8 @@ class Backend:
             camera.fx,
             correlated=settings.correlated_observations,
         )
-        loops = [loop.among(chosen, log_unit) for loop in self._loops if {loop.past, loop.new} <= set(chosen)]
+        among, found = set(chosen), map(Loop.of_row, self._loops.read())
+        loops = [loop.among(chosen, log_unit) for loop in found if {loop.past, loop.new} <= among]
         if not loops:
             return problem, 0
         graph = optimise_pose_graph(T_world_camera, pairs, loops, _median_depth_mm(points))
@@ -251,7 +255,8 @@ class Backend:
     ) -> str:
         """Return that the depths of keyframes agree less than as tracked, "" where they agree."""
         assert self._camera is not None
-        before = [np.float32(worlds[self._tracked[k].map].scale) * self._depth_grids[k] for k in chosen]
+        grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
+        before = [np.float32(worlds[self._tracked[k].map].scale) * grids[k] for k in chosen]
         after = [np.exp(scale) * grid for scale, grid in zip(found.state.log_scale, before, strict=True)]
         if fields:
             factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]

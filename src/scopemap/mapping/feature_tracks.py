@@ -6,10 +6,9 @@ would often stay where shading, which moves with the lamp, is alike. Aligned pat
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,12 +17,14 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.flow.corners import detect_corners, match_corners, normalised_brightness, refined_corners
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame
+from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.uncertainty import relative_sigma
 from scopemap.mapping.loop_closure import Loop
 from scopemap.mapping.reprojection import Observations, Points
 
 _CELL_PX = 16  # one corner in each cell of that size
+# Maps whose last keyframes are kept: as many as a lost camera may be found again in.
+_MOST_MAPS = 20
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
 
 
@@ -49,24 +50,22 @@ class _FlowKeyframe:
         self.pattern = normalised_brightness(self.rgb)
 
 
-class _Matches(NamedTuple):
-    """Observations in the order in which they were found: point (N,), keyframe (N,), pixel (N, 2) as in the image."""
-
-    point: np.ndarray
-    keyframe: np.ndarray
-    pixel: np.ndarray
+_POINT = np.dtype([("host", np.int64), ("pixel", np.float64, (2,)), ("log_depth", np.float64), ("sigma", np.float32)])
+_MATCH = np.dtype([("point", np.int64), ("keyframe", np.int64), ("pixel", np.float64, (2,))])
+"""An observation, in the order in which they were found; its pixel is as in the image."""
 
 
 class FeatureTracks:
-    """Takes keyframes one by one; each is matched both ways with those `keyframe_gaps` before it in its map."""
+    """Takes keyframes one by one; each is matched both ways with those `keyframe_gaps` before it in its map.
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+    table : where points and observations are kept until they are collected.
+    """
+
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
         self.settings, self._flow = settings.advanced, flow
-        gap = max(self.settings.keyframe_gaps)
-        self._recent: defaultdict[int, deque[_FlowKeyframe]] = defaultdict(lambda: deque(maxlen=gap))
-        self._points: list[Points] = []
-        self._matches: list[_Matches] = []
-        self._point_count = self._keyframe_count = 0
+        self._recent: dict[int, deque[_FlowKeyframe]] = {}
+        self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
+        self._keyframe_count = 0
         self._camera: PinholeCamera | None = None
 
     def add(self, keyframe: Frame, map_number: int = 0) -> None:
@@ -78,7 +77,10 @@ class FeatureTracks:
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self._keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
-        recent = self._recent[map_number]
+        # The map that was used last is the last one.
+        recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self.settings.keyframe_gaps)))
+        for oldest in [*self._recent][:-_MOST_MAPS]:
+            del self._recent[oldest]
         self._forget_flows_of_other_maps(map_number)
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self._keyframe_count, number_in_map, keyframe.rgb, keyframe.valid, corners, first)
@@ -117,8 +119,7 @@ class FeatureTracks:
         ):
             known = np.isfinite(log_depth)
             first = self._add_points(host, pixels[known], log_depth[known], np.zeros(known.sum()))
-            number = first + np.arange(known.sum())
-            self._matches.append(_Matches(number, np.full(len(number), other), observed[known]))
+            self._add_matches(first + np.arange(known.sum()), other, observed[known])
 
     def collected(
         self, keyframes: Collection[int] | None = None, most_observations: int | None = None
@@ -131,10 +132,9 @@ class FeatureTracks:
         new_number = np.full(self._keyframe_count, -1)
         chosen = np.arange(self._keyframe_count) if keyframes is None else np.array(keyframes, dtype=int)
         new_number[chosen] = np.arange(len(chosen))
-        points = Points(*(np.concatenate([getattr(p, n) for p in self._points]) for n in Points.__annotations__))
-        empty = _Matches(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-        point, keyframe, pixel = (np.concatenate(parts) for parts in zip(empty, *self._matches, strict=True))
-        host, keyframe = new_number[points.host], new_number[keyframe]
+        points, matches = self._points.read(), self._matches.read()
+        point, keyframe = matches["point"], new_number[matches["keyframe"]]
+        host = new_number[points["host"]]
         by_host = np.argsort(host, kind="stable")[np.count_nonzero(host < 0) :]
         if most_observations is not None:
             found = np.count_nonzero((host[point] >= 0) & (keyframe >= 0))
@@ -143,19 +143,26 @@ class FeatureTracks:
         place[by_host] = np.arange(len(by_host))
         order = np.argsort(place[point], kind="stable")
         order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
-        sorted_points = Points(host[by_host], points.pixel[by_host], points.log_depth[by_host], points.sigma[by_host])
-        return sorted_points, Observations(place[point][order], keyframe[order], self._centred(pixel[order]))
+        pixel, log_depth, sigma = (points[name][by_host] for name in ("pixel", "log_depth", "sigma"))
+        observed = Observations(place[point][order], keyframe[order], self._centred(matches["pixel"][order]))
+        return Points(host[by_host], pixel, log_depth, sigma), observed
 
     def _add_points(self, keyframe: int, pixels: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:
         """Add points at pixels (n, 2) of a keyframe; return the number of the first.
 
         share : (n,) standard deviation of the depth, over the depth.
         """
-        first = self._point_count
-        sigma = np.hypot(share, self.settings.depth_sigma_share)
-        self._points.append(Points(np.full(len(pixels), keyframe), self._centred(pixels), log_depth, sigma))
-        self._point_count += len(pixels)
+        first, rows = len(self._points), np.zeros(len(pixels), _POINT)
+        rows["host"], rows["pixel"], rows["log_depth"] = keyframe, self._centred(pixels), log_depth
+        rows["sigma"] = np.hypot(share, self.settings.depth_sigma_share)
+        self._points.append(rows)
         return first
+
+    def _add_matches(self, points: np.ndarray, keyframe: int, pixels: np.ndarray) -> None:
+        """Add the observations of points (n,) in a keyframe, at pixels (n, 2)."""
+        rows = np.zeros(len(points), _MATCH)
+        rows["point"], rows["keyframe"], rows["pixel"] = points, keyframe, pixels
+        self._matches.append(rows)
 
     def _centred(self, pixel: np.ndarray) -> np.ndarray:
         """Return pixels (n, 2) relative to the principal point, y times fx / fy."""
@@ -169,7 +176,7 @@ class FeatureTracks:
         """Add the observations of the host's corners in another keyframe; `flows` : to the other one, and back."""
         number, pixel = match_corners(host.corners, flows, other.valid, _CONSISTENCY_PX)
         kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel)
-        self._matches.append(_Matches(host.first_point + number[kept], np.full(len(kept), other.number), pixel))
+        self._add_matches(host.first_point + number[kept], other.number, pixel)
 
 
 def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from scopemap.config import MappingSettings
-from scopemap.frame import Frame
+from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
 
 _STRONGEST = 64  # features by which candidates are ranked
@@ -20,6 +21,15 @@ _MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same key
 _MAX_PAIRS = 60  # features of a loop
 MOST_SEARCHED = 400
 """Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
+_FEATURE = np.dtype(
+    # Half precision distinguishes descriptors as well, in half of the space.
+    [("pixel", np.float64, (2,)), ("descriptor", np.float16, (128,)), ("point_mm", np.float64, (3,))]
+)
+
+
+LOOP = np.dtype([("past", np.int64), ("new", np.int64), ("T_new_past", np.float64, (4, 4)), ("log_ratio", np.float64)])
+"""A loop without its features."""
+_NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -53,17 +63,35 @@ class Loop:
         log_ratio = self.log_ratio + float(log_unit[new] - log_unit[past])
         return replace(self, past=past, new=new, T_new_past=T_new_past, log_ratio=log_ratio)
 
+    def row(self) -> np.ndarray:
+        """Return the loop without its features as one row of the kind `LOOP`."""
+        return np.array([(self.past, self.new, self.T_new_past, self.log_ratio)], LOOP)
+
+    @classmethod
+    def of_row(cls, row: np.void) -> Loop:
+        """Return the loop of a row, without features."""
+        return cls(int(row["past"]), int(row["new"]), row["T_new_past"], float(row["log_ratio"]), *_NO_FEATURES)
+
+
+class _KeptFeatures(NamedTuple):
+    """Features of a keyframe: the strongest descriptors (n, 128) float16; first row and number of all of them."""
+
+    strongest: np.ndarray
+    first: int
+    rows: int
+
 
 class LoopFinder:
     """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
-    at least `settings.min_loop_inliers` inliers.
+    at least `settings.min_loop_inliers` inliers. table : where features are kept that only PnP needs.
     """
 
-    def __init__(self, settings: MappingSettings) -> None:
+    def __init__(self, settings: MappingSettings, table: RowTable = rows_in_memory) -> None:
         self._min_inliers, self._max_gap = settings.min_loop_inliers, max(settings.advanced.keyframe_gaps)
-        self._features: dict[int, Features] = {}
+        self._features: dict[int, _KeptFeatures] = {}
+        self._rows = table("features", _FEATURE)
         self._map_of: dict[int, int] = {}
         self._count, self._every = 0, 1
         self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
@@ -76,8 +104,7 @@ class LoopFinder:
             if loop is not None:
                 self._loops_to[past].append(loop.new)
                 loops.append(loop)
-        # Half precision distinguishes descriptors as well, in half of the memory.
-        self._features[self._count] = replace(new, descriptors=new.descriptors.astype(np.float16))
+        self._features[self._count] = self._kept(new)
         self._map_of[self._count] = map_number
         self._count += 1
         if len(self._features) > MOST_SEARCHED:
@@ -85,9 +112,19 @@ class LoopFinder:
             self._features = {k: own for k, own in self._features.items() if k % self._every == 0}
         return loops
 
+    def _kept(self, features: Features) -> _KeptFeatures:
+        rows = np.zeros(len(features.pixels), _FEATURE)
+        rows["pixel"], rows["descriptor"], rows["point_mm"] = features.pixels, features.descriptors, features.points_mm
+        self._rows.append(rows)
+        return _KeptFeatures(rows["descriptor"][:_STRONGEST].copy(), len(self._rows) - len(rows), len(rows))
+
+    def _of(self, keyframe: int) -> Features:
+        rows = self._rows.read(*self._features[keyframe][1:])
+        return Features(*(np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm")))
+
     def _loop(self, past: int, new: Features, keyframe: Frame, other_map: bool) -> Loop | None:
         """Return the loop between a past keyframe and the new one; None where PnP does not verify it."""
-        old = self._features[past]
+        old = self._of(past)
         found = relative_pose_pnp(old, new, keyframe.camera, self._min_inliers)
         if found is None or (other_map and self._static(old, new, found.pairs)):
             return None
@@ -124,9 +161,9 @@ class LoopFinder:
         return int((shift_px > _STATIC_PX).sum()) < self._min_inliers
 
     @staticmethod
-    def _similarity(strongest: np.ndarray, past: Features) -> float:
+    def _similarity(strongest: np.ndarray, past: _KeptFeatures) -> float:
         """Sum over descriptors of the cosine to the nearest one of a keyframe, above the threshold."""
-        cosine = strongest @ past.descriptors[:_STRONGEST].T.astype(np.float32)
+        cosine = strongest @ past.strongest.T.astype(np.float32)
         return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
 
     def _allows_loop(self, past: int) -> bool:

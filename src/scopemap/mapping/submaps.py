@@ -15,7 +15,7 @@ import numpy as np
 
 from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame
+from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.map_merging import Part
@@ -24,6 +24,17 @@ from scopemap.tracking.track import RELOCALISED, Track
 
 TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
 """Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
+
+_TRACKED = np.dtype(
+    [
+        ("index", np.int64),
+        ("map", np.int64),
+        ("keyframe", np.int64),
+        ("T_world_camera", np.float64, (4, 4)),
+        ("segment", np.int64),
+    ]
+)
+"""Number of a frame, and its `TrackedPose`."""
 
 LEAST_FRAMES = 10
 """Tracked frames that a submap needs to be a result beside the largest."""
@@ -50,12 +61,14 @@ class Submap:
 class Mapper:
     """Takes every track and every keyframe, and returns the submaps after the last frame.
 
-    flow : between keyframes, for the thread of the back end alone; "none" leaves all frames as tracked.
+    flow : between keyframes, for the thread of the back end alone; "none" leaves all frames as tracked. table : where
+    poses and observations are kept until the last frame.
     """
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
         links = settings.method == "full" and flow.name != "none"
-        self._backend = Backend(settings, flow) if links else None
+        self._backend = Backend(settings, flow, table) if links else None
+        self._rows = table("tracked_poses", _TRACKED)
         self._tracked: dict[int, TrackedPose] = {}
         self._lost_frames = 0
         self._relocalised: set[tuple[Part, Part]] = set()
@@ -65,9 +78,9 @@ class Mapper:
         if track.status == "lost":
             self._lost_frames += 1
             return
-        self._tracked[track.index] = self._pose(track)
-        if track.reason == RELOCALISED and track.keyframe in self._tracked:
-            part, found_in = (self._tracked[index] for index in (track.index, track.keyframe))
+        part = self._pose(track)
+        self._rows.append(np.array([(track.index, *part)], _TRACKED))
+        if track.reason == RELOCALISED and (found_in := self._poses().get(track.keyframe)) is not None:
             self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
 
     def settle(self) -> None:
@@ -77,8 +90,7 @@ class Mapper:
 
     def forget(self, indices: Collection[int]) -> None:
         """Forget where these frames were tracked: they are in no submap."""
-        for index in indices:
-            self._tracked.pop(index, None)
+        self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
 
     def add_keyframe(self, keyframe: Frame, track: Track) -> None:
         """Take a keyframe with refined depth and pose, to be adjusted with the others; before it is observed."""
@@ -91,6 +103,7 @@ class Mapper:
         All keyframes are adjusted together here: poses and depths that were handed on before need the submap's
         correction. Small submaps, but for the first, are left out.
         """
+        self._tracked = self._poses()
         split_off = self._split_maps()
         frames = Counter(pose.map for pose in self._tracked.values())
         found: list[Submap] = []
@@ -136,6 +149,15 @@ class Mapper:
 
     def _frames_of(self, maps: tuple[int, ...]) -> frozenset[int]:
         return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)
+
+    def _poses(self) -> dict[int, TrackedPose]:
+        """Return the poses of all tracked frames by their numbers."""
+        found = self._rows.read()
+        numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
+        return {
+            index: TrackedPose(number, keyframe, T, segment)
+            for index, number, keyframe, segment, T in zip(*numbers, found["T_world_camera"], strict=True)
+        }
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)

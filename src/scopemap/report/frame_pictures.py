@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from scopemap.errors import reporting
-from scopemap.frame import Frame
+from scopemap.frame import Frame, Rows
 
 FOLDER = "frames"
 _MOST = 64
@@ -22,6 +22,7 @@ _MOST_MEASURES = 100_000
 _LONGEST_SIDE_PX = 320
 _QUALITY = 80
 _COLUMNS = ("index", "sharpness", "ms")
+_MEASURE = np.dtype(list(zip(_COLUMNS, (np.int64, np.float64, np.float64), strict=True)))
 
 
 class HasFrame(Protocol):
@@ -45,7 +46,7 @@ class FramePictures:
 
     def __init__(self, *, timed: bool = True) -> None:
         self._pictures: dict[int, tuple[bytes, bytes]] = {}
-        self._measures: list[tuple[int, float, float]] = []
+        self._measures = Rows(_MEASURE)
         self._every, self._timed, self._before = 1, timed, time.perf_counter()
         self._count = 0
 
@@ -62,10 +63,13 @@ class FramePictures:
         if self._count % self._every == 0:
             small = _shrunk(rgb, cv2.INTER_AREA)
             self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", _shrunk(mask, cv2.INTER_NEAREST)))
-        self._measures.append((index, sharpness, 1000 * (now - self._before) if self._timed else np.nan))
+        waited_ms = 1000 * (now - self._before) if self._timed else np.nan
+        self._measures.append(np.array([(index, sharpness, waited_ms)], _MEASURE))
         self._count += 1
         if len(self._measures) > _MOST_MEASURES:
-            del self._measures[1 : _MOST_MEASURES // 2 : 2]
+            kept = np.ones(len(self._measures), bool)
+            kept[1 : _MOST_MEASURES // 2 : 2] = False
+            self._measures.keep(kept)
         if len(self._pictures) > _MOST:
             self._pictures = dict(list(self._pictures.items())[::2])
             self._every *= 2
@@ -85,7 +89,9 @@ class FramePictures:
             with (folder / "measures.csv").open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file)
                 writer.writerow(_COLUMNS)
-                writer.writerows((index, f"{sharp:.4g}", f"{ms:.4g}") for index, sharp, ms in self._measures)
+                writer.writerows(
+                    (index, f"{sharp:.4g}", f"{ms:.4g}") for index, sharp, ms in self._measures.read().tolist()
+                )
 
 
 def picture_file(run: Path, index: int) -> Path:

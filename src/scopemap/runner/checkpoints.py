@@ -112,21 +112,34 @@ class Checkpoints:
 def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> dict[str, Any]:
     """Return what two runs have in common that have the same result, as JSON holds it."""
     kind, _, folder = config.depth.backend.partition(":")
-    content = input_checksum(sequence.path)
+    content, masks = input_checksum(sequence.path), config.mask.files or sequence.source.masks
+    own_files = {
+        "mask.files": "" if masks in (None, "none") else masks,
+        "depth.model": config.depth.model,
+        "depth.anchor_model": config.depth.anchor_model,
+        "depth files": folder if kind == "files" else "",
+    }
     facts = {
         # What is too large to be told by its content is told by its place.
         "input": content if "sha256" in content else content | {"path": str(sequence.path.resolve())},
         "frames": str(sequence.selection),
         "camera": f"{sequence.rectifier.source} at {sequence.camera.width}x{sequence.camera.height}",
-        "depth files": input_checksum(Path(folder)) if kind == "files" else {},
         "tracker": type(tracker).__name__,
     }
+    # Names of weights on a hub are no files: the hashes of theirs are pinned.
+    facts |= {f"content of {name}": input_checksum(Path(file)) for name, file in own_files.items() if file}
     groups = config.model_dump(mode="json", exclude={"preset"})
     return (
         facts
         | {f"{group}.{key}": value for group, part in groups.items() for key, value in part.items()}
         | package_versions()
     )
+
+
+def is_same_input(identity: dict[str, Any], content: dict[str, Any]) -> bool:
+    """Return whether an input with this content, as `input_checksum` has it, is the one of an identity."""
+    before = identity["input"]
+    return {name: before[name] for name in before if name != "path"} == content
 
 
 def can_resume(folder: Path, identity: dict[str, Any]) -> bool:

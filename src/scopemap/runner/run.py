@@ -21,7 +21,7 @@ import numpy as np
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.estimators import compiling_s, largest_depth_mm
-from scopemap.frame import Frame
+from scopemap.frame import Frame, Rows
 from scopemap.fusion.agreement import agreement_figures, compare_with_frame
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
@@ -39,9 +39,10 @@ from scopemap.reconstruction import (
     records_of,
     warnings_of_frames,
 )
-from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of
+from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, is_same_input
 from scopemap.runner.preparation import Progress, prepare
 from scopemap.runner.provenance import Limits, provenance_of, refuse_own_input
+from scopemap.runner.records import FrameRecords
 from scopemap.tracking.track import FrameTracker, Track
 
 Observer = Callable[[Step], bool | None]
@@ -100,6 +101,9 @@ def reconstruct(
             else:
                 _track_with_checkpoints(run, observers, folder, identity)
             result = run.result(notes)
+        if folder is not None and not is_same_input(identity, result.provenance["input_content"]):
+            changed = f"the input {sequence.path} changed while it was read: this may be a part of it"
+            result.provenance["warnings"].append(changed)
         del run  # with its keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write is not None:
             progress("writing", 0, 0)
@@ -128,8 +132,8 @@ class Run:
     progress: Progress
     stopped: bool = False
     interrupted: bool = False
-    records: list[FrameRecord] = field(default_factory=list)
-    median_depths_mm: list[float] = field(default_factory=list)
+    records: FrameRecords = field(init=False)
+    median_depths_mm: Rows = field(default_factory=lambda: Rows(np.dtype(np.float64)))
     limits: Limits = field(default_factory=Limits)
     resumed_after: int | None = None
     forgotten: int = 0
@@ -138,6 +142,9 @@ class Run:
     final_frames: int = 0
     final_done: int = 0
     checked: dict[int, _SpreadFrames] = field(default_factory=lambda: defaultdict(_SpreadFrames))
+
+    def __post_init__(self) -> None:
+        self.records = FrameRecords(self.pipeline.fusion.store.table)
 
     def track(self, observers: tuple[Observer, ...], checkpoints: Checkpoints | None = None) -> None:
         """Pass all frames through the pipeline, those after the last checkpoint."""
@@ -151,14 +158,14 @@ class Run:
             self.take(step)
             for observer in observers:
                 self.stopped = bool(observer(step)) or self.stopped
-        if checkpoints is not None and self.records and not (complete or self.interrupted):
-            checkpoints.commit_all(self.records[-1].index)
+        if checkpoints is not None and len(self.records) and not (complete or self.interrupted):
+            checkpoints.commit_all(self.records.last_index)
 
     def take(self, step: Step) -> None:
         """Collect the results of a step."""
         some_mm = step.refined.depth_mm[::4, ::4]
         if np.isfinite(some_mm).any():
-            self.median_depths_mm.append(float(np.nanmedian(some_mm)))
+            self.median_depths_mm.append(np.array([np.nanmedian(some_mm)]))
         if self.write is not None and not self.pipeline.fusion.at_end:
             self.write(step.frame)
         if self.pipeline.fusion.at_once:
@@ -178,17 +185,15 @@ class Run:
                 fusion.forget(number)
                 self.checked.pop(number, None)
         if most.frames is not None and len(self.records) > most.frames:
-            half = len(self.records) // 2
-            older = self.records[1:half:2]
-            self.records = self.records[:half:2] + self.records[half:]
-            self.median_depths_mm = self.median_depths_mm[::2]
-            self.pipeline.mapper.forget({record.index for record in older})
+            older = self.records.thin()
+            self.median_depths_mm.keep(np.arange(len(self.median_depths_mm)) % 2 == 0)
+            self.pipeline.mapper.forget(older)
             self.forgotten += len(older)
 
-    def check(self) -> None:
+    def check(self, records: list[FrameRecord]) -> None:
         """Raise `InputError` where no frame was tracked."""
-        if all(record.track.status == "lost" for record in self.records):
-            reason = self.records[0].track.reason if self.records else "interrupted before the first"
+        if all(record.track.status == "lost" for record in records):
+            reason = records[0].track.reason if records else "interrupted before the first"
             guess = "" if "max_depth_mm" in reason else " (black or constant?)"
             raise InputError(f"no frame of {self.sequence.path} could be used: {reason}{guess}")
 
@@ -202,14 +207,16 @@ class Run:
 
     def result(self, notes: list[str]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        self.check()
+        records = self.records.read()
+        self.check(records)
         self.progress("adjusting keyframes", 0, 0)
         submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
         self.final_frames = sum(len(submap.frames) for submap in submaps)
-        results = [self._fuse_submap(number, submaps, notes) for number in range(len(submaps))]
-        for frame in self._frames_outside_submaps(submaps):
-            self._write_depth(frame)
-        last = self.records[-1].index if self.interrupted else None
+        results = [self._fuse_submap(records_of(n, submaps, records), submaps[n], notes) for n in range(len(submaps))]
+        submapped = {index for submap in submaps for index in submap.frames}
+        for frame in self.pipeline.fusion.store.frames({r.index for r in records if r.index not in submapped}):
+            self._write_depth(frame)  # as tracked
+        last = self.records.last_index if self.interrupted else None
         warnings = self.pipeline.warnings + warnings + warnings_of_frames(results[0].records, last)
         results[0].provenance["warnings"] += warnings
         results[0].provenance["interrupted_at_frame"] = last
@@ -220,9 +227,8 @@ class Run:
             results[0].provenance["warnings"].append(few)
         return replace(results[0], others=results[1:])
 
-    def _fuse_submap(self, number: int, submaps: list[Submap], notes: list[str]) -> Reconstruction:
-        """Correct, write and fuse the frames of the submap with this number."""
-        submap = submaps[number]
+    def _fuse_submap(self, records: list[FrameRecord], submap: Submap, notes: list[str]) -> Reconstruction:
+        """Correct, write and fuse the frames of a submap, whose records these are."""
         sequence, pipeline = self.sequence, self.pipeline
         store = pipeline.fusion.store
         final = FinalFrames(submap, store.poses(submap.frames), store.frame)
@@ -237,7 +243,6 @@ class Run:
         fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         checked = self.checked.pop(submap.main, _SpreadFrames()).frames
         agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
-        records = records_of(number, submaps, self.records)
         provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, records)
         correction = [] if submap.correction is None else [submap.correction.description]
         provenance["notes"] += notes + correction + ([] if depths is None else [depths.description]) + fused.notes
@@ -245,7 +250,7 @@ class Run:
         provenance["warnings"] += [] if masks is None else masks.warnings
         # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
         median_mm = store.median_depth_mm(submap.main_frames)
-        medians_mm = self.median_depths_mm if median_mm is None else [median_mm]
+        medians_mm = self.median_depths_mm.read().tolist() if median_mm is None else [median_mm]
         provenance["warnings"] += depth_warnings(medians_mm, fused.settings)
         provenance["surface"] = agreement
         config = self.config.model_copy(update={"fusion": fused.settings})
@@ -269,11 +274,6 @@ class Run:
             yield self._write_depth(frame)
             self.final_done += 1
             self.progress("fusing", self.final_done, self.final_frames)
-
-    def _frames_outside_submaps(self, submaps: list[Submap]) -> Iterator[Frame]:
-        """Yield the stored frames that are in no submap, as tracked."""
-        submapped = {index for submap in submaps for index in submap.frames}
-        return self.pipeline.fusion.store.frames({r.index for r in self.records if r.index not in submapped})
 
     def _write_depth(self, frame: Frame) -> Frame:
         """Write the final depth of a frame."""

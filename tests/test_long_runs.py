@@ -1,0 +1,113 @@
+"""What a run keeps of each frame and keyframe until its end is small: the rest is on disk."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+
+from scopemap.config import MappingSettings
+from scopemap.config.mapping import MappingAdvanced
+from scopemap.flow.dis import DisFlow
+from scopemap.frame import Frame, rows_in_memory
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.mapping import Backend
+from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.submaps import Mapper
+from scopemap.reconstruction import FrameRecord
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.runner.records import FrameRecords
+from scopemap.tracking.track import Track
+
+
+def _record(number: int) -> FrameRecord:
+    T = plane_scene.pose(at_mm=(float(number), 1.0, 2.0))
+    track = Track(number, "ok", f"reason {number} \u00e4", T, number // 10, 0.1, 0.5, 0.25, float("nan"), number, 2)
+    pose = None if number % 3 == 0 else T + 1
+    return FrameRecord(number, number / 30, f"{number}\udcff.png", track, pose, 1.5, 0.75)
+
+
+def _bytes_each(put: Callable[[int], object], count: int, warm_up: int) -> float:
+    """Return how much memory grows with each number that is put, after some."""
+    tracemalloc.start()
+    for number in range(count):
+        if number == warm_up:
+            before = tracemalloc.get_traced_memory()[0]
+        put(number)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    return grown / (count - warm_up)
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_records_come_back(on_disk: bool, tmp_path: Path) -> None:
+    records = FrameRecords(FrameStore(tmp_path).table if on_disk else rows_in_memory)
+    assert (len(records), records.last_index, records.read()) == (0, -1, [])
+    for number in range(40):
+        records.append(_record(number))
+    assert (len(records), records.last_index) == (40, 39)
+
+    def same(found: list[FrameRecord], numbers: list[int]) -> None:
+        assert [record.index for record in found] == numbers
+        for record, wanted in zip(found, map(_record, numbers), strict=True):
+            np.testing.assert_array_equal(record.track.T_world_camera, wanted.track.T_world_camera)
+            assert (record.T_world_camera is None) == (wanted.T_world_camera is None)
+            assert wanted.T_world_camera is None or (record.T_world_camera == wanted.T_world_camera).all()
+            assert record.row() == wanted.row()
+            plain = replace(wanted.track, T_world_camera=record.track.T_world_camera, overlap=0.0)
+            assert replace(record.track, overlap=0.0) == plain
+
+    same(records.read(), [*range(40)])
+    assert records.thin() == {*range(1, 20, 2)}
+    same(records.read(), [*range(0, 20, 2), *range(20, 40)])
+
+
+def test_a_frame_leaves_little_in_memory(tmp_path: Path) -> None:
+    store = FrameStore(tmp_path)
+    records, pictures = FrameRecords(store.table), FramePictures()
+    mapper = Mapper(MappingSettings(), DisFlow(), store.table)
+    small = np.zeros((8, 8, 3), np.uint8)
+    camera = CAMERA.resized(8, 8)
+
+    def put(number: int) -> None:
+        record = _record(number)
+        records.append(record)
+        mapper.observe(record.track)
+        store.put(Frame(number, 0.0, small, camera, small[..., 0] == 0, small[..., 0] + 1.0, record.T_world_camera))
+        pictures.put(number, small, small[..., 0] == 0)
+
+    # Measures of sharpness, 24 bytes, in an array that grows by a quarter.
+    assert _bytes_each(put, 3000, 1000) < 100
+
+
+def test_a_keyframe_leaves_little_in_memory(tmp_path: Path) -> None:
+    backend = Backend(MappingSettings(), DisFlow(), FrameStore(tmp_path).table)
+
+    def put(number: int) -> None:
+        view = plane_scene.see(plane_scene.pose(at_mm=(30.0 * np.sin(0.3 * number), 10.0 * np.cos(0.3 * number), 0.0)))
+        frame = (view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
+        backend.add(Frame(number, number / 3, *frame))
+        backend.settle()
+
+    # The 64 strongest descriptors, of 400 keyframes at most: 16 KiB each.
+    assert _bytes_each(put, 50, 20) < 24_000
+    assert backend.adjust().loops > 0
+
+
+def test_of_many_maps_the_last_ones_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.mapping.feature_tracks._MOST_MAPS", 2)
+    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))), DisFlow())
+    for number, map_number in enumerate((0, 1, 0, 2, 0, 1)):
+        view = plane_scene.see(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)))
+        frame = (view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
+        tracks.add(Frame(number, number / 30, *frame), map_number)
+    points, observations = tracks.collected()
+    pairs = set(zip(points.host[observations.point].tolist(), observations.keyframe.tolist(), strict=True))
+    # Map 1 was forgotten when map 2 began: the last keyframe has no other one to be matched with.
+    assert pairs == {(0, 2), (2, 0), (2, 4), (4, 2)}
