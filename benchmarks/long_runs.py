@@ -1,6 +1,6 @@
 """Time and memory of long runs: a phantom's frames there and back until they are long enough.
 
-    python benchmarks/long_runs.py [--frames 300 6000 20000] [--size 160x128] [--preset default]
+    python benchmarks/long_runs.py [--frames 300 6000 20000] [--size 320x256] [--preset default]
 
 Each is one run of the command line. Printed are its seconds, its processor time per frame, its peak memory, its memory
 at each tenth of the time (the last ones are the adjustment, the fusion and the writing) and its open files.
@@ -58,7 +58,7 @@ def main() -> None:
     """Render, run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, nargs="+", default=[300, 6000, 20000], help="in increasing order")
-    parser.add_argument("--size", default="160x128")
+    parser.add_argument("--size", default="320x256")
     parser.add_argument("--preset", default="default")
     options = parser.parse_args()
     print("| frames | seconds | processor time a frame, ms | peak memory MB | memory MB each tenth | open files |")

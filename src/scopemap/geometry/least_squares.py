@@ -237,31 +237,31 @@ class SchurModel:
         """Return the step (cameras + points,) to the minimum."""
         matrix, rhs = self.reduced()
         step = np.zeros(self.cameras + self.points)
-        step[self.free] = splu(matrix).solve(rhs)
+        step[self.free] = splu(sparse.csc_matrix(matrix)).solve(rhs)
         for block in self.blocks[0]:
             points = slice(self.cameras + block.points.start, self.cameras + block.points.stop)
             step[points] = -(block.g + block.E @ step[block.columns]) / block.h
         return step
 
-    def reduced(self) -> tuple[sparse.csc_matrix, np.ndarray]:
+    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrix (F, F) of the free camera unknowns without the points, and the right-hand side (F,)."""
-        rhs = np.zeros(self.cameras)
-        parts = [(prior.columns, prior.A) for prior in self.blocks[1]]
-        for prior in self.blocks[1]:
-            rhs[prior.columns] -= prior.b
-        for block in self.blocks[0]:
-            shrunk = block.E / block.h[:, None]
-            parts.append((block.columns, block.A - block.E.T @ shrunk))
-            rhs[block.columns] -= block.scores.sum(0) - shrunk.T @ block.g
+        rhs, matrix = np.zeros(self.cameras), np.zeros((len(self.free),) * 2)
         place = np.full(self.cameras, -1)
         place[self.free] = np.arange(len(self.free))
-        rows = place[np.concatenate([np.repeat(columns, len(columns)) for columns, _ in parts])]
-        columns = place[np.concatenate([np.tile(columns, len(columns)) for columns, _ in parts])]
-        values = np.concatenate([A.ravel() for _, A in parts])
-        values *= np.where(rows == columns, 1 + _RIDGE, 1.0)
-        kept = (rows >= 0) & (columns >= 0)
-        shape = (len(self.free),) * 2
-        return sparse.coo_matrix((values[kept], (rows[kept], columns[kept])), shape=shape).tocsc(), rhs[self.free]
+
+        def add(columns: np.ndarray, A: np.ndarray, b: np.ndarray) -> None:
+            rhs[columns] -= b
+            kept = np.flatnonzero(place[columns] >= 0)
+            own = place[columns[kept]]
+            matrix[np.ix_(own, own)] += A[np.ix_(kept, kept)]
+
+        for prior in self.blocks[1]:
+            add(*prior)
+        for block in self.blocks[0]:
+            shrunk = block.E / block.h[:, None]
+            add(block.columns, block.A - block.E.T @ shrunk, block.scores.sum(0) - shrunk.T @ block.g)
+        matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
+        return matrix, rhs[self.free]
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""

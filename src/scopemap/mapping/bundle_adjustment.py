@@ -24,7 +24,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
+from numba import njit
 
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, PointBlock, SchurModel, cauchy, minimise, robust_sigma_2d
@@ -246,22 +246,10 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     points, observations = problem.points, problem.observations
     here = slice(*np.searchsorted(points.host, (host, host + 1)))
     some = slice(*np.searchsorted(observations.point, (here.start, here.stop)))
-    error, weight, by_camera, by_host, by_depth, by_lens = (part[some] for part in parts)
     keyframes = np.union1d(observations.keyframe[some], host)
-    size, count, at = len(error), here.stop - here.start, int(np.searchsorted(keyframes, host))
-    J: np.ndarray = np.zeros((size, 2, len(keyframes), _PER_KEYFRAME))
-    J[np.arange(size), :, np.searchsorted(keyframes, observations.keyframe[some]), :6] = by_camera
-    J[:, :, at, :6] += by_host
-    J = np.concatenate([J.reshape(size, 2, _PER_KEYFRAME * len(keyframes)), by_lens], -1)
-    rows = J.reshape(2 * size, J.shape[-1])
-    A = rows.T @ (np.repeat(weight, 2)[:, None] * rows)
-    number = observations.point[some] - here.start
-    h, g = (np.bincount(number, weight * (by_depth * by).sum(1), count) for by in (by_depth, error))
-    place = (np.repeat(number, 2), np.arange(2 * size))
-    E, scores = (
-        sparse.csr_matrix(((weight[:, None] * by).ravel(), place), shape=(count, 2 * size)) @ rows
-        for by in (by_depth, error)
-    )
+    count, at = here.stop - here.start, int(np.searchsorted(keyframes, host))
+    number, observer = observations.point[some] - here.start, np.searchsorted(keyframes, observations.keyframe[some])
+    A, scores, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
     # The prior of the estimated depth, up to the host's scale.
     off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], _PER_KEYFRAME * at + 6
     held = cauchy((off / points.sigma[here]) ** 2, _CAUCHY)[1] / points.sigma[here] ** 2
@@ -269,8 +257,42 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     A[column, column] += held.sum()
     scores[:, column] -= held * off
     columns = (_PER_KEYFRAME * keyframes[:, None] + np.arange(_PER_KEYFRAME)).ravel()
-    columns = np.append(columns, _PER_KEYFRAME * len(state.T_camera_world) + np.arange(by_lens.shape[2]))
+    columns = np.append(columns, _PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
     return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
+
+
+@njit(cache=True, nogil=True)
+def _summed(
+    rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, scores, E, h and g of a `PointBlock`, summed over the observations of a host's points.
+
+    point, observer : (N,) int, numbers among the block's points and keyframes, of which `host` is one.
+    """
+    error, weight, by_camera, by_host, by_depth, by_lens = rows
+    lens = by_lens.shape[2]
+    last = _PER_KEYFRAME * keyframes
+    size = last + lens
+    A = np.zeros((size, size))
+    scores, E = np.zeros((points, size)), np.zeros((points, size))
+    h, g = np.zeros(points), np.zeros(points)
+    touched = np.empty(12 + lens, np.int64)
+    touched[6:12] = _PER_KEYFRAME * host + np.arange(6)
+    touched[12:] = last + np.arange(lens)
+    row = np.empty(12 + lens)
+    for k in range(len(weight)):
+        touched[:6] = _PER_KEYFRAME * observer[k] + np.arange(6)
+        for axis in range(2):
+            row[:6], row[6:12], row[12:] = by_camera[k, axis], by_host[k, axis], by_lens[k, axis]
+            depth, off = weight[k] * by_depth[k, axis], weight[k] * error[k, axis]
+            h[point[k]] += depth * by_depth[k, axis]
+            g[point[k]] += off * by_depth[k, axis]
+            for i in range(len(row)):
+                E[point[k], touched[i]] += depth * row[i]
+                scores[point[k], touched[i]] += off * row[i]
+                for j in range(len(row)):
+                    A[touched[i], touched[j]] += weight[k] * row[i] * row[j]
+    return A, scores, E, h, g
 
 
 def _with_points(problem: BundleProblem, state: State) -> State:

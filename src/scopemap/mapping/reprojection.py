@@ -131,7 +131,7 @@ def reproject(problem: BundleProblem, state: State) -> Reprojection:
     rays = np.column_stack([_undistorted(problem, points.pixel, state.lens[1]) / focal, np.ones(len(points.host))])
     in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
     pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
-    between = np.stack([T[pair % len(T)] @ inverse(T[pair // len(T)]) for pair in pairs])
+    between = T[pairs % len(T)] @ inverse(T[pairs // len(T)])
     R = between[which, :3, :3]
     seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)

@@ -92,7 +92,7 @@ def _log_focal_deviation(problem: BundleProblem, state: State) -> float:
     """Return the cluster-robust standard deviation of ln f, all else marginalised; NaN where it is undetermined."""
     model = linearised(problem, state)
     (block,), free = model.blocks[0], model.free
-    matrix = model.reduced()[0].toarray()
+    matrix = model.reduced()[0]
     try:
         influence = np.zeros(model.cameras)
         influence[free] = np.linalg.pinv(matrix, hermitian=True)[-2]
