@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
 from scopemap.depth.correspondence import DenseCorrespondence
@@ -51,24 +52,30 @@ def measure(path: Path, frames: int, config: Config, tracker: FrameTracker | Non
             and preprocessed.correspondence is not None
             and "lost" not in (step.track.status, last.track.status)
         ):
-            points_mm, pixels = observed(last, preprocessed.correspondence)
-            if len(pixels) >= LEAST_SHARE * frame.valid.size:
+            # Flow and refined depth are of the size of the depth estimate.
+            camera = preprocessed.small.camera
+            points_mm, pixels = observed(last, preprocessed.correspondence, camera)
+            if len(pixels) >= LEAST_SHARE * preprocessed.small.valid.size:
                 T_current_last = inverse(step.track.T_world_camera) @ last.track.T_world_camera
                 for errors, T in ((moved, np.eye(4)), (off, T_current_last)):
-                    projected = frame.camera.project(transform(T, points_mm))
-                    errors.append(float(np.median(np.linalg.norm(projected - pixels, axis=1))))
+                    projected = camera.project(transform(T, points_mm))
+                    error_px = float(np.median(np.linalg.norm(projected - pixels, axis=1)))
+                    errors.append(error_px * frame.camera.width / camera.width)
         last = step
         lost.append(step.track.status == "lost")
     medians = (float(np.median(values)) if values else float("nan") for values in (moved, off))
     return Agreement(*medians, len(off), sum(lost), len(lost))
 
 
-def observed(last: Step, link: DenseCorrespondence) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (N, 3) of the last frame, mm, and the pixels (N, 2) of the current frame where flow finds them."""
+def observed(last: Step, link: DenseCorrespondence, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) of the last frame, mm, and the pixels (N, 2) of the current frame where flow finds them.
+
+    camera : of the size of the flow.
+    """
     rows, columns = np.nonzero(link.consistent)
     pixels = np.column_stack([columns, rows])
     there = pixels + link.to_previous[rows, columns]
-    camera, depth_mm = last.frame.camera, last.refined.depth_mm
+    depth_mm = last.refined.depth_mm
     nearest = np.clip(np.rint(there), 0, [camera.width - 1, camera.height - 1]).astype(int)
     found_mm = depth_mm[nearest[:, 1], nearest[:, 0]]
     known = np.isfinite(found_mm)

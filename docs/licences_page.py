@@ -6,6 +6,7 @@ A package that is not installed here has no row: write the page where all extras
 from __future__ import annotations
 
 import re
+import textwrap
 import tomllib
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -16,13 +17,15 @@ from scopemap.io.weights import REGISTRY
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
+NOTICE = ROOT / "src" / "scopemap" / "tracking" / "alike.LICENSE.txt"
 _HEAD = """# Licences
 
-scopemap and its network scopenet are under Apache-2.0. Below is what is installed with it, as the packages state it. A
-test holds them to a list of licences that are allowed: permissive ones for the core; for extras also MPL-2.0, and
-NVIDIA's own for the libraries that torch brings for its GPUs. Wheels bring libraries with licences of their own: that
-of PyAV holds FFmpeg with x264 and x265 (GPL-2.0-or-later), that of OpenCV FFmpeg (LGPL-2.1-or-later). An image or an
-installer that holds these wheels is passed on under these licences. `python docs/licences_page.py` writes this page.
+scopemap and its network scopenet are under Apache-2.0, the weights of ALIKE-t in the package under BSD-3-Clause.
+Below is what is installed with it, as the packages state it. A test holds them to a list of licences that are
+allowed: permissive ones for the core; for extras also MPL-2.0, and NVIDIA's own for the libraries that torch brings
+for its GPUs. Wheels bring libraries with licences of their own: that of PyAV holds FFmpeg with x264 and x265
+(GPL-2.0-or-later), that of OpenCV FFmpeg (LGPL-2.1-or-later). An image or an installer that holds these wheels is
+passed on under these licences. `python docs/licences_page.py` writes this page.
 """
 # What their metadata leave out or say in a whole text, as in the files they bring.
 _STATED = {
@@ -89,7 +92,10 @@ def licences_page() -> str:
     lines.append("\n## Packages\n\n| package | licence | of |\n|---|---|---|\n")
     lines += [f"| {name} | {licence} | {of} |\n" for name, (licence, of) in sorted(rows.items())]
     lines.append("\n## Weights\n\n| weights | licence |\n|---|---|\n| scopenet | Apache-2.0 |\n")
+    lines.append("| ALIKE-t, part of the package | BSD-3-Clause, notice below |\n")
     lines += [f"| {one.name} | {one.licence} |\n" for one in REGISTRY.values()]
+    notice = textwrap.indent(NOTICE.read_text(encoding="utf-8"), "    ")
+    lines.append(f"\n## Notice of ALIKE-t\n\nOf the weights in `src/scopemap/tracking/alike.onnx`:\n\n{notice}")
     return "".join(lines)
 
 

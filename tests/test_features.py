@@ -11,11 +11,18 @@ from plane_scene import CAMERA
 
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.features import detect_features, match_features, relative_pose_pnp
+from scopemap.tracking.alike import AlikeFeatures
+from scopemap.tracking.features import FeatureDetector, SiftFeatures, match_features, relative_pose_pnp
 
 HERE = plane_scene.pose()
 # Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.
 THERE = plane_scene.pose(at_mm=(30.0, 8.0, 6.0), turn_rad=(0.08, -0.12, 0.35))
+DETECTORS: list[FeatureDetector] = [SiftFeatures(), AlikeFeatures()]
+
+
+@pytest.fixture(params=DETECTORS, ids=lambda detector: detector.name)
+def detector(request: pytest.FixtureRequest) -> FeatureDetector:
+    return request.param
 
 
 def _frame(T_world_camera: np.ndarray, index: int = 0) -> Frame:
@@ -23,8 +30,8 @@ def _frame(T_world_camera: np.ndarray, index: int = 0) -> Frame:
     return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
 
 
-def test_the_pose_of_a_far_view_is_found_from_features() -> None:
-    known, seen = detect_features(_frame(HERE)), detect_features(replace(_frame(THERE), depth_mm=None))
+def test_the_pose_of_a_far_view_is_found_from_features(detector: FeatureDetector) -> None:
+    known, seen = detector.detect(_frame(HERE)), detector.detect(replace(_frame(THERE), depth_mm=None))
     located = relative_pose_pnp(known, seen, CAMERA, min_inliers=20)
     assert located is not None
     off = located.T_current_reference @ inverse(HERE) @ THERE
@@ -34,13 +41,13 @@ def test_the_pose_of_a_far_view_is_found_from_features() -> None:
     T = inverse(THERE) @ HERE
     moved = known.points_mm[located.pairs[:, 0]] @ T[:3, :3].T + T[:3, 3]
     away = np.linalg.norm(CAMERA.project(moved) - seen.pixels[located.pairs[:, 1]], axis=1)
-    assert np.median(away) < 0.5
+    assert np.median(away) < {"sift": 0.5, "alike": 0.7}[detector.name]
     assert len(located.pairs) >= 20
 
 
-def test_features_have_the_3d_point_of_their_pixel() -> None:
+def test_features_have_the_3d_point_of_their_pixel(detector: FeatureDetector) -> None:
     frame = _frame(THERE)
-    features = detect_features(frame)
+    features = detector.detect(frame)
     assert len(features.pixels) > 100
     np.testing.assert_allclose(CAMERA.project(features.points_mm), features.pixels, atol=1e-6)
     column, row = np.rint(features.pixels).astype(int).T
@@ -49,20 +56,24 @@ def test_features_have_the_3d_point_of_their_pixel() -> None:
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-5)
 
 
-def test_masked_pixels_have_no_features() -> None:
+def test_masked_pixels_have_no_features(detector: FeatureDetector) -> None:
     half = plane_scene.EVERYWHERE.copy()
     half[:, 120:] = False
-    assert detect_features(replace(_frame(HERE), valid=half)).pixels[:, 0].max() < 120
-    flat = replace(_frame(HERE), rgb=np.full((CAMERA.height, CAMERA.width, 3), 99, np.uint8))
-    nothing = detect_features(flat)
+    assert detector.detect(replace(_frame(HERE), valid=half)).pixels[:, 0].max() < 120
+    nothing = detector.detect(replace(_frame(HERE), valid=np.zeros_like(half)))
     assert nothing.pixels.shape == (0, 2)
-    assert match_features(nothing, detect_features(_frame(HERE))).shape == (0, 2)
+    assert match_features(nothing, detector.detect(_frame(HERE))).shape == (0, 2)
+
+
+def test_a_flat_picture_has_no_sift_features() -> None:
+    flat = replace(_frame(HERE), rgb=np.full((CAMERA.height, CAMERA.width, 3), 99, np.uint8))
+    assert SiftFeatures().detect(flat).pixels.shape == (0, 2)
 
 
 @pytest.mark.parametrize("what", ["another place", "no depth", "too many required"])
-def test_no_pose_without_enough_inliers(what: str) -> None:
+def test_no_pose_without_enough_inliers(what: str, detector: FeatureDetector) -> None:
     known, least = _frame(HERE), 20
-    seen = detect_features(_frame(THERE))
+    seen = detector.detect(_frame(THERE))
     if what == "another place":
         noise = np.random.default_rng(3).integers(0, 255, known.rgb.shape, dtype=np.uint8)
         known = replace(known, rgb=noise)
@@ -70,11 +81,11 @@ def test_no_pose_without_enough_inliers(what: str) -> None:
         known = replace(known, depth_mm=None)
     else:
         least = 10_000
-    assert relative_pose_pnp(detect_features(known), seen, CAMERA, least) is None
+    assert relative_pose_pnp(detector.detect(known), seen, CAMERA, least) is None
 
 
-def test_the_pose_is_deterministic() -> None:
-    known, seen = detect_features(_frame(HERE)), detect_features(_frame(THERE))
+def test_the_pose_is_deterministic(detector: FeatureDetector) -> None:
+    known, seen = detector.detect(_frame(HERE)), detector.detect(_frame(THERE))
     one, other = (relative_pose_pnp(known, seen, CAMERA, min_inliers=20) for _ in range(2))
     assert one is not None
     assert other is not None

@@ -63,6 +63,31 @@ def test_a_place_seen_again_is_found_with_its_relative_pose() -> None:
         assert loop.log_ratio == pytest.approx(np.log(scale_new / scale_past), abs=0.03)
 
 
+@pytest.mark.parametrize("candidates", [0, 3])
+def test_all_keyframes_of_two_maps_are_weighed_at_the_end(candidates: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.mapping.loop_closure._CANDIDATES", candidates)
+    finder, map_of = LoopFinder(SETTINGS), [0] * len(OUT) + [1] * (COUNT - len(OUT))
+    first = [loop for number in range(COUNT) for loop in finder.add(_frame(number), map_of[number])]
+    assert bool(first) == bool(candidates)
+    loops = finder.between(map_of)
+    found = [(loop.past, loop.new) for loop in [*first, *loops]]
+    assert len(set(found)) == len(found)
+    assert all(map_of[past] != map_of[new] for past, new in found[len(first) :])
+    # Places that both maps show: the camera came back through all but the last.
+    assert len({past for past, _ in found}) >= 5
+    for loop in loops:
+        rotation_rad, off_mm = _off(loop.T_new_past, inverse(POSES[loop.new]) @ POSES[loop.past])
+        assert rotation_rad < np.radians(1.0)
+        assert off_mm < 1.0
+
+
+def test_one_map_has_no_loops_between_maps() -> None:
+    finder = LoopFinder(SETTINGS)
+    for number in range(6):
+        finder.add(_frame(number))
+    assert finder.between([0] * 6) == []
+
+
 def test_a_camera_that_never_returns_closes_no_loop() -> None:
     finder = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
     for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):

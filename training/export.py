@@ -13,7 +13,7 @@ from torch import nn
 from scopemap.depth.scopenet.planes import PLANES
 from training.network import SPREAD_RANGE, TYPICAL_LOG_MM, TYPICAL_LOG_SPREAD, Block, Context, Merge, ScopeNet
 
-_OPSET, _IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
+OPSET, IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
 
 
 def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
@@ -22,8 +22,8 @@ def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
     Sides of the picture are multiples of `STRIDE`. Runtimes compute in float32, and fold the batch normalisations into
     the convolutions when they load the graph.
     """
-    graph = _Graph(network)
-    answer = graph.network("planes")
+    graph = Graph(network)
+    answer = graph.scopenet(network, "planes")
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -32,8 +32,8 @@ def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
             [helper.make_tensor_value_info(answer, TensorProto.FLOAT, (1, 2, "height", "width"))],
             graph.tensors,
         ),
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        ir_version=_IR_VERSION,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
         producer_name="scopemap",
     )
     helper.set_model_props(model, facts)
@@ -53,19 +53,18 @@ def read_network(file: Path) -> ScopeNet:
     return network.eval()
 
 
-class _Graph:
-    """Nodes and tensors of a ScopeNet; every method adds a part and returns the name of its output."""
+class Graph:
+    """Nodes and tensors of a network; every method adds a part and returns the name of its output."""
 
-    def __init__(self, network: ScopeNet) -> None:
+    def __init__(self, network: nn.Module) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.tensors: list[onnx.TensorProto] = []
-        self._network = network
         self._names = {part: name for name, part in network.named_modules()}
-        self._constant("twice", np.array([1, 1, 2, 2], np.float32))
 
-    def network(self, planes: str) -> str:
-        """Add the whole network, as in `ScopeNet.forward` but for the padding."""
-        net, x, scales = self._network, planes, []
+    def scopenet(self, net: ScopeNet, planes: str) -> str:
+        """Add a whole ScopeNet, as in `ScopeNet.forward` but for the padding."""
+        self._constant("twice", np.array([1, 1, 2, 2], np.float32))
+        x, scales = planes, []
         for stage in net.stages:
             x = self._sequence(stage, x)
             scales.append(x)

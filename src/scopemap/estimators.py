@@ -27,6 +27,8 @@ from scopemap.io.sequence import Sequence
 from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
 from scopemap.pipeline import Estimators
+from scopemap.tracking.alike import AlikeFeatures
+from scopemap.tracking.features import FeatureDetector, SiftFeatures
 
 _VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
 _COMPILING = TimingListener()
@@ -65,6 +67,7 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
         own.flow or create_flow(networks.keyframe_flow, networks.device),
         create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks),
+        AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
     )
 
 
@@ -111,9 +114,10 @@ def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
 def estimators_provenance(estimators: Estimators) -> dict[str, str]:
     """Return names, versions and hashes of the estimators, and the source of the depth scale."""
     parts = estimators.depth.provenance()
-    others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance] = {
+    others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance | FeatureDetector] = {
         "flow": estimators.flow,
         "perceptual": estimators.perceptual,
+        "features": estimators.features,
     }
     if estimators.anchor.reference.name == "depth-pro":
         others["anchor"] = estimators.anchor.reference

@@ -14,7 +14,7 @@ it tracks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -32,6 +32,7 @@ from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks
+from scopemap.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.tracking.tracker import Tracker
@@ -50,6 +51,7 @@ class Estimators:
     keyframe_flow: FlowEstimator  # between keyframes, in mapping
     perceptual: PerceptualDistance
     masks: StoredMasks | None = None
+    features: FeatureDetector = field(default_factory=SiftFeatures)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Pipeline:
     STATES: ClassVar = {
         "preprocess": ("_masker", "estimators", "_depth_faults"),
         "match": ("_matcher", "_flow_faults"),
-        "track": ("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_tracking_faults"),
+        "track": ("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame", "_tracking_faults"),
     }
     """The attributes that each stage changes, by its name; those of `fuse` are in `fusion`."""
 
@@ -108,11 +110,12 @@ class Pipeline:
         self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method == "full")
         self._masker = Masker(config.mask, estimators.masks)
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
-        self._tracker = tracker or Tracker(config.tracking, estimators.corner_flow)
+        self._tracker = tracker or Tracker(config.tracking, estimators.corner_flow, estimators.features)
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self.mapper = Mapper(config.mapping, estimators.keyframe_flow, store.table)
+        self.mapper = Mapper(config.mapping, estimators.keyframe_flow, store.table, estimators.features)
         self._last_track: Track | None = None
+        self._last_frame: tuple[Frame, Track] | None = None
         self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
 
     @property
@@ -176,6 +179,7 @@ class Pipeline:
             self._reset()
         refined = refined or self._refine(preprocessed, motion_between(last, track))
         frame = _with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
+        self._add_last_keyframe(track)
         track = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
@@ -195,6 +199,12 @@ class Pipeline:
             track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
         blind, unknown_mm = _blind(frame), np.asarray(_blind(preprocessed.small).depth_mm)
         return Step(blind, track, np.asarray(blind.depth_mm), RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm))
+
+    def new_tracker(self) -> Tracker | None:
+        """Return a tracker that has seen no frame, to track lost frames anew; None where the caller's own tracks."""
+        if not isinstance(self._tracker, Tracker):
+            return None
+        return Tracker(self.config.tracking, self.estimators.corner_flow, self.estimators.features)
 
     def fuse(self, step: Step) -> None:
         """Fuse a tracked frame, or store it until the last one."""
@@ -223,11 +233,22 @@ class Pipeline:
         self._mapis.reset()
         self._smooth.reset()
 
+    def _add_last_keyframe(self, track: Track) -> None:
+        """Hand on the frame that was tracked last where the tracker made it the keyframe of this one."""
+        if track.status == "ok" and self._last_frame is not None and self._last_frame[1].index == track.keyframe:
+            self.mapper.add_keyframe(*self._last_frame)
+            self._last_frame = None
+
     def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> Track:
         """Make a frame the keyframe where one is due; the first one of a map that cannot be one is lost."""
-        if track.status == "lost" or not self._tracker.needs_keyframe():
+        if track.status == "lost":
             return track
         keyframe, kind = replace(frame, T_world_camera=track.T_world_camera), preprocessed.kind
+        if not self._tracker.needs_keyframe():
+            if kind != "measured" and isinstance(self._tracker, Tracker):
+                self._tracker.remember(keyframe)
+                self._last_frame = keyframe, track
+            return track
         measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
         inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
         if inserted and kind != "measured":  # with measured depth tracking alone is better

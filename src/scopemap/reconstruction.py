@@ -110,14 +110,15 @@ def records_of(number: int, submaps: list[Submap], records: list[FrameRecord]) -
     """
     submap = submaps[number]
     map_of = {index: number for number, submap in enumerate(submaps) for index in submap.frames}
-    out, started = list[FrameRecord](), False
+    out, maps = list[FrameRecord](), set[int]()
     for record in records:
         track, found_in = record.track, map_of.get(record.index)
         if found_in == number:
-            if track.status == "initial" and started:
-                record = replace(record, track=replace(track, status="ok", reason="first frame of a merged map"))
+            if track.status == "initial" and maps:
+                reason = track.reason if track.map in maps else "first frame of a merged map"
+                record = replace(record, track=replace(track, status="ok", reason=reason))
             out.append(replace(_corrected(submap, record), map=number))
-            started = True
+            maps.add(track.map)
         elif number == 0 and record.T_world_camera is not None:
             where = "a submap too small to be saved" if found_in is None else f"maps/{found_in}"
             track = replace(track, status=OTHER_MAP, reason=f"tracked in {where}")

@@ -157,7 +157,7 @@ class MapisSettings(Settings):
 
 
 class NetworkSettings(Settings):
-    """Optical flow and perceptual distance."""
+    """Optical flow, features and perceptual distance."""
 
     flow: str = Field(
         "dis",
@@ -173,6 +173,11 @@ class NetworkSettings(Settings):
         "structure",
         description="perceptual distance, structure: local structural similarity, no weights; lpips: AlexNet (with the "
         "extra `networks` and its weights)",
+    )
+    features: Literal["alike", "sift"] = Field(
+        "alike",
+        description="features by which a lost camera, loops and other maps are found again, alike: ALIKE-t, learned, "
+        "part of the package; sift: OpenCV's",
     )
     device: str = Field(
         "auto",

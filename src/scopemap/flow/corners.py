@@ -16,6 +16,7 @@ import numpy as np
 from scopemap.errors import check_shape
 from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, transform
 
 _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
@@ -24,6 +25,7 @@ _CONSISTENCY_PX = 1.0
 # Of the corners that flow between small images must match, now and on average over some frames: where flow matches few,
 # that between the whole images gives keyframes more in common.
 _SMALL_COVERAGE, _FRAMES_BEFORE = 0.5, 10
+_EXPECTED_PX = 8  # between the pixels of a flow that is only a start
 _START_COVERAGE = 0.3  # of the corners that must be matched for the flow to be the next frame's start
 # Refinement.
 _SURROUND_PX, _DARKEST = 8.0, 8.0  # of the local mean and contrast; grey levels added to the mean
@@ -83,10 +85,18 @@ class KeyframeMatcher:
         self._corners = np.zeros((0, 2), dtype=int)
         self._points_mm = np.zeros((0, 3))
 
-    def set_keyframe(self, keyframe: Frame | None) -> None:
-        """Detect the corners of a frame with depth, which replace those of the last keyframe; None: no keyframe."""
-        self._keyframe, self._flows = keyframe, None
-        if keyframe is None:
+    def set_keyframe(
+        self, keyframe: Frame | None, frame: Frame | None = None, T_frame_keyframe: np.ndarray | None = None
+    ) -> None:
+        """Detect the corners of a frame with depth, which replace those of the last keyframe; None: no keyframe.
+
+        frame, T_frame_keyframe : the frame that will be matched next and a first guess of its motion (4, 4), where one
+        is known: the flow is searched from there.
+        """
+        same, self._keyframe, self._flows = keyframe is self._keyframe, keyframe, None
+        if keyframe is not None and frame is not None and T_frame_keyframe is not None:
+            self._flows = _expected_flow(keyframe, T_frame_keyframe), _expected_flow(frame, inverse(T_frame_keyframe))
+        if keyframe is None or same:
             return
         assert keyframe.depth_mm is not None
         self._patterns = normalised_brightness(keyframe.rgb)
@@ -131,6 +141,22 @@ class KeyframeMatcher:
         there, found = _aligned(self._patterns, patterns, self._corners[matched], pixels, _QUICK)
         near = found & (np.linalg.norm(there - pixels, axis=1) <= _MAX_STEP_PX)
         return matched[near], there[near].astype(np.float64)
+
+
+def _expected_flow(frame: Frame, T_other_frame: np.ndarray) -> np.ndarray:
+    """Return the flow (h, w, 2), in its own pixels, that a motion gives a frame's points; coarse."""
+    assert frame.depth_mm is not None
+    height, width = (side // _EXPECTED_PX for side in frame.valid.shape)
+    u, v = np.meshgrid(*((np.arange(side) + 0.5) * _EXPECTED_PX - 0.5 for side in (width, height)))
+    pixels = np.stack([u, v], -1)
+    depth_mm = frame.depth_mm[_EXPECTED_PX // 2 :: _EXPECTED_PX, _EXPECTED_PX // 2 :: _EXPECTED_PX][:height, :width]
+    moved = transform(T_other_frame, (frame.camera.unproject(pixels.reshape(-1, 2)) * depth_mm.reshape(-1, 1)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        flow = (frame.camera.project(moved) - pixels.reshape(-1, 2)) / _EXPECTED_PX
+    flow[~(moved[:, 2] > 0) | ~np.isfinite(flow).all(1)] = np.nan
+    if not np.isfinite(flow).any():
+        return np.zeros((height, width, 2), np.float32)
+    return np.where(np.isfinite(flow), flow, np.nanmedian(flow, 0)).reshape(height, width, 2).astype(np.float32)
 
 
 def _resized(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -194,6 +194,12 @@ class FrameStore:
         """Return the frame with this number; any thread may call it."""
         entries, place = self._index()
         return self._read(entries[place[index]])
+
+    def locate(self, poses: Mapping[int, np.ndarray]) -> None:
+        """Set the poses (4, 4) of stored frames, by number, after the last was put in; the file keeps the old ones."""
+        entries, place = self._index()
+        for index, T_world_camera in poses.items():
+            entries[place[index]]["has_pose"], entries[place[index]]["T_world_camera"] = True, T_world_camera
 
     def poses(self, among: Collection[int]) -> dict[int, np.ndarray]:
         """Return the poses (4, 4) of the frames with the given numbers that have one, by number."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
@@ -32,6 +32,7 @@ from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
+from scopemap.tracking.features import FeatureDetector
 
 # Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
 _TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
@@ -48,16 +49,24 @@ _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
 class _Adjusted(NamedTuple):
     """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
 
-    Within the main map, the largest within one map, and between maps.
+    Within the main map, the largest within one map, and between maps; the last two also as tracked, before adjustment.
     """
 
     correction: FrameCorrection
     main_px: float
     largest_px: float
     between_px: float
+    tracked_px: tuple[float, float]
 
     def accepted(self, alone: _Adjusted, max_sigma_px: float) -> bool:
-        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone."""
+        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
+
+        Where tissue moves, so that not even the main map is adjusted, they are merged as tracked, if what is seen from
+        both fits as well as what is seen from one.
+        """
+        if alone.correction.refused:
+            largest_px, between_px = self.tracked_px
+            return bool(self.correction.refused) and between_px <= _MAX_ERROR_FACTOR * largest_px
         rigid = not self.correction.refused and self.largest_px <= max_sigma_px
         connected = self.correction.loops > 0 and self.between_px <= max_sigma_px
         return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
@@ -71,17 +80,29 @@ class Backend:
     adjustment. table : where observations are kept until then.
     """
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
+    def __init__(
+        self,
+        settings: MappingSettings,
+        flow: FlowEstimator,
+        table: RowTable = rows_in_memory,
+        features: FeatureDetector | None = None,
+    ) -> None:
         self.settings = settings.advanced
         self._frames: list[int] = []
         self._tracked: list[TrackedPose] = []
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
         self._tracks = FeatureTracks(settings, flow, table)
-        self._finder = LoopFinder(settings, table) if settings.min_loop_inliers > 0 else None
+        self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
         self._loops = table("loops", LOOP)
+        self._all_weighed = False
         self._camera: PinholeCamera | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
         self._pending: deque[Future[None]] = deque()
+
+    @property
+    def keyframe_count(self) -> int:
+        """Number of keyframes of all maps."""
+        return len(self._frames)
 
     def keyframes(self, map_number: int = 0) -> int:
         """Return the number of keyframes of a map."""
@@ -106,6 +127,11 @@ class Backend:
         while self._pending and self._pending[0].done():
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map))
+
+    def replace_tracked(self, change: Callable[[TrackedPose], TrackedPose]) -> None:
+        """Change the poses as tracked of all keyframes, after the last one."""
+        self._finish()
+        self._tracked = [change(pose) for pose in self._tracked]
 
     def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
         """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`.
@@ -149,6 +175,7 @@ class Backend:
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
         self._finish()
+        self._close_loops_between_maps()
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
         found = alone = self._adjusted(worlds, map_number)
@@ -167,7 +194,16 @@ class Backend:
         """Add a keyframe's feature tracks and loop closures."""
         self._camera = keyframe.camera
         self._tracks.add(keyframe, map_number)
-        for loop in self._finder.add(keyframe, map_number) if self._finder is not None else []:
+        self._take(self._finder.add(keyframe, map_number) if self._finder is not None else [])
+
+    def _close_loops_between_maps(self) -> None:
+        """Weigh all keyframes of every pair of maps, once."""
+        if self._finder is not None and not self._all_weighed:
+            self._take(self._finder.between([pose.map for pose in self._tracked]))
+            self._all_weighed = True
+
+    def _take(self, loops: Sequence[Loop]) -> None:
+        for loop in loops:
             self._tracks.add_loop(loop)
             self._loops.append(loop.row())
 
@@ -196,15 +232,22 @@ class Backend:
             found, loops = adjust_in_windows(replace(problem, start=None)), 0
             refused, fields = self._judged(chosen, problem, found, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
-        length_px = errors_px(problem, found.state)
-        within = {number: _sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds}
+
+        def sigmas_px(state: State) -> tuple[list[float], float]:
+            length_px = errors_px(problem, state)
+            within = [_sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds]
+            return within, _sigma_px(length_px[host != observer])
+
+        (within, between), (tracked, between_tracked) = map(sigmas_px, (found.state, problem.tracked))
         index = np.array([self._frames[k] for k in chosen])
         correction = (
             _correction(index, problem, found, loops, fields) if not refused else _no_correction(index, found, refused)
         )
         # A map of one keyframe has no observations: NaN.
-        largest_px = np.fmax.reduce(list(within.values()))
-        return _Adjusted(correction, within[main], largest_px, _sigma_px(length_px[host != observer]))
+        main_px = within[list(worlds).index(main)]
+        return _Adjusted(
+            correction, main_px, np.fmax.reduce(within), between, (np.fmax.reduce(tracked), between_tracked)
+        )
 
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera

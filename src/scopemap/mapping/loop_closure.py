@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.frame import Frame, RowTable, rows_in_memory
-from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
+from scopemap.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp
 
-_STRONGEST = 64  # features by which candidates are ranked
+_STRONGEST_VALUES = 8192  # of the descriptors of the strongest features, by which candidates are ranked
 _MIN_SIMILARITY = 0.8  # cosine of descriptors above which they count for a candidate
 _CANDIDATES = 3
 _STATIC_PX = 2.0
@@ -21,12 +24,7 @@ _MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same key
 _MAX_PAIRS = 60  # features of a loop
 MOST_SEARCHED = 400
 """Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
-_FEATURE = np.dtype(
-    # Half precision distinguishes descriptors as well, in half of the space.
-    [("pixel", np.float64, (2,)), ("descriptor", np.float16, (128,)), ("point_mm", np.float64, (3,))]
-)
-
-
+_TRIED_BETWEEN, _MOST_TRIED = 20, 1000  # pairs of keyframes that are verified at the end: of two maps, of all maps
 LOOP = np.dtype([("past", np.int64), ("new", np.int64), ("T_new_past", np.float64, (4, 4)), ("log_ratio", np.float64)])
 """A loop without its features."""
 _NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
@@ -74,7 +72,7 @@ class Loop:
 
 
 class _KeptFeatures(NamedTuple):
-    """Features of a keyframe: the strongest descriptors (n, 128) float16; first row and number of all of them."""
+    """Features of a keyframe: the strongest descriptors (n, D) float16; first row and number of all of them."""
 
     strongest: np.ndarray
     first: int
@@ -86,21 +84,37 @@ class LoopFinder:
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
     at least `settings.min_loop_inliers` inliers. table : where features are kept that only PnP needs.
+    detector : of features; None: SIFT.
     """
 
-    def __init__(self, settings: MappingSettings, table: RowTable = rows_in_memory) -> None:
+    def __init__(
+        self,
+        settings: MappingSettings,
+        table: RowTable = rows_in_memory,
+        detector: FeatureDetector | None = None,
+    ) -> None:
+        self._detector = detector or SiftFeatures()
+        self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
         self._min_inliers, self._max_gap = settings.min_loop_inliers, max(settings.advanced.keyframe_gaps)
         self._features: dict[int, _KeptFeatures] = {}
-        self._rows = table("features", _FEATURE)
+        self._rows = table("features", self._kind)
         self._map_of: dict[int, int] = {}
         self._count, self._every = 0, 1
         self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
+        self._camera: PinholeCamera | None = None
+
+    @property
+    def _kind(self) -> np.dtype:
+        # Half precision distinguishes descriptors as well, in half of the space.
+        size = (self._detector.descriptor_size,)
+        return np.dtype([("pixel", np.float64, (2,)), ("descriptor", np.float16, size), ("point_mm", np.float64, (3,))])
 
     def add(self, keyframe: Frame, map_number: int = 0) -> list[Loop]:
         """Return the loops that a keyframe with depth closes."""
-        new, loops = detect_features(keyframe), []
+        new, loops = self._detector.detect(keyframe), []
+        self._camera = keyframe.camera
         for past in self._candidates(new, map_number):
-            loop = self._loop(past, new, keyframe, self._map_of[past] != map_number)
+            loop = self._loop((past, self._count), self._of(past), new, self._map_of[past] != map_number)
             if loop is not None:
                 self._loops_to[past].append(loop.new)
                 loops.append(loop)
@@ -113,19 +127,43 @@ class LoopFinder:
         return loops
 
     def _kept(self, features: Features) -> _KeptFeatures:
-        rows = np.zeros(len(features.pixels), _FEATURE)
+        rows = np.zeros(len(features.pixels), self._kind)
         rows["pixel"], rows["descriptor"], rows["point_mm"] = features.pixels, features.descriptors, features.points_mm
         self._rows.append(rows)
-        return _KeptFeatures(rows["descriptor"][:_STRONGEST].copy(), len(self._rows) - len(rows), len(rows))
+        return _KeptFeatures(rows["descriptor"][: self._strongest].copy(), len(self._rows) - len(rows), len(rows))
 
     def _of(self, keyframe: int) -> Features:
         rows = self._rows.read(*self._features[keyframe][1:])
-        return Features(*(np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm")))
+        pixels, descriptors, points_mm = (
+            np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm")
+        )
+        return Features(pixels, descriptors, points_mm, self._detector.max_ratio)
 
-    def _loop(self, past: int, new: Features, keyframe: Frame, other_map: bool) -> Loop | None:
-        """Return the loop between a past keyframe and the new one; None where PnP does not verify it."""
-        old = self._of(past)
-        found = relative_pose_pnp(old, new, keyframe.camera, self._min_inliers)
+    def between(self, map_of: Sequence[int]) -> list[Loop]:
+        """Return further loops between maps, after the last keyframe: for each pair of maps all pairs of keyframes are
+        ranked, and the most similar ones verified.
+
+        map_of : numbers of the keyframes' maps, which may have been split or joined since.
+        """
+        ranked = defaultdict[tuple[int, int], list[tuple[float, int, int]]](list)
+        for past, new in combinations(self._features, 2):
+            if map_of[past] != map_of[new] and new not in self._loops_to[past]:
+                maps = min(map_of[past], map_of[new]), max(map_of[past], map_of[new])
+                strongest = self._features[new].strongest.astype(np.float32)
+                ranked[maps].append((self._similarity(strongest, self._features[past]), past, new))
+        likely = [pair for pairs in ranked.values() for pair in sorted(pairs, reverse=True)[:_TRIED_BETWEEN]]
+        loops = []
+        for _, past, new in sorted(likely, reverse=True)[:_MOST_TRIED]:
+            loop = self._loop((past, new), self._of(past), self._of(new), other_map=True)
+            if loop is not None:
+                self._loops_to[past].append(new)
+                loops.append(loop)
+        return loops
+
+    def _loop(self, pair: tuple[int, int], old: Features, new: Features, other_map: bool) -> Loop | None:
+        """Return the loop between a past keyframe and a new one, by number; None where PnP does not verify it."""
+        assert self._camera is not None
+        found = relative_pose_pnp(old, new, self._camera, self._min_inliers)
         if found is None or (other_map and self._static(old, new, found.pairs)):
             return None
         one, other = found.pairs[:: -(-len(found.pairs) // _MAX_PAIRS)].T
@@ -137,14 +175,14 @@ class LoopFinder:
         if np.isfinite(ratio).sum() < min(self._min_inliers, _MAX_PAIRS) // 2:
             return None
         log_ratio, pixels = float(np.nanmedian(ratio)), (old.pixels[one], new.pixels[other])
-        return Loop(past, self._count, T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
+        return Loop(*pair, T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
 
     def _candidates(self, new: Features, map_number: int) -> list[int]:
         """Numbers of the most similar keyframes, of this map and of others.
 
         The last keyframes of this map are left out: flow matches them already.
         """
-        kept, strongest = list(self._features), new.descriptors[:_STRONGEST]
+        kept, strongest = list(self._features), new.descriptors[: self._strongest]
         recent = [k for k, number in self._map_of.items() if number == map_number][-self._max_gap :]
         own = [k for k in kept if self._map_of[k] == map_number and k not in recent]
         elsewhere = [k for k in kept if self._map_of[k] != map_number]

@@ -20,6 +20,7 @@ from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.map_merging import Part
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.tracking.features import FeatureDetector
 from scopemap.tracking.track import RELOCALISED, Track
 
 TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
@@ -62,16 +63,26 @@ class Mapper:
     """Takes every track and every keyframe, and returns the submaps after the last frame.
 
     flow : between keyframes, for the thread of the back end alone; "none" leaves all frames as tracked. table : where
-    poses and observations are kept until the last frame.
+    poses and observations are kept until the last frame. features : of keyframes, for loop closure; None: SIFT.
     """
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
+    def __init__(
+        self,
+        settings: MappingSettings,
+        flow: FlowEstimator,
+        table: RowTable = rows_in_memory,
+        features: FeatureDetector | None = None,
+    ) -> None:
         links = settings.method == "full" and flow.name != "none"
-        self._backend = Backend(settings, flow, table) if links else None
+        self._backend = Backend(settings, flow, table, features) if links else None
         self._rows = table("tracked_poses", _TRACKED)
+        self._last: tuple[int, TrackedPose] | None = None
         self._tracked: dict[int, TrackedPose] = {}
         self._lost_frames = 0
         self._relocalised: set[tuple[Part, Part]] = set()
+        # Changes after the last frame: a checkpoint has what was before.
+        self._changed: dict[int, TrackedPose] = {}
+        self._extended: set[int] = set()
 
     def observe(self, track: Track) -> None:
         """Note where a frame was tracked, or that it was lost."""
@@ -79,9 +90,44 @@ class Mapper:
             self._lost_frames += 1
             return
         part = self._pose(track)
+        self._last = track.index, part
         self._rows.append(np.array([(track.index, *part)], _TRACKED))
         if track.reason == RELOCALISED and (found_in := self._poses().get(track.keyframe)) is not None:
             self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
+
+    @property
+    def adjusts(self) -> bool:
+        """Whether keyframes are adjusted after the last frame."""
+        return self._backend is not None and bool(self._backend.keyframe_count)
+
+    def add_found(self, track: Track) -> None:
+        """Note where a frame was tracked after all, after the last frame: it moves with its keyframe."""
+        self._changed[track.index] = self._poses()[track.keyframe]._replace(
+            keyframe=track.keyframe, T_world_camera=track.T_world_camera
+        )
+        self._extended.add(track.map)
+
+    def join(self, start: Track, last: Track, T_earlier_own: np.ndarray) -> None:
+        """Make the map of `start` a part of an earlier one: tracking leads back from `start` to its frame `last`.
+
+        T_earlier_own : (4, 4), from its world to that of the earlier map.
+        """
+        own, poses = start.map, self._poses()
+        earlier, after = poses[last.index], poses[start.index]
+
+        def joined(pose: TrackedPose) -> TrackedPose:
+            moved = pose._replace(map=earlier.map, T_world_camera=T_earlier_own @ pose.T_world_camera)
+            return moved if pose.map == own else pose
+
+        self._changed |= {index: joined(pose) for index, pose in poses.items() if pose.map == own}
+
+        def part(number: int, segment: int) -> Part:
+            return (earlier.map if number == own else number), segment
+
+        pairs = [((earlier.map, earlier.segment), (own, after.segment)), *self._relocalised]
+        self._relocalised = {(part(*one), part(*other)) for one, other in pairs}
+        if self._backend is not None:
+            self._backend.replace_tracked(joined)
 
     def settle(self) -> None:
         """Wait for what was begun in other threads."""
@@ -93,9 +139,10 @@ class Mapper:
         self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
 
     def add_keyframe(self, keyframe: Frame, track: Track) -> None:
-        """Take a keyframe with refined depth and pose, to be adjusted with the others; before it is observed."""
+        """Take a keyframe with refined depth and pose, to be adjusted with the others; it may be observed already."""
         if self._backend is not None:
-            self._backend.add(keyframe, self._pose(track))
+            observed = self._last is not None and self._last[0] == track.index
+            self._backend.add(keyframe, self._last[1] if self._last and observed else self._pose(track))
 
     def submaps(self) -> tuple[list[Submap], list[str]]:
         """Return the submaps, most frames first, and warnings about frames that are not in the first.
@@ -104,7 +151,7 @@ class Mapper:
         correction. Small submaps, but for the first, are left out.
         """
         self._tracked = self._poses()
-        split_off = self._split_maps()
+        not_first = self._split_maps() | self._extended
         frames = Counter(pose.map for pose in self._tracked.values())
         found: list[Submap] = []
         while frames:
@@ -112,7 +159,7 @@ class Mapper:
             correction = None
             if self._backend is not None and self._backend.keyframes(main):
                 correction = self._backend.adjust(main, self._tracked, among=frames)
-                correction = self._from_first_frame(correction, split_off)
+                correction = self._from_first_frame(correction, not_first)
             maps = (main,) if correction is None else tuple(sorted(correction.S_common_map))
             found.append(Submap(main, maps, self._frames_of(maps), self._frames_of((main,)), correction))
             for number in maps:
@@ -140,10 +187,10 @@ class Mapper:
         self._tracked = {index: pose._replace(map=number(pose)) for index, pose in self._tracked.items()}
         return {pose.map for pose in self._tracked.values()} - before
 
-    def _from_first_frame(self, correction: FrameCorrection, split_off: Collection[int]) -> FrameCorrection:
-        """Return the correction to the world of its first frame: that of a part that was split off is another one."""
+    def _from_first_frame(self, correction: FrameCorrection, not_first: Collection[int]) -> FrameCorrection:
+        """Return the correction to the world of its first frame: that of maps that begin elsewhere is another one."""
         first = min(self._frames_of(tuple(correction.S_common_map)))
-        if self._tracked[first].map not in split_off:
+        if self._tracked[first].map not in not_first:
             return correction
         return correction.in_world(inverse(correction.pose(first, self._tracked[first].T_world_camera)))
 
@@ -154,10 +201,11 @@ class Mapper:
         """Return the poses of all tracked frames by their numbers."""
         found = self._rows.read()
         numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
-        return {
+        poses = {
             index: TrackedPose(number, keyframe, T, segment)
             for index, number, keyframe, segment, T in zip(*numbers, found["T_world_camera"], strict=True)
         }
+        return poses | self._changed
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)

@@ -39,6 +39,7 @@ from scopemap.reconstruction import (
     records_of,
     warnings_of_frames,
 )
+from scopemap.runner.backwards import track_backwards
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, is_same_input
 from scopemap.runner.preparation import Progress, prepare
 from scopemap.runner.provenance import Limits, provenance_of, refuse_own_input
@@ -209,6 +210,7 @@ class Run:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         records = self.records.read()
         self.check(records)
+        records = self.clock.timed("track backwards", self._after_going_back, records)
         self.progress("adjusting keyframes", 0, 0)
         submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
         self.final_frames = sum(len(submap.frames) for submap in submaps)
@@ -226,6 +228,14 @@ class Run:
             few = f"{self.forgotten} of the older frames are not in the result: it keeps {self.limits.frames}"
             results[0].provenance["warnings"].append(few)
         return replace(results[0], others=results[1:])
+
+    def _after_going_back(self, records: list[FrameRecord]) -> list[FrameRecord]:
+        """Return the records after lost frames were tracked from the frames after them."""
+        tracks = track_backwards(self.pipeline, [record.track for record in records])
+        return [
+            record if track is record.track else replace(record, track=track, T_world_camera=track.T_world_camera)
+            for record, track in zip(records, tracks, strict=True)
+        ]
 
     def _fuse_submap(self, records: list[FrameRecord], submap: Submap, notes: list[str]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap, whose records these are."""

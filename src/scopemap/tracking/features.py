@@ -1,12 +1,13 @@
-"""SIFT features with depth, their matching, and the relative pose of two frames by PnP in RANSAC.
+"""Features with depth, their matching, and the relative pose of two frames by PnP in RANSAC.
 
-SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012). Tissue has few distinctive
-corners: the detection threshold is low, and RANSAC rejects the wrong matches.
+Learned features are in `alike.py`; here SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman,
+CVPR 2012). Tissue has few distinctive corners: the detection threshold is low, and RANSAC rejects the wrong matches.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,24 +21,55 @@ _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
 _MAX_EDGE_RATIO = 15.0
 _BORDER_PX = 3
 _MAX_RATIO = 0.8  # Lowe's ratio test
-_MAX_ITERATIONS = 300
+_MAX_ITERATIONS = 500
 _CONFIDENCE = 0.999
 _INLIER_SHARE = 1 / 80  # largest reprojection error of an inlier, share of the image's width
 
 
 @dataclass(frozen=True)
 class Features:
-    """SIFT features of a frame, strongest first.
+    """Features of a frame, strongest first.
 
     Attributes
     ----------
-    pixels : (N, 2) float64 x, y. descriptors : (N, 128) float32 of unit length. points_mm : (N, 3) float64 in the
-    camera frame, NaN where the depth is unknown.
+    pixels : (N, 2) float64 x, y. descriptors : (N, D) float32 of unit length. points_mm : (N, 3) float64 in the
+    camera frame, NaN where the depth is unknown. max_ratio : of the distances to the nearest and to the second nearest
+    descriptor, above which a feature is not matched; 1: mutual nearest neighbours are matched however close others are.
     """
 
     pixels: np.ndarray
     descriptors: np.ndarray
     points_mm: np.ndarray
+    max_ratio: float = _MAX_RATIO
+
+
+class FeatureDetector(Protocol):
+    """Protocol of what detects features: `SiftFeatures` and `AlikeFeatures`; any thread may call it."""
+
+    name: str
+    descriptor_size: int
+    max_ratio: float
+    """See `Features`."""
+
+    def detect(self, frame: Frame) -> Features:
+        """Return features in the usable pixels of a frame, with depth where the frame has it."""
+
+    def provenance(self) -> dict[str, str]:
+        """Return what the result depends on, as text: names, versions, hashes."""
+
+
+class SiftFeatures:
+    """RootSIFT features by OpenCV."""
+
+    name, descriptor_size, max_ratio = "sift", 128, _MAX_RATIO
+
+    def detect(self, frame: Frame) -> Features:
+        """Return features in the usable pixels of a frame, with depth where the frame has it."""
+        return detect_features(frame)
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name and OpenCV's version."""
+        return {"features": self.name, "opencv": cv2.__version__}
 
 
 @dataclass(frozen=True)
@@ -55,38 +87,48 @@ class RelativePose:
 
 
 def detect_features(frame: Frame) -> Features:
-    """Return at most 500 features in the usable pixels of a frame, with depth where the frame has it."""
-    usable = cv2.erode(frame.valid.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0)
+    """Return at most 500 RootSIFT features in the usable pixels of a frame, with depth where the frame has it."""
     sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST, edgeThreshold=_MAX_EDGE_RATIO)
-    corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), 255 * usable)
+    usable = 255 * usable_pixels(frame.valid).astype(np.uint8)
+    corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), usable)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
     order = np.argsort([-corner.response for corner in corners], kind="stable")
     pixels = np.array([corner.pt for corner in corners], dtype=np.float64)[order]
-    height, width = frame.valid.shape
-    column, row = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
-    depth_mm = np.full(len(pixels), np.nan) if frame.depth_mm is None else frame.depth_mm[row, column]
-    camera = frame.camera
+    rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
+    return Features(pixels, rooted.astype(np.float32), points_at(pixels, frame.depth_mm, frame.camera))
+
+
+def usable_pixels(valid: np.ndarray) -> np.ndarray:
+    """Return where features may be, (H, W) bool: those at the edge of a mask or a highlight are not the tissue's."""
+    border = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(valid.astype(np.uint8), border, borderValue=0) > 0)
+
+
+def points_at(pixels: np.ndarray, depth_mm: np.ndarray | None, camera: PinholeCamera) -> np.ndarray:
+    """Return the points (N, 3) mm in the camera at pixels (N, 2); NaN where the depth (H, W), mm, is unknown."""
+    column, row = np.clip(np.rint(pixels).astype(int), 0, [camera.width - 1, camera.height - 1]).T
+    known_mm = np.full(len(pixels), np.nan) if depth_mm is None else depth_mm[row, column]
     ray = np.column_stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(pixels))]
     )
-    rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
-    return Features(pixels, rooted.astype(np.float32), depth_mm[:, None].astype(np.float64) * ray)
+    return known_mm[:, None].astype(np.float64) * ray
 
 
 def match_features(reference: Features, current: Features) -> np.ndarray:
-    """Return index pairs (M, 2) int of mutual nearest neighbours that pass the ratio test."""
+    """Return index pairs (M, 2) int of mutual nearest neighbours that pass the ratio test, of features of one kind."""
     if len(reference.pixels) < 2 or len(current.pixels) < 2:
         return np.zeros((0, 2), dtype=int)
     cosine = np.asarray(reference.descriptors, np.float32) @ np.asarray(current.descriptors, np.float32).T
     rows = np.arange(len(cosine))
     best = cosine.argmax(1)
     mutual = cosine.argmax(0)[best] == rows
-    first = cosine[rows, best]
-    cosine[rows, best] = -1.0
-    # Of unit vectors the squared distance is 2 (1 - cosine).
-    distinct = 1 - first < _MAX_RATIO**2 * (1 - cosine.max(1))
-    return np.column_stack([rows, best])[mutual & distinct]
+    if reference.max_ratio < 1:
+        first = cosine[rows, best]
+        cosine[rows, best] = -1.0
+        # Of unit vectors the squared distance is 2 (1 - cosine).
+        mutual &= 1 - first < reference.max_ratio**2 * (1 - cosine.max(1))
+    return np.column_stack([rows, best])[mutual]
 
 
 def relative_pose_pnp(
@@ -111,7 +153,7 @@ def relative_pose_pnp(
         iterationsCount=_MAX_ITERATIONS,
         reprojectionError=max_error_px,
         confidence=_CONFIDENCE,
-        flags=cv2.SOLVEPNP_EPNP,
+        flags=cv2.SOLVEPNP_P3P,
     )
     if not found or inliers is None or len(inliers) < min_inliers:
         return None

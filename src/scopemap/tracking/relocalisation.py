@@ -1,19 +1,18 @@
-"""Relocalisation: finds a lost camera in recent keyframes by SIFT features, PnP and photometric alignment."""
+"""Relocalisation: finds a lost camera in recent keyframes by features, PnP and alignment from there."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
-from scopemap.tracking.features import Features, detect_features, relative_pose_pnp
+from scopemap.tracking.features import FeatureDetector, Features, RelativePose, relative_pose_pnp
 from scopemap.tracking.residuals import View
-from scopemap.tracking.rtdl import Alignment, align
+from scopemap.tracking.rtdl import Alignment
 
 _MIN_INLIERS = 20
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
@@ -36,19 +35,15 @@ class Keyframe:
     measured: bool
     map: int
 
-    @cached_property
-    def features(self) -> Features:
-        """Features with depth, detected on first use: most clips never need them."""
-        return detect_features(self.frame)
-
 
 class Relocaliser:
     """Recent keyframes of the current map and of other maps, in which a lost camera is searched."""
 
-    def __init__(self, settings: TrackingSettings) -> None:
-        self.settings = settings
+    def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
+        self.settings, self._detector = settings, detector
         self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
         self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
+        self._features: dict[int, Features] = {}
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of the current map."""
@@ -67,26 +62,41 @@ class Relocaliser:
     def find(
         self,
         frame: Frame,
-        pyramid: list[View],
+        align: Callable[[Keyframe, RelativePose], Alignment],
         is_accepted: Callable[[Keyframe, Alignment], bool],
         *,
+        near: Sequence[Keyframe],
+        recent: bool,
         other_maps: bool,
     ) -> tuple[Keyframe, Alignment] | None:
         """Return the keyframe with the best accepted alignment of a frame, and that alignment; None without any.
 
-        pyramid : of the frame. other_maps : whether other maps are searched where the current one has none.
+        align : returns the alignment with a keyframe from its relative pose by features. near : keyframes
+        that are searched in any case. recent : whether those of the current map are, too. other_maps : whether those of
+        other maps are, where none of these is found.
         """
         if self.settings.relocalisation_keyframes == 0:
             return None
-        current = detect_features(replace(frame, depth_mm=None))
-        for keyframes in (self._keyframes, self._of_other_maps if other_maps else ()):
+        current = self._detector.detect(replace(frame, depth_mm=None))
+        own = {keyframe.frame.index: keyframe for keyframe in (*(self._keyframes if recent else ()), *near)}
+        groups = [own.values(), self._of_other_maps if other_maps else ()]
+        searched = {keyframe.frame.index for group in groups for keyframe in group}
+        self._features = {index: known for index, known in self._features.items() if index in searched}
+        for keyframes in groups:
             found = []
             for keyframe in keyframes:
-                relative = relative_pose_pnp(keyframe.features, current, frame.camera, _MIN_INLIERS)
+                relative = relative_pose_pnp(self._known(keyframe), current, frame.camera, _MIN_INLIERS)
                 if relative is not None:
-                    alignment = align(keyframe.pyramid, pyramid, relative.T_current_reference, self.settings)
+                    alignment = align(keyframe, relative)
                     if is_accepted(keyframe, alignment):
                         found.append((keyframe, alignment))
             if found:
                 return max(found, key=lambda pair: pair[1].agreement)
         return None
+
+    def _known(self, keyframe: Keyframe) -> Features:
+        """Return the features of a keyframe, detected on first use: most clips never need them."""
+        index = keyframe.frame.index
+        if index not in self._features:
+            self._features[index] = self._detector.detect(keyframe.frame)
+        return self._features[index]

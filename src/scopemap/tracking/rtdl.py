@@ -52,7 +52,7 @@ class Alignment:
     both frames' normalised channel over these pixels; near 0 for noise, however well that fits.
     texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
-    is_supported : whether matched corners confirm the motion.
+    is_supported : whether matched corners confirm the motion. matches : inliers of the features that it was found by.
     """
 
     motion: Motion
@@ -63,6 +63,7 @@ class Alignment:
     overlap: float
     iterations: int
     is_supported: bool = False
+    matches: int = 0
 
     @property
     def agreement(self) -> float:

@@ -12,6 +12,7 @@ from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
+from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.relocalisation import Keyframe, Relocaliser
 from scopemap.tracking.reprojection import pose_from_correspondences, reprojection_error_px
@@ -22,8 +23,10 @@ from scopemap.tracking.track import RELOCALISED, Status, Track
 
 _MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and more
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
-_DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost
+_DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost, unless so many features match: by chance 20 at most
+_CLEAR_MATCHES = 40
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
+_WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 
@@ -39,13 +42,16 @@ class Tracker:
     later relocalisation may lead back to an older map.
     """
 
-    def __init__(self, settings: TrackingSettings, flow: FlowEstimator | None = None) -> None:
+    def __init__(
+        self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
+    ) -> None:
         self.settings = settings
         with_corners = flow is not None and flow.name != "none" and settings.advanced.corner_depth_sigma > 0
         self._matcher = KeyframeMatcher(flow) if flow is not None and with_corners else None
-        self._relocaliser = Relocaliser(settings)
+        self._relocaliser = Relocaliser(settings, features or SiftFeatures())
         self._sharpness = SharpnessMonitor()
         self._keyframe: Keyframe | None = None
+        self._last: Frame | None = None
         self._T_world_last = np.eye(4)
         self._T_step = np.eye(4)
         self._frames_since_keyframe = 0
@@ -73,23 +79,32 @@ class Tracker:
             self._sharp_frames_lost += not self._is_unsharp
             return self._lost(frame, f"not searched: one of {self.settings.search_every} lost frames is")
         alignment, pyramid = self._align(self._keyframe, frame)
-        if self._is_obscured(sharpness, alignment):
+        obscured = self._is_obscured(sharpness, alignment)
+        rejected, reason = self._reject_reason(self._keyframe, alignment), ""
+        failed, is_weak = obscured or bool(rejected), self._coverage < _WEAK_COVERAGE
+        if failed or is_weak or self._frames_lost:
+            found = self._found(frame, pyramid, sharpness, failed=failed)
+            if found is not None and (failed or found[1].agreement > alignment.agreement):
+                reason = "" if found[0].map == self._map and not self._frames_lost else RELOCALISED
+                obscured, rejected = False, ""
+                alignment = self._aligned_to(*found)
+        if obscured:
             self._sharp_frames_lost = 0
             return self._lost(frame, unsharp, alignment)
-        rejected, reason = self._reject_reason(self._keyframe, alignment), ""
-        if rejected or self._frames_lost:
-            pyramid = pyramid or self._pyramid(self._keyframe, frame)
-            found = self._relocaliser.find(frame, pyramid, self._is_accepted, other_maps=bool(rejected))
-            if found is not None and (rejected or found[1].agreement > alignment.agreement):
-                keyframe, alignment = found
-                self._use_keyframe(keyframe)
-                rejected, reason = "", RELOCALISED
         if rejected:
             self._sharp_frames_lost += 1
             if self._sharp_frames_lost > self.settings.new_map_after > 0 and not self._is_unsharp:
                 return self._new_map(frame)
             return self._lost(frame, f"rejected: {rejected}", alignment)
         return self._accept(frame, self._keyframe, alignment, reason)
+
+    def remember(self, frame: Frame) -> None:
+        """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
+
+        Where tissue moves further than flow follows, features still match successive frames. `Track.keyframe` is then
+        the number of this frame, which is a keyframe from there on.
+        """
+        self._last = None if self._is_unsharp else frame
 
     def needs_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""
@@ -109,19 +124,65 @@ class Tracker:
         """
         if frame.depth_mm is None or frame.T_world_camera is None:
             raise ValueError("a keyframe needs a depth and a pose")
-        known = frame.valid & np.isfinite(frame.depth_mm)
-        if known.mean() < self.settings.min_valid_share:
+        keyframe = self._keyframe_of(frame, measured)
+        if keyframe is None:
             return False
-        pyramid = build_pyramid(frame, self.settings, use_slope=measured)
-        mean_mm = float(frame.depth_mm[known].mean())
-        keyframe = Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._map)
         self._use_keyframe(keyframe)
         self._relocaliser.add(keyframe)
         self._frames_since_keyframe = 0
         return True
 
+    def _keyframe_of(self, frame: Frame, measured: bool) -> Keyframe | None:
+        """Return a keyframe of the current map; None where too little of the frame's depth is known."""
+        assert frame.depth_mm is not None
+        assert frame.T_world_camera is not None
+        known = frame.valid & np.isfinite(frame.depth_mm)
+        if known.mean() < self.settings.min_valid_share:
+            return None
+        pyramid = build_pyramid(frame, self.settings, use_slope=measured)
+        mean_mm = float(frame.depth_mm[known].mean())
+        return Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._map)
+
+    def _found(
+        self, frame: Frame, pyramid: list[View] | None, sharpness: float, *, failed: bool
+    ) -> tuple[Keyframe, Alignment] | None:
+        """Return the keyframe in which features find a frame, and its accepted alignment; None without any.
+
+        failed : whether the alignment without features failed; then all maps are searched. After a loss the current one
+        is, else the keyframe and the frame tracked last.
+        """
+        assert self._keyframe is not None
+        views, coverage = pyramid or self._pyramid(self._keyframe, frame), self._coverage
+        near = [self._keyframe]
+        if self._last is not None and self._last.index != self._keyframe.frame.index:
+            last = self._keyframe_of(self._last, self._keyframe.measured)
+            near += [] if last is None else [last]
+        found = self._relocaliser.find(
+            frame,
+            lambda keyframe, relative: self._align_from(keyframe, frame, views, relative),
+            lambda keyframe, alignment: (
+                self._is_accepted(keyframe, alignment) and not self._is_obscured(sharpness, alignment)
+            ),
+            near=near,
+            recent=failed or self._frames_lost > 0,
+            other_maps=failed,
+        )
+        if self._matcher is not None and not self._keyframe.measured:
+            self._matcher.set_keyframe(self._keyframe.frame)
+        self._coverage = coverage
+        return found
+
+    def _aligned_to(self, keyframe: Keyframe, alignment: Alignment) -> Alignment:
+        """Make the keyframe in which a frame was found the current one; return its alignment."""
+        if self._last is not None and keyframe.frame.index == self._last.index:
+            self._relocaliser.add(keyframe)
+            self._frames_since_keyframe = 1
+        self._use_keyframe(keyframe)
+        self._coverage = 0.0  # tracking by flow alone has failed: a keyframe is due
+        return alignment
+
     def _use_keyframe(self, keyframe: Keyframe) -> None:
-        self._keyframe, self._agreement = keyframe, []
+        self._keyframe, self._last, self._agreement = keyframe, None, []
         if self._matcher is not None:
             # Measured depth tracks better by itself than flow over wide gaps.
             self._matcher.set_keyframe(None if keyframe.measured else keyframe.frame)
@@ -129,7 +190,8 @@ class Tracker:
     def _align(self, keyframe: Keyframe, frame: Frame) -> tuple[Alignment, list[View] | None]:
         """Return the pose by corners, else by photometric alignment, and the frame's pyramid where it was needed."""
         self._coverage = 1.0
-        by_corners = self._align_by_corners(keyframe, frame)
+        T_start = inverse(self._T_world_last) @ keyframe.T_world_camera
+        by_corners = self._align_by_corners(keyframe, frame, T_start)
         if by_corners is not None and self._is_accepted(keyframe, by_corners):
             return by_corners, None
         pyramid = self._pyramid(keyframe, frame)
@@ -137,11 +199,20 @@ class Tracker:
         found = [align(keyframe.pyramid, pyramid, start, self.settings) for start in starts]
         return max(found, key=lambda alignment: alignment.agreement), pyramid
 
-    def _align_by_corners(self, keyframe: Keyframe, frame: Frame) -> Alignment | None:
+    def _align_from(self, keyframe: Keyframe, frame: Frame, pyramid: list[View], relative: RelativePose) -> Alignment:
+        """Return the pose from the one by features: by corners, their flow searched from there, else photometric."""
+        T_start, matches = relative.T_current_reference, len(relative.pairs)
+        if self._matcher is not None and not keyframe.measured:
+            self._matcher.set_keyframe(keyframe.frame, frame, T_start)
+            by_corners = self._align_by_corners(keyframe, frame, T_start)
+            if by_corners is not None and self._is_accepted(keyframe, by_corners):
+                return replace(by_corners, matches=matches)
+        return replace(align(keyframe.pyramid, pyramid, T_start, self.settings), matches=matches)
+
+    def _align_by_corners(self, keyframe: Keyframe, frame: Frame, T_start: np.ndarray) -> Alignment | None:
         correspondences = None if self._matcher is None else self._matcher.match(frame)
         if correspondences is None:
             return None
-        T_start = inverse(self._T_world_last) @ keyframe.T_world_camera
         depth_sigma = self.settings.advanced.corner_depth_sigma
         T = pose_from_correspondences(correspondences, frame.camera, T_start, depth_sigma)
         if T is None:
@@ -167,8 +238,9 @@ class Tracker:
     def _is_obscured(self, sharpness: float, alignment: Alignment) -> bool:
         """Whether an image is too unsharp for its alignment to be reliable."""
         least = self.settings.min_sharpness
-        # Below half of it inliers are no evidence: smoke fits smoke.
-        return sharpness < (least if alignment.inlier_share < _DOUBTFUL_INLIER_SHARE else least / 2)
+        # Pixels of smoke fit smoke; its features match by chance alone. Below half of it neither is evidence.
+        is_evident = alignment.inlier_share >= _DOUBTFUL_INLIER_SHARE or alignment.matches >= _CLEAR_MATCHES
+        return sharpness < (least / 2 if is_evident else least)
 
     def _is_accepted(self, keyframe: Keyframe, alignment: Alignment) -> bool:
         return not self._reject_reason(keyframe, alignment)
@@ -229,7 +301,7 @@ class Tracker:
         return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._map)
 
     def _enter_map(self, number: int) -> None:
-        self._map = number
+        self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
 
 

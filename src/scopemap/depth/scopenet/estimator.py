@@ -23,6 +23,7 @@ from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
 from scopemap.io.device import cpu_threads
+from scopemap.io.inference import open_network
 
 WEIGHTS_NAME = "scopenet.onnx"
 _INPUT = "planes"
@@ -81,13 +82,8 @@ def load_network(file: Path, threads: int = 0) -> onnxruntime.InferenceSession:
 @lru_cache(maxsize=1)
 def _loaded(file: Path, threads: int, _: int) -> onnxruntime.InferenceSession:
     """Return a network, the same for runs that follow each other in one process, until its file changes."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    # Threads that wait must sleep: the tracker needs the cores.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 4  # what is wrong is raised, not printed
     try:
-        session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+        session = open_network(file.read_bytes(), threads)
         answer = _answer(session, np.zeros((PLANES, STRIDE, STRIDE), np.float32))
     except Exception as error:  # the runtime raises a dozen kinds that share no other root
         reason = " ".join(str(error).split())

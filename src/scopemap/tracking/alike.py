@@ -1,0 +1,121 @@
+"""ALIKE-t: learned local features (Zhao et al., IEEE Transactions on Multimedia 2022, arXiv 2112.02906).
+
+The network is an ONNX graph that comes with the package (`training/alike.py` writes it; the weights are its authors',
+under BSD-3-Clause: `alike.LICENSE.txt`). It gives a score per pixel and features at four scales. Keypoints are local
+maxima of the scores, moved by a soft argmax of their surroundings (differentiable keypoint detection); descriptors are
+what the head makes of the features there.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import resources
+
+import cv2
+import numpy as np
+import onnxruntime
+
+from scopemap.errors import WeightsError
+from scopemap.frame import Frame
+from scopemap.io.inference import open_network
+from scopemap.io.weights import sha256_of
+from scopemap.tracking.features import Features, points_at, usable_pixels
+
+STRIDE = 32  # of the network: both sides of its input are multiples
+_NETWORK = "alike.onnx"
+_MAPS = ["map1", "map2", "map3", "map4"]
+_MAX_FEATURES = 1000  # twice those of SIFT: where tissue is bare, the weaker half holds a third of the matches
+_RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
+_TEMPERATURE = 0.1  # of the soft argmax
+
+
+class AlikeFeatures:
+    """ALIKE-t's keypoints and descriptors (64), matched as mutual nearest neighbours."""
+
+    name, descriptor_size, max_ratio = "alike", 64, 1.0
+
+    def detect(self, frame: Frame) -> Features:
+        """Return at most 1000 features in the usable pixels of a frame, with depth where the frame has it.
+
+        Raises `WeightsError` where the installation lacks the network.
+        """
+        height, width = frame.valid.shape
+        scores, maps, head = network_answer(frame.rgb)
+        scores = scores[:height, :width]
+        pixels = _keypoints(scores, usable_pixels(frame.valid))
+        if not len(pixels):
+            return Features(
+                np.zeros((0, 2)), np.zeros((0, len(head)), np.float32), np.zeros((0, 3)), max_ratio=self.max_ratio
+            )
+        descriptors = descriptors_at(pixels, maps, head)
+        return Features(pixels, descriptors, points_at(pixels, frame.depth_mm, frame.camera), max_ratio=self.max_ratio)
+
+    def provenance(self) -> dict[str, str]:
+        """Return the name, the network's hash, and the runtime."""
+        with resources.as_file(resources.files(__package__) / _NETWORK) as file:
+            sha256 = sha256_of(file) if file.is_file() else "missing"
+        runtime = f"onnxruntime {onnxruntime.__version__}"
+        return {"features": self.name, f"sha256 {_NETWORK}": sha256, "runtime": runtime}
+
+
+def network_answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Return the network's scores, features and head for a picture (H, W, 3) uint8 of any size.
+
+    Scores (H', W') float32, 0..1, and features (16, H'/n, W'/n) at four scales n, of the picture continued at its right
+    and lower side to multiples of `STRIDE`; and the descriptor's head (64, 64).
+    """
+    height, width = rgb.shape[:2]
+    padded = np.pad(rgb, ((0, -height % STRIDE), (0, -width % STRIDE), (0, 0)), mode="edge")
+    planes = np.ascontiguousarray(padded.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
+    scores, head, *maps = _network().run(["scores", "head", *_MAPS], {"rgb": planes})
+    return scores[0, 0], [features[0] for features in maps], head
+
+
+def descriptors_at(pixels: np.ndarray, maps: list[np.ndarray], head: np.ndarray) -> np.ndarray:
+    """Return the descriptors (N, 64) float32 of length 1 at pixels (N, 2) x, y, of what `network_answer` returned."""
+    height, width = maps[0].shape[1:]
+    parts = []
+    for features in maps:
+        # The corners of all scales lie on each other, as in the network's training.
+        last = np.array([features.shape[2] - 1, features.shape[1] - 1])
+        parts.append(_sampled(features, pixels * last / [width - 1, height - 1]))
+    descriptors = np.concatenate(parts, 1) @ head.T
+    return (descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+
+
+def _sampled(features: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return features (C, h, w) at places (N, 2) x, y within them, (N, C), bilinear."""
+    corner = np.clip(np.floor(places).astype(int), 0, [features.shape[2] - 2, features.shape[1] - 2])
+    x, y = corner.T
+    a, b = (places - corner).T
+    top = (1 - a) * features[:, y, x] + a * features[:, y, x + 1]
+    bottom = (1 - a) * features[:, y + 1, x] + a * features[:, y + 1, x + 1]
+    return np.asarray(((1 - b) * top + b * bottom).T)
+
+
+def _keypoints(scores: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Return the pixels (N, 2) float64 x, y of the highest local maxima of scores (H, W) among the usable pixels."""
+    side = 2 * _RADIUS_PX + 1
+    highest = cv2.dilate(scores, np.ones((side, side), np.uint8)) == scores
+    rows, columns = np.nonzero(highest & usable)
+    chosen = np.argsort(-scores[rows, columns], kind="stable")[:_MAX_FEATURES]
+    rows, columns = rows[chosen], columns[chosen]
+    # Usable pixels are far enough from the border.
+    around = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
+    near = scores[rows[:, None, None] + around[:, None], columns[:, None, None] + around]
+    weight = np.exp((near - scores[rows, columns][:, None, None]) / _TEMPERATURE)
+    weight /= weight.sum((1, 2), keepdims=True)
+    shift = np.column_stack([weight.sum(1) @ around, weight.sum(2) @ around])
+    return np.column_stack([columns, rows]) + shift.astype(np.float64)
+
+
+@lru_cache(maxsize=1)
+def _network() -> onnxruntime.InferenceSession:
+    file = resources.files(__package__) / _NETWORK
+    try:
+        return open_network(file.read_bytes())
+    except FileNotFoundError:
+        raise WeightsError(
+            f"loading ALIKE-t: this installation lacks {file}, which the package comes with; install it again, or "
+            "choose networks.features=sift"
+        ) from None

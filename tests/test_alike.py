@@ -1,0 +1,113 @@
+"""ALIKE-t as the package runs it: against the network it is made of, and against what it gave when it was made."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import plane_scene
+import pytest
+from plane_scene import CAMERA
+
+from scopemap.errors import WeightsError
+from scopemap.frame import Frame
+from scopemap.tracking import alike
+from scopemap.tracking.alike import AlikeFeatures, descriptors_at, network_answer
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE = ROOT / "src" / "scopemap" / "tracking" / "alike.onnx"
+RGB = plane_scene.see(plane_scene.pose()).rgb
+# What it gave when the weights were converted.
+EXPECTED_PIXELS = [[25.943, 119.564], [188.489, 82.124], [121.505, 68.355]]
+EXPECTED_DESCRIPTOR = [-0.0138, -0.0882, -0.0031, 0.0730]
+
+
+def test_the_graph_is_the_network() -> None:
+    """Scores and descriptors of the graph, whose head is applied before the maps are enlarged, are the network's."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from training.alike import read_alike
+
+    network = read_alike(FILE)
+    assert sum(value.numel() for value in network.parameters()) > 70_000
+    scores, maps, head = network_answer(RGB)
+    padded = np.pad(
+        RGB, [(0, own - side) for own, side in zip(scores.shape, RGB.shape, strict=False)] + [(0, 0)], "edge"
+    )
+    with torch.no_grad():
+        expected, dense = network(torch.from_numpy(padded.transpose(2, 0, 1)[None].astype(np.float32) / 255))
+    np.testing.assert_allclose(scores, expected[0, 0], atol=1e-4)
+    assert scores.max() > 0.5
+    pixels = np.random.default_rng(0).integers(0, min(scores.shape), (200, 2))
+    found = descriptors_at(pixels.astype(float), maps, head)
+    np.testing.assert_allclose(found, dense[0].numpy()[:, pixels[:, 1], pixels[:, 0]].T, atol=1e-4)
+
+
+def test_an_exported_network_is_read_again(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from training.alike import export_alike, read_alike
+
+    network = read_alike(FILE)
+    export_alike(network, tmp_path / "again.onnx")
+    again = read_alike(tmp_path / "again.onnx").state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in network.state_dict().items())
+
+
+def test_features_are_those_of_before() -> None:
+    features = AlikeFeatures().detect(_frame(RGB))
+    assert features.descriptors.shape == (len(features.pixels), 64)
+    np.testing.assert_allclose(features.pixels[:3], EXPECTED_PIXELS, atol=0.02)
+    np.testing.assert_allclose(features.descriptors[0, :4], EXPECTED_DESCRIPTOR, atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(41, 67), (32, 32), (100, 33)])
+def test_pictures_of_any_size(size: tuple[int, int]) -> None:
+    height, width = size
+    scores, maps, _ = network_answer(RGB[:height, :width])
+    assert scores.shape == (-(-height // 32) * 32, -(-width // 32) * 32)
+    assert [features.shape[0] for features in maps] == [16] * 4
+
+
+def test_keypoints_follow_the_picture_by_less_than_a_pixel() -> None:
+    """Each second keypoint of a picture is found in one that is smaller by a tenth, where it belongs."""
+    import cv2
+
+    smaller = cv2.resize(RGB, None, fx=0.9, fy=0.9, interpolation=cv2.INTER_AREA)
+    usable = np.pad(np.ones([side - 8 for side in smaller.shape[:2]], bool), 4)
+    whole = alike._keypoints(network_answer(RGB)[0][: RGB.shape[0], : RGB.shape[1]], _inside(RGB))
+    found = alike._keypoints(network_answer(smaller)[0][: smaller.shape[0], : smaller.shape[1]], usable)
+    away = np.linalg.norm((whole[:100, None] + 0.5) * 0.9 - 0.5 - found, axis=2).min(1)
+    assert np.median(away) < 0.5
+
+
+def test_an_installation_without_the_network_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(alike, "_NETWORK", "none.onnx")
+    alike._network.cache_clear()
+    with pytest.raises(WeightsError, match=r"lacks .*none\.onnx.*networks\.features=sift"):
+        AlikeFeatures().detect(_frame(RGB))
+    assert AlikeFeatures().provenance()["sha256 none.onnx"] == "missing"
+    monkeypatch.undo()
+    alike._network.cache_clear()
+    assert len(AlikeFeatures().detect(replace(_frame(RGB), depth_mm=None)).pixels)
+
+
+def test_the_notice_comes_with_the_weights() -> None:
+    notice = (resources.files("scopemap.tracking") / "alike.LICENSE.txt").read_text(encoding="utf-8")
+    assert "BSD 3-Clause" in notice
+    assert "Copyright (c) 2022, Zhao Xiaoming" in notice
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    shipped = setup["tool"]["setuptools"]["package-data"]["scopemap"]
+    assert {"tracking/alike.onnx", "tracking/alike.LICENSE.txt"} <= set(shipped)
+
+
+def _frame(rgb: np.ndarray) -> Frame:
+    depth_mm = np.full(rgb.shape[:2], 50.0, np.float32)
+    return Frame(0, 0.0, rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm)
+
+
+def _inside(rgb: np.ndarray) -> np.ndarray:
+    return np.pad(np.ones([side - 8 for side in rgb.shape[:2]], bool), 4)
