@@ -22,6 +22,7 @@ SOURCE = Path(scopemap.config.__file__).parents[1]
 ROOT = Path(__file__).resolve().parents[1]
 # Where the settings of a group are read. A room's own `settings` object counts only in that room.
 READERS = {
+    "run": ["runner/memory.py"],
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner/*.py"],
     "mask": ["masking/*.py"],
     "depth": ["depth/*.py"],

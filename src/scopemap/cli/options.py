@@ -77,6 +77,14 @@ def parse_box(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in text.split(","))
 
 
+def parse_memory(text: str) -> int:
+    """Return MB of "2GB", "1500MB" or "1.5G"."""
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([MG])B?", text.strip(), re.IGNORECASE)
+    if not match:
+        raise SettingsError(f"cannot read the memory '{text[:_QUOTED]}': expected a size such as 2GB or 1500MB")
+    return round(float(match[1]) * (1000 if match[2].upper() == "G" else 1))
+
+
 def parse_near_far(text: str) -> tuple[float, float]:
     """Return (nearest, farthest) of "NEAR:FAR", mm."""
     try:

@@ -18,6 +18,7 @@ from scopemap.cli.options import (
     Quiet,
     SetPairs,
     parse_box,
+    parse_memory,
     parse_near_far,
     parse_settings,
     parse_size,
@@ -112,6 +113,12 @@ def run(
         str | None,
         typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
     ] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE", help="Limit of memory, such as 2GB; coarser voxels, where the surface needs more."
+        ),
+    ] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="Device of the networks.")] = None,
     settings: SetPairs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
@@ -137,6 +144,7 @@ def run(
         "input.deinterlace": deinterlace or None,
         "input.redact": [parse_box(box) for box in redact] if redact else None,
         "input.fps": fps,
+        "run.memory_mb": parse_memory(memory) if memory else None,
         "depth.backend": depth,
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
         "networks.flow": flow,

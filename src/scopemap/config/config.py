@@ -17,7 +17,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from scopemap.config.depth import DepthSettings, MapisSettings, NetworkSettings
 from scopemap.config.input import InputSettings, MaskSettings
@@ -59,10 +59,22 @@ REMOVED_VALUES = {"networks.flow": "auto", "networks.keyframe_flow": "auto", "ne
 _QUOTED = 80  # characters of a value that an error repeats
 
 
+class RunSettings(Settings):
+    """The run as a whole."""
+
+    memory_mb: int | None = Field(
+        None,
+        ge=1,
+        description="limit of memory, MB: fewer observations are adjusted, and voxels are larger, where more would be "
+        "needed; default: none",
+    )
+
+
 class Config(Settings):
     """All settings of a run."""
 
     preset: Preset = "default"
+    run: RunSettings = RunSettings()
     input: InputSettings = InputSettings()
     mask: MaskSettings = MaskSettings()
     depth: DepthSettings = DepthSettings()

@@ -356,6 +356,19 @@ class VoxelBlocks:
                 array.resize((larger, *array.shape[1:]), refcheck=False)
         return slots
 
+    def halve(self) -> None:
+        """Keep every second voxel along each axis: the field as voxels of twice the size hold it."""
+        coordinates = unpack(self.keys())
+        # In the order in which they were made, as ever.
+        keys = np.asarray(pack.py_func(*(coordinates >> 1).T))
+        old, (self.voxels, self._slots) = self.voxels, (_zeros(_FIRST_CAPACITY), {})
+        slots = self.slots(keys)
+        for octant in np.ndindex(2, 2, 2):
+            some = np.flatnonzero((coordinates & 1 == octant).all(1))
+            there = tuple(slice(BLOCK // 2 * half, BLOCK // 2 * (half + 1)) for half in octant)
+            for array, finer in zip(self.voxels, old, strict=True):
+                array[slots[some], there[0], there[1], there[2]] = finer[some + 1, ::2, ::2, ::2]
+
     def find(self, coordinates: np.ndarray) -> np.ndarray:
         """Return the (N,) int64 slots of the blocks at (N, 3) int64 block coordinates; 0 where there is no block."""
         keys = np.asarray(pack.py_func(*coordinates.T))

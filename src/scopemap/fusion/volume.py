@@ -138,6 +138,12 @@ class TsdfVolume:
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
 
+    def coarsen(self) -> None:
+        """Go on with voxels of twice the size, and twice the truncation."""
+        self._blocks.halve()
+        voxel_mm, truncation_mm = 2 * self.parameters.voxel_mm, 2 * self.parameters.truncation_mm
+        self.parameters = self.parameters._replace(voxel_mm=voxel_mm, truncation_mm=truncation_mm)
+
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
         median_level = None if self._painter is None else self._painter.median_level
@@ -202,6 +208,8 @@ class SurfaceFusion:
         """Whether frames are stored until the last one."""
         self.most_blocks: int | None = None
         """Blocks in all volumes beyond which nothing more is fused at once; None: no limit."""
+        self.coarser_beyond: int | None = None
+        """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
         self._volumes: dict[int, TsdfVolume] = {}
         self._tracked_frames = 0
 
@@ -233,7 +241,13 @@ class SurfaceFusion:
             volume = self._volumes.setdefault(map_number, TsdfVolume(self.settings))
             if self._tracked_frames % self.settings.every == 0 and not self.is_full:
                 volume.integrate(frame)
+                self._coarsen(list(self._volumes.values()))
             self._tracked_frames += 1
+
+    def _coarsen(self, volumes: list[TsdfVolume]) -> None:
+        """Make the voxels of the largest volume larger until all are within the limit."""
+        while self.coarser_beyond is not None and sum(volume.block_count for volume in volumes) > self.coarser_beyond:
+            max(volumes, key=lambda volume: volume.block_count).coarsen()
 
     def fuse(self, frames: Iterable[Frame], main_frames: Collection[int], map_number: int = 0) -> FusedSurface:
         """Return the surface of every n-th of the stored frames, all of which are consumed, or of those fused at once.
@@ -248,9 +262,13 @@ class SurfaceFusion:
         for number, frame in enumerate(frames):
             if volume is not None and number % settings.every == 0:
                 volume.integrate(frame)
+                self._coarsen([volume])
         if volume is None:
             return FusedSurface(trimesh.Trimesh(), settings, [])
         notes = [] if settings.voxel_mm is not None else [volume.parameters.description]
+        if volume.parameters.voxel_mm > (finest := choose_parameters(settings, median_mm)).voxel_mm:
+            wanted = f"{volume.parameters.voxel_mm:g} mm in place of {finest.voxel_mm:g} mm"
+            notes = [f"fusion: voxels of {wanted}, so that the surface is within run.memory_mb"]
         used = settings.model_copy(update=volume.parameters._asdict())
         return FusedSurface(volume.extract_mesh(), used, notes)
 

@@ -41,7 +41,8 @@ _DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
 _MAX_PART_ERROR = 0.05
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
-_MOST_OBSERVATIONS = 1_000_000
+MOST_OBSERVATIONS = 1_000_000
+"""Of an adjustment, unless memory is limited."""
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
 _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
 
@@ -96,6 +97,8 @@ class Backend:
         self._loops = table("loops", LOOP)
         self._all_weighed = False
         self._camera: PinholeCamera | None = None
+        self.most_observations = MOST_OBSERVATIONS
+        """About so many are adjusted."""
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
         self._pending: deque[Future[None]] = deque()
 
@@ -256,7 +259,7 @@ class Backend:
         settings, own = self.settings, [self._tracked[k] for k in chosen]
         T_world_camera = np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
         log_unit = np.log([worlds[pose.map].scale for pose in own])
-        points, observations = self._tracks.collected(chosen, _MOST_OBSERVATIONS)
+        points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)

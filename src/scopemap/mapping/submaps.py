@@ -129,6 +129,11 @@ class Mapper:
         if self._backend is not None:
             self._backend.replace_tracked(joined)
 
+    def limit(self, observations: int) -> None:
+        """Have at most about so many observations adjusted."""
+        if self._backend is not None:
+            self._backend.most_observations = observations
+
     def settle(self) -> None:
         """Wait for what was begun in other threads."""
         if self._backend is not None:

@@ -136,10 +136,13 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
     )
 
 
-def is_same_input(identity: dict[str, Any], content: dict[str, Any]) -> bool:
-    """Return whether an input with this content, as `input_checksum` has it, is the one of an identity."""
-    before = identity["input"]
-    return {name: before[name] for name in before if name != "path"} == content
+def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path) -> list[str]:
+    """Return a warning where an input with this content, as `input_checksum` has it, is not that of an identity.
+
+    identity : {}: that is not known.
+    """
+    before = {name: value for name, value in identity.get("input", content).items() if name != "path"}
+    return [] if before == content else [f"the input {path} changed while it was read: this may be a part of it"]
 
 
 def can_resume(folder: Path, identity: dict[str, Any]) -> bool:

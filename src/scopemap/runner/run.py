@@ -40,7 +40,8 @@ from scopemap.reconstruction import (
     warnings_of_frames,
 )
 from scopemap.runner.backwards import track_backwards
-from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, is_same_input
+from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
+from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import Progress, prepare
 from scopemap.runner.provenance import Limits, provenance_of, refuse_own_input
 from scopemap.runner.records import FrameRecords
@@ -88,6 +89,7 @@ def reconstruct(
     clock = Clock()
     config = config or Config()
     if out is not None:
+        memory_plan(config, sequence)  # that it is refused early
         refuse_own_input(Path(out), sequence, config)
         check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
     identity = {} if out is None else identity_of(sequence, config, tracker)
@@ -102,9 +104,7 @@ def reconstruct(
             else:
                 _track_with_checkpoints(run, observers, folder, identity)
             result = run.result(notes)
-        if folder is not None and not is_same_input(identity, result.provenance["input_content"]):
-            changed = f"the input {sequence.path} changed while it was read: this may be a part of it"
-            result.provenance["warnings"].append(changed)
+        result.provenance["warnings"] += input_changes(identity, result.provenance["input_content"], sequence.path)
         del run  # with its keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write is not None:
             progress("writing", 0, 0)
@@ -134,6 +134,7 @@ class Run:
     stopped: bool = False
     interrupted: bool = False
     records: FrameRecords = field(init=False)
+    plan: MemoryPlan = field(init=False)
     median_depths_mm: Rows = field(default_factory=lambda: Rows(np.dtype(np.float64)))
     limits: Limits = field(default_factory=Limits)
     resumed_after: int | None = None
@@ -146,6 +147,9 @@ class Run:
 
     def __post_init__(self) -> None:
         self.records = FrameRecords(self.pipeline.fusion.store.table)
+        self.plan = memory_plan(self.config, self.sequence)
+        self.pipeline.fusion.coarser_beyond = self.plan.blocks
+        self.pipeline.mapper.limit(self.plan.observations)
 
     def track(self, observers: tuple[Observer, ...], checkpoints: Checkpoints | None = None) -> None:
         """Pass all frames through the pipeline, those after the last checkpoint."""
@@ -155,7 +159,7 @@ class Run:
             self.resumed_after = last
             self.progress("resuming", len(self.records), 0)
         frames = iter(()) if complete else self._frames(last)
-        for step in overlapped(frames, self.pipeline, self.clock, states=checkpoints):
+        for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, checkpoints):
             self.take(step)
             for observer in observers:
                 self.stopped = bool(observer(step)) or self.stopped
@@ -255,7 +259,9 @@ class Run:
         agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
         provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, records)
         correction = [] if submap.correction is None else [submap.correction.description]
-        provenance["notes"] += notes + correction + ([] if depths is None else [depths.description]) + fused.notes
+        provenance["notes"] += (
+            notes + self.plan.notes + correction + ([] if depths is None else [depths.description]) + fused.notes
+        )
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
         # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.

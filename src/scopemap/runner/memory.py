@@ -1,0 +1,76 @@
+"""What a run may keep in memory at once, by `run.memory_mb`: what its buffers, adjustment and surface may hold.
+
+A run takes a base, and so much for each pixel of its pictures and each frame; the rest of the limit bounds what else
+grows: half of it the observations that are adjusted, the other half, and what these leave, the volume with its mesh.
+The figures are peaks of runs of 160x128 to 640x512 px, rounded up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scopemap.config import Config
+from scopemap.errors import InputError, SettingsError
+from scopemap.io.sequence import Sequence
+from scopemap.mapping.backend import MOST_OBSERVATIONS
+
+_MB = 1_000_000
+# Python with its libraries, the embedded network, kernels; with kernels that are compiled.
+_BASE_BYTES = 480 * _MB
+# Of the working size: in all stages, and for each frame that a stage is ahead of the next; of the input's pictures.
+_PIXEL_BYTES, _AHEAD_PIXEL_BYTES, _SOURCE_PIXEL_BYTES = 1_700, 100, 30
+_FRAME_BYTES, _OBSERVATION_BYTES, _BLOCK_BYTES = 5_000, 1_100, 45_000
+_AHEAD = (2, 1)
+_UNMEASURED = ("depth-anything", "depth-pro", "raft", "lpips")
+_LEAST_OBSERVATIONS, _LEAST_BLOCKS = 50_000, 1_000
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What a run may hold; `limited` : by a limit of memory.
+
+    ahead : frames that each stage is ahead of the next. observations : that are adjusted at once, about. blocks : of
+    8^3 voxels in all volumes; None: any number.
+    """
+
+    ahead: int = _AHEAD[0]
+    observations: int = MOST_OBSERVATIONS
+    blocks: int | None = None
+
+    @property
+    def notes(self) -> list[str]:
+        """What was chosen, in words; [] without a limit."""
+        if self.blocks is None:
+            return []
+        chosen = f"{self.observations} observations adjusted, {self.blocks} blocks of 8^3 voxels"
+        return [f"memory: at most {chosen}, stages {self.ahead} frame(s) ahead (run.memory_mb)"]
+
+
+def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:
+    """Return what a run over a sequence may hold.
+
+    Raises `InputError` where its pictures alone take more, `SettingsError` for networks whose memory is not known.
+    """
+    memory_mb, networks = config.run.memory_mb, config.networks
+    if memory_mb is None:
+        return MemoryPlan()
+    used = (config.depth.backend, config.depth.anchor, networks.flow, networks.keyframe_flow, networks.perceptual)
+    if unknown := sorted({name for name in used if name.startswith(_UNMEASURED)}):
+        raise SettingsError(
+            f"--memory (run.memory_mb) cannot be held with {', '.join(unknown)}: what PyTorch takes is not known"
+        )
+    camera, source = sequence.camera, sequence.source
+    pixels, frames = camera.width * camera.height, sequence.count or 0
+    fixed = _BASE_BYTES + _PIXEL_BYTES * pixels + _SOURCE_PIXEL_BYTES * source.width * source.height
+    fixed += _FRAME_BYTES * frames
+    least = 2 * max(_LEAST_OBSERVATIONS * _OBSERVATION_BYTES, _LEAST_BLOCKS * _BLOCK_BYTES)
+    for ahead in _AHEAD:
+        left = memory_mb * _MB - fixed - ahead * _AHEAD_PIXEL_BYTES * pixels
+        if left >= least:
+            observations = min(left // 2 // _OBSERVATION_BYTES, MOST_OBSERVATIONS)
+            return MemoryPlan(ahead, observations, (left - observations * _OBSERVATION_BYTES) // _BLOCK_BYTES)
+    needed_mb = -(-(fixed + _AHEAD[-1] * _AHEAD_PIXEL_BYTES * pixels + least) // _MB)
+    raise InputError(
+        f"{memory_mb} MB of memory (--memory) are too few for {sequence.path}: {needed_mb} MB are the least for "
+        f"{frames or 'its'} frames of {camera.width}x{camera.height} px; a smaller --size needs less"
+    )

@@ -1,0 +1,135 @@
+"""`--memory`: what a run may hold, a refusal that names the least, and a surface of coarser voxels that is as true."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from front_door import call, refused
+from test_fusion import all_around, sphere_frame
+from tiny_phantom import SIZE, with_true_depth, write_tiny
+
+from scopemap import open_sequence, reconstruct
+from scopemap.cli.options import parse_memory
+from scopemap.config import Config, FusionSettings
+from scopemap.errors import InputError, SettingsError
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.tsdf import VoxelBlocks, pack
+from scopemap.fusion.volume import SurfaceFusion
+from scopemap.mapping.backend import MOST_OBSERVATIONS
+from scopemap.runner.memory import MemoryPlan, memory_plan
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("phantom"))
+
+
+def _plan(folder: Path, memory_mb: int | None, size: tuple[int, int] = SIZE, **settings: object) -> MemoryPlan:
+    given = {"run.memory_mb": memory_mb} | {key.replace("__", "."): value for key, value in settings.items()}
+    return memory_plan(Config.load(settings=given), open_sequence(folder, size=size))
+
+
+@pytest.mark.parametrize(("text", "mb"), [("2GB", 2000), ("1500MB", 1500), ("0.7 g", 700)])
+def test_sizes_are_read(text: str, mb: int) -> None:
+    assert parse_memory(text) == mb
+
+
+@pytest.mark.parametrize("text", ["2", "GB", "-1GB", "1e9GB", "2TB"])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    with pytest.raises(SettingsError, match="expected a size such as 2GB"):
+        parse_memory(text)
+
+
+def test_more_memory_is_more_of_everything_up_to_what_is_used_without_a_limit(folder: Path) -> None:
+    assert _plan(folder, None) == MemoryPlan(blocks=None)
+    plans = [_plan(folder, memory_mb) for memory_mb in (800, 1000, 4000)]
+    assert [plan.blocks for plan in plans] == sorted({plan.blocks for plan in plans})
+    assert plans[0].observations < plans[2].observations == MOST_OBSERVATIONS
+    large = _plan(folder, 4000, (640, 512))
+    assert large.blocks is not None
+    assert plans[2].blocks is not None
+    assert large.blocks < plans[2].blocks
+
+
+def test_too_little_is_refused_with_the_least_that_works(folder: Path) -> None:
+    with pytest.raises(InputError, match="MB are the least for 9 frames of 160x128 px") as caught:
+        _plan(folder, 100)
+    least = int(re.search(r"(\d+) MB are the least", str(caught.value))[1])  # type: ignore[index]
+    assert _plan(folder, least).ahead == 1
+    with pytest.raises(InputError, match=f"{least} MB are the least"):
+        _plan(folder, least - 1)
+
+
+def test_networks_whose_memory_is_not_known_are_refused(folder: Path) -> None:
+    with pytest.raises(SettingsError, match=r"cannot be held with depth-anything, raft-small"):
+        _plan(folder, 4000, depth__backend="depth-anything", networks__flow="raft-small")
+
+
+def test_a_halved_field_holds_every_second_voxel() -> None:
+    blocks, rng = VoxelBlocks(), np.random.default_rng(0)
+    keys = np.unique(np.asarray(pack.py_func(*rng.integers(-20, 20, (500, 3)).T)))
+    slots = blocks.slots(keys)
+    for array in blocks.voxels:
+        array[slots] = rng.random(array[slots].shape)
+    before = blocks.dense(np.array([-20, -20, -20]), 40)
+    blocks.halve()
+    for finer, coarser in zip(before, blocks.dense(np.array([-10, -10, -10]), 20), strict=True):
+        np.testing.assert_array_equal(finer[::2, ::2, ::2], coarser)
+
+
+@pytest.mark.parametrize("at_end", [True, False])
+def test_voxels_grow_until_the_surface_is_within_the_limit(at_end: bool, tmp_path: Path) -> None:
+    settings = FusionSettings(voxel_mm=0.5, max_depth_mm=150.0)
+    frames = [replace(sphere_frame(T, 30.0), index=n) for n, T in enumerate(all_around())]
+    meshes, counts = [], []
+    for limit in (None, 2500, 200):
+        fusion = SurfaceFusion(settings, FrameStore(tmp_path), corrected=at_end)
+        fusion.coarser_beyond = limit
+        for frame in frames:
+            fusion.put(frame)
+        found = fusion.fuse(fusion.store.frames(), {0})
+        meshes.append(found.mesh)
+        counts.append((found.settings.voxel_mm, found.settings.truncation_mm, len(found.notes)))
+    assert counts == [(0.5, 2.5, 0), (1.0, 5.0, 1), (4.0, 20.0, 1)] or counts[1][0] == 1.0 < counts[2][0]
+    assert len(meshes[0].faces) > 3 * len(meshes[1].faces) > 9 * len(meshes[2].faces)
+    for mesh, tolerance_mm in zip(meshes, (0.1, 0.2, 1.5), strict=True):
+        radius_mm = np.linalg.norm(mesh.vertices, axis=1)
+        assert np.median(np.abs(radius_mm - 30.0)) < tolerance_mm
+
+
+def test_a_limited_run_says_what_was_chosen_and_its_settings_repeat_it(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("scopemap.runner.memory._BLOCK_BYTES", 500_000)
+    monkeypatch.setattr("scopemap.runner.memory._LEAST_BLOCKS", 100)
+    ask = ("run", folder, "--depth", f"files:{folder}")
+    assert call(*ask, "--out", tmp_path / "free") == 0
+    free = capfd.readouterr().out
+    assert "note: memory" not in free
+    assert call(*ask, "--out", tmp_path / "limited", "--memory", "800MB") == 0
+    said = capfd.readouterr().out
+    assert re.search(r"note: memory: at most \d+ observations adjusted, \d+ blocks of 8\^3 voxels", said)
+    assert re.search(r"note: fusion: voxels of [\d.]+ mm in place of [\d.]+ mm, so that the surface is within", said)
+    assert "memory_mb = 800" in (tmp_path / "limited" / "config.toml").read_text()
+    faces = [len(trimesh.load_mesh(tmp_path / name / "mesh.ply").faces) for name in ("free", "limited")]
+    assert faces[0] > 2 * faces[1] > 200
+
+
+def test_the_command_refuses_before_it_works(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert "MB are the least" in refused(capfd, "run", folder, "--out", tmp_path / "out", "--memory", "100MB")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_limited_run_at_once_is_limited_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.runner.memory._BLOCK_BYTES", 500_000)
+    monkeypatch.setattr("scopemap.runner.memory._LEAST_BLOCKS", 100)
+    config = with_true_depth(folder, "realtime", run__memory_mb=800, fusion__voxel_mm=0.4)
+    result = reconstruct(open_sequence(folder), config)
+    assert result.config.fusion.voxel_mm is not None
+    assert result.config.fusion.voxel_mm > 0.4
+    assert any("in place of 0.4 mm" in note for note in result.provenance["notes"])
