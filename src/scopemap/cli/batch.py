@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from scopemap.io.inputs import NamedInput
     from scopemap.report.batch_page import BatchRow
     from scopemap.runner.batch import Video
+    from scopemap.runner.engines import Engine
     from scopemap.runner.forecast import Forecast
 
 _COLUMNS = ("name", "preset", "config", "dataset", "camera", "fov", "frames", "size")
@@ -41,9 +42,9 @@ def batch(
         list[str],
         typer.Argument(
             metavar="INPUT...",
-            help="Videos, folders of videos, patterns in quotes, lists (.txt, one a line), tables (.csv with a column "
-            "input; further columns are settings: name, preset, config, dataset, camera, fov, frames, size, or any of "
-            "--set).",
+            help="Videos, folders of videos, patterns in quotes, addresses (s3://bucket/folder and others, extra "
+            "cluster), lists (.txt, one a line), tables (.csv with a column input; further columns are settings: name, "
+            "preset, config, dataset, camera, fov, frames, size, or any of --set).",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results, one folder per video.")],
@@ -66,6 +67,19 @@ def batch(
     retries: Annotated[
         int, typer.Option(min=0, metavar="N", help="Further attempts where the process of a video dies.")
     ] = 1,
+    engine: Annotated[
+        Literal["processes", "ray", "slurm"],
+        typer.Option(help="What runs the videos: processes of this machine; actors on Ray; jobs of Slurm."),
+    ] = "processes",
+    address: Annotated[
+        str | None, typer.Option(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
+    ] = None,
+    cores: Annotated[int | None, typer.Option(min=1, metavar="N", help="Ray, Slurm: of each worker (2).")] = None,
+    memory: Annotated[float | None, typer.Option(min=0.1, metavar="GB", help="Ray, Slurm: of each worker (4).")] = None,
+    gpus: Annotated[
+        float | None,
+        typer.Option(min=0, help="Ray, Slurm: of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
+    ] = None,
     part: Annotated[str | None, typer.Option(metavar="K/N", help="Only the K-th of N parts, for job arrays.")] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Run a second of each video, and print what all of them will take.")
@@ -89,10 +103,14 @@ def batch(
     from scopemap.runner.processes import ProcessLimits, usable_cores
 
     videos = videos_of(named_inputs(inputs), shared, parse_settings(settings or []))
+    if workers is None and (engine == "slurm" or address):
+        raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
+    given = {"address": address, "cores": cores, "memory": memory, "gpus": gpus}
+    run = engine_of(engine, given, videos, out)
     with _ending_by_sigterm():
         if dry_run:
-            _forecast(videos[of_part[0] - 1 :: of_part[1]], out, limits, as_json=as_json, quiet=quiet)
+            _forecast(videos[of_part[0] - 1 :: of_part[1]], out, limits, run, as_json=as_json, quiet=quiet)
             return
         from scopemap.report.batch_page import counts_of
         from scopemap.runner.batch import INDEX, TABLE, run_batch
@@ -102,7 +120,7 @@ def batch(
             def told(row: BatchRow, left: int) -> None:
                 show(row.folder, _row_line(row), left, row.status == "started")
 
-            rows = run_batch(videos, out, limits, overwrite=overwrite, part=of_part, told=told)
+            rows = run_batch(videos, out, limits, engine=run, overwrite=overwrite, part=of_part, told=told)
     if as_json:
         print_json([asdict(row) for row in rows])
     elif not quiet:
@@ -174,11 +192,45 @@ def _number(text: str) -> float:
         raise SettingsError(f"cannot read the field of view '{text[:80]}': expected degrees such as 90") from None
 
 
-def _forecast(videos: list[Video], out: Path, limits: Any, *, as_json: bool, quiet: bool) -> None:
+def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) -> Engine:
+    """Return the engine of a name.
+
+    given : the values of its options, None where one is not given. Raises `SettingsError` for those of another engine.
+    """
+    of_cluster = ("cores", "memory", "gpus")
+    takes = {"processes": (), "ray": ("address", *of_cluster), "slurm": of_cluster}
+    for option in (option for option, value in given.items() if value is not None and option not in takes[name]):
+        engines = " or ".join(engine for engine, options in takes.items() if option in options)
+        raise SettingsError(f"--{option} is an option of --engine {engines}")
+    from scopemap.runner.engines import WorkerNeeds
+    from scopemap.runner.processes import run_in_processes
+
+    if name == "processes":
+        return run_in_processes
+    by_default, gpus = WorkerNeeds(), given["gpus"]
+    if gpus is None:
+        gpus = float(any(video.config.networks.device.startswith("cuda") for video in videos))
+    needs = WorkerNeeds(given["cores"] or by_default.cores, given["memory"] or by_default.memory_gb, gpus)
+    if name == "ray":
+        from scopemap.runner.ray_engine import RayEngine
+
+        return RayEngine(needs, given["address"])
+    if gpus % 1:
+        raise SettingsError(f"Slurm gives whole GPUs: --gpus {gpus:g}")
+    from scopemap.runner.slurm_engine import SlurmEngine
+
+    return SlurmEngine(out.absolute(), needs)
+
+
+def _forecast(videos: list[Video], out: Path, limits: Any, engine: Engine, *, as_json: bool, quiet: bool) -> None:
     from scopemap.runner.forecast import forecast
 
     with _lines(silent=quiet or as_json) as show:
-        found = forecast(videos, out, limits, lambda one, left: show(one.name, _forecast_line(one), left, False))
+
+        def told(one: Forecast, left: int) -> None:
+            show(one.name, _forecast_line(one), left, False)
+
+        found = forecast(videos, out, limits, told, engine)
     if as_json:
         print_json([asdict(one) for one in found])
     elif not quiet:

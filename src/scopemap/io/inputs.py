@@ -1,4 +1,4 @@
-"""Many inputs from a few texts: files, folders of videos, patterns, lists and tables."""
+"""Many inputs from a few texts: files, folders of videos, addresses, patterns, lists and tables."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from scopemap.errors import InputError, check_bytes, reporting
+from scopemap.io.addresses import RemoteFile, is_address, remote_files
 from scopemap.io.images import ImageFolder
 from scopemap.io.opening import DATASETS, VIDEO_ENDINGS
 
@@ -25,7 +26,7 @@ _DEEPEST = 8
 class NamedInput:
     """An input, and the columns of the table that names it, without empty cells; {} where no table does."""
 
-    path: Path
+    path: Path | RemoteFile
     columns: dict[str, str] = field(default_factory=dict)
 
 
@@ -33,10 +34,11 @@ def named_inputs(texts: Sequence[str]) -> list[NamedInput]:
     """Return what texts name, in order, each input with the same columns once.
 
     A text is the path of an input; a folder, of which each video below it is an input, and each data set or folder of
-    images; a pattern (`*`, `**`); a list, *.txt, with one such text a line; or a table, *.csv, with such a text in its
-    column `input`. Texts in a list or a table are relative to its folder, and so are its cells `camera` and `config`.
-    What does not exist is an input, too, and fails when it is opened. Raises `InputError` for a list or table that
-    cannot be read, and where nothing is named.
+    images; a pattern (`*`, `**`); an address that fsspec reads (s3://...) of a video, a folder or a pattern; a list,
+    *.txt, with one such text a line; or a table, *.csv, with such a text in its column `input`. Paths in a list or a
+    table are relative to its folder, and so are its cells `camera` and `config`. What does not exist is an input, too,
+    and fails when it is opened. Raises `InputError` for a list, table or address that cannot be read, and where nothing
+    is named.
     """
     found = [named for text in texts for named in _of_text(text)]
     once = {(str(named.path), *sorted(named.columns.items())): named for named in found}
@@ -49,7 +51,7 @@ def _of_text(text: str) -> Iterator[NamedInput]:
     file = Path(text)
     ending = file.suffix.lower()
     if ending not in (LIST, TABLE) or not file.is_file():
-        yield from map(NamedInput, _paths(file))
+        yield from map(NamedInput, _named(text, Path()))
         return
     with reporting(f"cannot read {file}"):
         check_bytes(str(file), file.stat().st_size, _MOST_BYTES)
@@ -58,7 +60,7 @@ def _of_text(text: str) -> Iterator[NamedInput]:
         for path, columns in named:
             beside = {key: str(file.parent / cell) for key, cell in columns.items() if key in _FILES}
             columns |= {key: cell for key, cell in beside.items() if Path(cell).is_file()}
-            for one in _paths(file.parent / path):
+            for one in _named(path, file.parent):
                 yield NamedInput(one, columns)
 
 
@@ -78,6 +80,11 @@ def _of_table(file: Path, lines: list[str]) -> list[tuple[str, dict[str, str]]]:
         if path := cells.pop(_COLUMN, ""):
             named.append((path, cells))
     return named
+
+
+def _named(text: str, folder: Path) -> Sequence[Path | RemoteFile]:
+    """Return the inputs that an address names, or a path or pattern relative to a folder."""
+    return remote_files(text, _ENDINGS) if is_address(text) else _paths(folder / text)
 
 
 def _paths(path: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 """Many videos: each in a folder of its own, with a record of what became of it.
 
 OUT/NAME/ (the result)    OUT/records/NAME.json    OUT/logs/NAME.txt (what its process printed)    OUT/batch.csv
+OUT/.fetched/NAME/ (a video that came from an address, while it is run)
 """
 
 from __future__ import annotations
@@ -9,17 +10,19 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from scopemap.config import Config
 from scopemap.errors import reporting
+from scopemap.io.addresses import RemoteFile
 from scopemap.io.inputs import NamedInput
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence as Frames
@@ -27,10 +30,12 @@ from scopemap.report.batch_page import BatchRow, write_batch_page, write_batch_t
 from scopemap.report.kept_run import read_run
 from scopemap.report.page import write_report
 from scopemap.report.verdict import frames_in_result, verdict
+from scopemap.runner.engines import Engine
 from scopemap.runner.processes import Outcome, ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
 
 INDEX, TABLE, RECORDS, LOGS = "index.html", "batch.csv", "records", "logs"
+_FETCHED = ".fetched"
 _LONGEST_NAME = 80
 _SECONDS_BETWEEN_TABLES = 10.0
 _OTHER = "its folder holds a result of another input or of other settings: name another --out, or give --overwrite"
@@ -40,7 +45,7 @@ _OTHER = "its folder holds a result of another input or of other settings: name 
 class Video:
     """One input of a batch: the name of its folder, and what `open_sequence` and `reconstruct` take."""
 
-    path: Path
+    path: Path | RemoteFile
     name: str
     config: Config
     dataset: str | None = None
@@ -49,8 +54,24 @@ class Video:
     size: tuple[int, int] | None = None
     frames: slice | None = None
 
+    def fetched(self, out: Path) -> Video:
+        """Return it as it can be opened: from an address, it is copied into the folder of the batch first.
+
+        The place is the same each time, as a run is known by it that is resumed. Raises what `RemoteFile.fetch` does.
+        """
+        if isinstance(self.path, Path):
+            return self
+        return replace(self, path=self.path.fetch(out / _FETCHED / self.name))
+
+    def forget_fetched(self, out: Path) -> None:
+        """Remove what `fetched` has copied."""
+        shutil.rmtree(out / _FETCHED / self.name, ignore_errors=True)
+        with suppress(OSError):  # those of others are there
+            (out / _FETCHED).rmdir()
+
     def open(self, frames: slice | None = None) -> Frames:
         """Return its frames, by default those that are chosen. Raises what `open_sequence` does."""
+        assert isinstance(self.path, Path)
         return open_sequence(
             self.path,
             dataset=self.dataset,
@@ -64,10 +85,11 @@ class Video:
     def key(self) -> str:
         """Return what tells this input with these settings from others, 40 hexadecimal digits.
 
-        An input is known by its path, size and time of change; a folder by those of what is in it.
+        An input is known by its path, size and time of change; a folder by those of what is in it; what is at an
+        address by that, its size and its ETag or time of change.
         """
         choice = [self.dataset, self.camera, self.fov_deg, self.size, str(self.frames), self.config.toml()]
-        return _digest([str(self.path.absolute()), _state(self.path), choice])[:40]
+        return _digest([_place(self.path), _state(self.path), choice])[:40]
 
 
 @dataclass(frozen=True)
@@ -84,7 +106,7 @@ def folder_names(inputs: Sequence[NamedInput]) -> list[str]:
     name of the folder around it, else that with digits of a hash.
     """
     plain = [_safe(one.columns.get("name") or _stem(one.path)) for one in inputs]
-    longer = [_safe(f"{one.path.absolute().parent.name}_{_stem(one.path)}") for one in inputs]
+    longer = [_safe(f"{Path(_place(one.path)).parent.name}_{_stem(one.path)}") for one in inputs]
     count = Counter(name.lower() for name in [*plain, INDEX, TABLE, RECORDS, LOGS])
     of_longer = Counter(name.lower() for name in longer) + count
     names = []
@@ -94,7 +116,7 @@ def folder_names(inputs: Sequence[NamedInput]) -> list[str]:
         elif of_longer[long.lower()] == 1:
             names.append(long)
         else:
-            names.append(f"{long}-{_digest([str(one.path.absolute()), sorted(one.columns.items())])[:12]}")
+            names.append(f"{long}-{_digest([_place(one.path), sorted(one.columns.items())])[:12]}")
     return names
 
 
@@ -103,15 +125,16 @@ def run_batch(
     out: Path,
     limits: ProcessLimits,
     *,
+    engine: Engine = run_in_processes,
     overwrite: bool = False,
     part: tuple[int, int] = (1, 1),
     told: Callable[[BatchRow, int], None] = lambda row, left: None,
 ) -> list[BatchRow]:
-    """Run videos in processes and return a row for each; one whose folder holds its result already is not run again.
+    """Run videos and return a row for each; one whose folder holds its result already is not run again.
 
-    part : (k, n): of n parts only the k-th. told : called with the row of a video that begins or ends, and how many
-    are left. Writes batch.csv and index.html of all videos, and with a part a table of its own, too. Raises
-    `InputError` where `out` cannot be written.
+    engine : what runs them. part : (k, n): of n parts only the k-th. told : called with the row of a video that begins
+    or ends, and how many are left. Writes batch.csv and index.html of all videos, and with a part a table of its own,
+    too. Raises `InputError` where `out` cannot be written, and what the engine does.
     """
     with reporting(f"cannot write a batch to {out}"):
         for folder in (RECORDS, LOGS):
@@ -134,14 +157,17 @@ def run_batch(
 
     tasks = [_Task(video, out.absolute(), rows[video.name].before) for video in due]
     try:
-        with closing(run_in_processes(_run, tasks, limits, begin)) as ended:
+        with closing(engine(_run, tasks, limits, begin)) as ended:
             for number, outcome in ended:
                 left -= 1
+                due[number].forget_fetched(out)
                 put(_row_after(rows[due[number].name], outcome, out))
                 if time.monotonic() - written_s > _SECONDS_BETWEEN_TABLES:
                     _write_part(list(rows.values()), out, part)
                     written_s = time.monotonic()
     finally:
+        for video in due:
+            video.forget_fetched(out)
         _write_part(list(rows.values()), out, part)
         _write_overview(videos, rows, out)
     return list(rows.values())
@@ -152,12 +178,13 @@ def _run(task: _Task) -> dict[str, Any]:
     video, folder = task.video, task.out / task.video.name
     log_to(task.out / LOGS / f"{video.name}.txt")
     if _written(folder) in (None, task.before):
-        reconstruct_with_report(video.open(), video.config, folder, overwrite=task.before is not None)
+        frames = video.fetched(task.out).open()
+        reconstruct_with_report(frames, video.config, folder, overwrite=task.before is not None)
     else:  # the process ended while it wrote the report
         write_report(folder)
     run = read_run(folder)
-    found, (tracked, frames) = verdict(run), frames_in_result(run)
-    return {"verdict": found.word, "sentence": found.sentence, "tracked": tracked, "frames": frames}
+    found, (tracked, of) = verdict(run), frames_in_result(run)
+    return {"verdict": found.word, "sentence": found.sentence, "tracked": tracked, "frames": of}
 
 
 def log_to(file: Path) -> None:
@@ -235,8 +262,14 @@ def _written(folder: Path) -> int | None:
         return None
 
 
-def _state(path: Path) -> list[Any]:
+def _place(path: Path | RemoteFile) -> str:
+    return path.address if isinstance(path, RemoteFile) else str(path.absolute())
+
+
+def _state(path: Path | RemoteFile) -> list[Any]:
     """Return what changes with an input, of a file or of what is in a folder; [] for what is not there."""
+    if isinstance(path, RemoteFile):
+        return [path.size, path.version]
     try:
         if not path.is_dir():
             return [path.stat().st_size, int(path.stat().st_mtime)]
@@ -251,7 +284,9 @@ def _digest(facts: list[Any]) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
-def _stem(path: Path) -> str:
+def _stem(path: Path | RemoteFile) -> str:
+    if isinstance(path, RemoteFile):
+        return Path(path.name).stem
     return path.absolute().name if path.is_dir() else path.stem
 
 

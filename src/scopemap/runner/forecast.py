@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from scopemap.errors import reporting
+from scopemap.io.addresses import RemoteFile
 from scopemap.runner.batch import LOGS, Video, log_to
+from scopemap.runner.engines import Engine
 from scopemap.runner.processes import ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
 
@@ -50,10 +52,12 @@ def forecast(
     out: Path,
     limits: ProcessLimits,
     told: Callable[[Forecast, int], None] = lambda one, left: None,
+    engine: Engine = run_in_processes,
 ) -> list[Forecast]:
     """Return the forecast of each video; what is written meanwhile is removed.
 
-    told : called with each as it is found, and how many are left. Raises `InputError` where `out` cannot be written.
+    engine : what runs their first seconds. told : called with each as it is found, and how many are left. Raises
+    `InputError` where `out` cannot be written, and what the engine does.
     """
     is_new, found = not out.exists(), dict[int, Forecast]()
     with reporting(f"cannot write to {out}"):
@@ -61,8 +65,9 @@ def forecast(
         folder = Path(tempfile.mkdtemp(prefix=".dry-run-", dir=out)).absolute()
         (folder / LOGS).mkdir()
     try:
-        for number, outcome in run_in_processes(_measure, [_Part(video, folder) for video in videos], limits):
+        for number, outcome in engine(_measure, [_Part(video, folder) for video in videos], limits):
             video = videos[number]
+            video.forget_fetched(folder)
             known = outcome.value or {}
             found[number] = Forecast(video.name, outcome.fault, input_bytes=_bytes(video.path), **known)
             told(found[number], len(videos) - len(found))
@@ -76,8 +81,9 @@ def forecast(
 def _measure(part: _Part) -> dict[str, Any]:
     """Run the first second of a video, and return what its forecast says."""
     log_to(part.out / LOGS / f"{part.video.name}.txt")
-    whole, folder = part.video.open(), part.out / part.video.name
-    rate_hz, chosen = whole.source.rate_hz, part.video.frames or slice(None)
+    video, folder = part.video.fetched(part.out), part.out / part.video.name
+    whole = video.open()
+    rate_hz, chosen = whole.source.rate_hz, video.frames or slice(None)
     step = chosen.step or 1
     used = min(max(math.ceil(rate_hz / step), _FEWEST), _MOST)
     if whole.source.count is not None:
@@ -91,9 +97,9 @@ def _measure(part: _Part) -> dict[str, Any]:
         if doing == _REPORTING:
             written[0] = time.perf_counter()
 
-    first = part.video.open(slice(start, min(stop, start + used * step), step))
+    first = video.open(slice(start, min(stop, start + used * step), step))
     seen = (lambda step: times.append(time.perf_counter()),)
-    reconstruct_with_report(first, part.video.config, folder, observers=seen, progress=progress)
+    reconstruct_with_report(first, video.config, folder, observers=seen, progress=progress)
     ended, count = time.perf_counter(), whole.count
     if count is None:
         return {}
@@ -108,8 +114,10 @@ def _measure(part: _Part) -> dict[str, Any]:
     }
 
 
-def _bytes(path: Path) -> int:
+def _bytes(path: Path | RemoteFile) -> int:
     """Return the size of a file, or of all files below a folder; 0 for what is not there."""
+    if isinstance(path, RemoteFile):
+        return path.size or 0
     try:
         files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
         return sum(file.stat().st_size for file in files)

@@ -23,7 +23,9 @@ import cv2
 
 from scopemap.errors import ScopemapError
 
-_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""Variables of the environment that bound the threads of a process."""
+
 _PROCESSES = multiprocessing.get_context("spawn")  # forked, the threads of the networks would be missing
 
 
@@ -68,7 +70,7 @@ def run_in_processes(
     try:
         while waiting or busy:
             while waiting and len(busy) < limits.processes:
-                worker = idle.pop() if idle else _Worker(call, _threads(limits.processes))
+                worker = idle.pop() if idle else _Worker(call, threads_of_each(limits.processes))
                 number, before = waiting.popleft()
                 started(number)
                 worker.begin(number, tasks[number], before)
@@ -92,7 +94,8 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _threads(processes: int) -> int:
+def threads_of_each(processes: int) -> int:
+    """Return how many threads each of so many processes may use that share this machine."""
     return max(1, usable_cores() // processes)
 
 
@@ -114,7 +117,7 @@ class _Worker:
         self.number, self.begun = 0, 0.0
         self._before = Outcome(None, "", 0.0, 0)
         self.process = _PROCESSES.Process(target=_serve, args=(theirs, call, threads), daemon=True)
-        with _environment({name: str(threads) for name in _THREADS}):
+        with _environment({name: str(threads) for name in THREADS}):
             self.process.start()
         theirs.close()
 
@@ -154,10 +157,10 @@ def _serve(connection: Connection, call: Callable[[Any], Any], threads: int) -> 
     cv2.setNumThreads(threads)
     with suppress(EOFError):
         while True:
-            connection.send(_attempt(call, connection.recv()))
+            connection.send(attempt(call, connection.recv()))
 
 
-def _attempt(call: Callable[[Any], Any], task: Any) -> tuple[Any, str, bool]:
+def attempt(call: Callable[[Any], Any], task: Any) -> tuple[Any, str, bool]:
     """Return what a task returns, "" or why it failed, and whether another attempt may help."""
     try:
         return call(task), "", True
