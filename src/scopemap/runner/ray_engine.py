@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -110,7 +111,7 @@ class RayEngine:
                 with reporting(f"cannot {'start Ray' if place is None else f'connect to Ray at {place}'}"):
                     _check_reached(place)
                     options = own if place is None else {}
-                    ray.init(place or "local", log_to_driver=False, logging_level="ERROR", **options)
+                    ray.init(place or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(signal.SIGTERM, handler)  # Ray's own would replace that of the command
                 yield ray
