@@ -50,11 +50,15 @@ def test_folders_files_and_patterns_are_listed(store: fsspec.AbstractFileSystem,
 
 def test_a_file_is_fetched_as_it_was_listed(store: fsspec.AbstractFileSystem, tmp_path: Path) -> None:
     (one,) = remote_files("memory://archive/a.mp4", ())
-    assert one.fetch(tmp_path / "new").read_bytes() == b"/archive/a.mp4"
+    copies = [one.fetch(tmp_path / name) for name in ("new", "again")]
+    assert {copy.read_bytes() for copy in copies} == {b"/archive/a.mp4"}
+    assert len({copy.stat().st_mtime_ns for copy in copies}) == 1
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.mp4"]
     store.pipe_file("/archive/a.mp4", b"another")
     with pytest.raises(InputError, match="has changed since it was listed"):
         one.fetch(tmp_path / "new")
+    (other,) = remote_files("memory://archive/a.mp4", ())
+    assert other.fetch(tmp_path / "new").stat().st_mtime_ns != copies[1].stat().st_mtime_ns
     with pytest.raises(InputError, match=r"fetching memory://archive/gone\.mp4"):
         RemoteFile("memory://archive/gone.mp4").fetch(tmp_path)
 
