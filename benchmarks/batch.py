@@ -161,7 +161,7 @@ def ray_cluster() -> Any:
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **given})
     try:
         nodes = [cluster.add_node(num_cpus=1, memory=2 << 30, **given) for _ in range(2)]
-        options = ("--engine", "ray", "--address", cluster.address, "--cores", "1", "--memory", "1")
+        options = ("--engine", "ray", "--address", cluster.address, "--worker-cores", "1", "--worker-memory", "1GB")
         yield options, lambda: nodes[0].kill_raylet(check_alive=False)
     finally:
         cluster.shutdown()

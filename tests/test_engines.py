@@ -125,10 +125,10 @@ def test_a_disturbed_batch_has_the_results_of_single_runs(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--cores", 2), "--cores is an option of --engine ray or slurm"),
+        (("--worker-cores", 2), "--worker-cores is an option of --engine ray or slurm"),
         (("--engine", "slurm", "--address", "auto", "--workers", 2), "--address is an option of --engine ray"),
         (("--engine", "slurm"), "Give --workers"),
-        (("--engine", "slurm", "--workers", 2, "--gpus", 0.5), "Slurm gives whole GPUs"),
+        (("--engine", "slurm", "--workers", 2, "--worker-gpus", 0.5), "Slurm gives whole GPUs"),
         (("--engine", "slurm", "--workers", 2), "limit the seconds for one video (--time-limit)"),
         (("--engine", "ray", "--address", "127.0.0.1:1", "--workers", 1), "cannot connect to Ray at 127.0.0.1:1"),
     ],

@@ -20,6 +20,7 @@ from scopemap.cli.options import (
     Dataset,
     Quiet,
     SetPairs,
+    parse_memory,
     parse_settings,
     parse_size,
     parse_slice,
@@ -74,11 +75,15 @@ def batch(
     address: Annotated[
         str | None, typer.Option(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
     ] = None,
-    cores: Annotated[int | None, typer.Option(min=1, metavar="N", help="Ray, Slurm: of each worker (2).")] = None,
-    memory: Annotated[float | None, typer.Option(min=0.1, metavar="GB", help="Ray, Slurm: of each worker (4).")] = None,
-    gpus: Annotated[
+    worker_cores: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Ray, Slurm: cores of each worker (2).")
+    ] = None,
+    worker_memory: Annotated[
+        str | None, typer.Option(metavar="SIZE", help="Ray, Slurm: memory that each worker is given (4GB).")
+    ] = None,
+    worker_gpus: Annotated[
         float | None,
-        typer.Option(min=0, help="Ray, Slurm: of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
+        typer.Option(min=0, help="Ray, Slurm: GPUs of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
     ] = None,
     part: Annotated[str | None, typer.Option(metavar="K/N", help="Only the K-th of N parts, for job arrays.")] = None,
     dry_run: Annotated[
@@ -106,7 +111,8 @@ def batch(
     if workers is None and (engine == "slurm" or address):
         raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
-    given = {"address": address, "cores": cores, "memory": memory, "gpus": gpus}
+    given = {"address": address, "worker-cores": worker_cores, "worker-memory": worker_memory}
+    given |= {"worker-gpus": worker_gpus}
     run = engine_of(engine, given, videos, out)
     with _ending_by_sigterm():
         if dry_run:
@@ -197,7 +203,7 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) 
 
     given : the values of its options, None where one is not given. Raises `SettingsError` for those of another engine.
     """
-    of_cluster = ("cores", "memory", "gpus")
+    of_cluster = ("worker-cores", "worker-memory", "worker-gpus")
     takes = {"processes": (), "ray": ("address", *of_cluster), "slurm": of_cluster}
     for option in (option for option, value in given.items() if value is not None and option not in takes[name]):
         engines = " or ".join(engine for engine, options in takes.items() if option in options)
@@ -207,16 +213,17 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) 
 
     if name == "processes":
         return run_in_processes
-    by_default, gpus = WorkerNeeds(), given["gpus"]
+    by_default, gpus, memory = WorkerNeeds(), given["worker-gpus"], given["worker-memory"]
     if gpus is None:
         gpus = float(any(video.config.networks.device.startswith("cuda") for video in videos))
-    needs = WorkerNeeds(given["cores"] or by_default.cores, given["memory"] or by_default.memory_gb, gpus)
+    memory_gb = parse_memory(memory) / 1000 if memory else by_default.memory_gb
+    needs = WorkerNeeds(given["worker-cores"] or by_default.cores, memory_gb, gpus)
     if name == "ray":
         from scopemap.runner.ray_engine import RayEngine
 
         return RayEngine(needs, given["address"])
     if gpus % 1:
-        raise SettingsError(f"Slurm gives whole GPUs: --gpus {gpus:g}")
+        raise SettingsError(f"Slurm gives whole GPUs: --worker-gpus {gpus:g}")
     from scopemap.runner.slurm_engine import SlurmEngine
 
     return SlurmEngine(out.absolute(), needs)

@@ -193,7 +193,7 @@ def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Wor
     if not busy and not found:
         raise InputError(
             f"no worker has started on Ray in {_LONGEST_START_S:g} s: has a node the cores, memory and GPUs of one "
-            "(--cores, --memory, --gpus)?"
+            "(--worker-cores, --worker-memory, --worker-gpus)?"
         )
     return [worker for worker in workers if worker.answer in found or worker in over]
 
