@@ -3,12 +3,14 @@
     python benchmarks/long_runs.py [--frames 300 6000 20000] [--size 320x256] [--preset default]
 
 Each is one run of the command line. Printed are its seconds, its processor time per frame, its peak memory, its memory
-at each tenth of the time (the last ones are the adjustment, the fusion and the writing) and its open files.
+at each tenth of the time (the last ones are the adjustment, the fusion and the writing), its open files, and the error
+of its path after a Sim(3) alignment.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -22,12 +24,13 @@ EVERY_S = 1.0
 
 
 def write_input(folder: Path, phantom: Path, count: int) -> None:
-    """Link a phantom's pictures there and back under increasing numbers, with its camera."""
-    pictures = sorted(phantom.glob("*_color.png"))
-    loop = pictures + pictures[-2:0:-1]
+    """Link a phantom's pictures there and back under increasing numbers, with its camera; write its poses likewise."""
+    pictures, poses = sorted(phantom.glob("*_color.png")), (phantom / "pose.txt").read_text().splitlines()
+    loop = [*range(len(pictures)), *range(len(pictures) - 2, 0, -1)]
     folder.mkdir()
     for number in range(count):
-        (folder / f"{number:06d}_color.png").symlink_to(loop[number % len(loop)])
+        (folder / f"{number:06d}_color.png").symlink_to(pictures[loop[number % len(loop)]])
+    (folder / "pose.txt").write_text("".join(f"{poses[loop[k % len(loop)]]}\n" for k in range(count)))
     for camera in phantom.glob("*.yaml"):
         (folder / camera.name).symlink_to(camera)
 
@@ -54,6 +57,13 @@ def measure(source: Path, out: Path, arguments: list[str]) -> tuple[float, float
     return time.perf_counter() - started, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6, seen
 
 
+def error_mm(source: Path, out: Path) -> float:
+    """Return the ATE RMSE after a Sim(3) alignment, mm."""
+    command = [sys.executable, "-m", "scopemap", "evaluate", str(out), "--truth", str(source)]
+    printed = subprocess.run([*command, "--align", "sim3", "--json"], capture_output=True, text=True).stdout
+    return float(json.loads(printed)["ate_rmse_mm"])
+
+
 def main() -> None:
     """Render, run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -61,8 +71,8 @@ def main() -> None:
     parser.add_argument("--size", default="320x256")
     parser.add_argument("--preset", default="default")
     options = parser.parse_args()
-    print("| frames | seconds | processor time a frame, ms | peak memory MB | memory MB each tenth | open files |")
-    print("|---|---|---|---|---|---|")
+    print("| frames | seconds | processor time a frame, ms | peak MB | MB each tenth | open files | ATE mm |")
+    print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
         phantom = Path(scratch) / "phantom"
         render = ["phantom", str(phantom), "--frames", str(PERIOD), "--size", options.size, "--quiet"]
@@ -75,6 +85,7 @@ def main() -> None:
             files = f"{max(n for _, n in seen)} at most"
             per_frame = 1e3 * cpu_s / count
             cells = [str(count), f"{seconds:.0f}", f"{per_frame:.0f}", f"{peak_mb:.0f}", " ".join(tenths), files]
+            cells.append(f"{error_mm(source, out):.2f}")
             print(f"| {' | '.join(cells)} |", flush=True)
 
 
