@@ -111,8 +111,8 @@ def batch(
     if workers is None and (engine == "slurm" or address):
         raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
-    given = {"address": address, "worker-cores": worker_cores, "worker-memory": worker_memory}
-    given |= {"worker-gpus": worker_gpus}
+    given: dict[str, Any] = {"address": address, "worker-cores": worker_cores}
+    given |= {"worker-memory": worker_memory, "worker-gpus": worker_gpus}
     run = engine_of(engine, given, videos, out)
     with _ending_by_sigterm():
         if dry_run:
