@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
+from scopemap.mapping.backend import _Adjusted, _support
 from scopemap.mapping.loop_closure import Loop
 from scopemap.mapping.map_merging import merge_maps
+from scopemap.mapping.pose_interpolation import FrameCorrection
 
 DEPTH_MM = 50.0
 # Of nine keyframes; the second map is left and entered again.
@@ -104,3 +106,35 @@ def test_a_false_loop_is_rejected_by_the_majority() -> None:
     worlds = merge_maps(scene.poses, MAP_OF, [false, scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)
     for k, pose in _common(scene, worlds).items():
         np.testing.assert_allclose(pose, scene.true[k], atol=1e-6)
+
+
+def test_support_counts_keyframes_on_the_side_with_fewer_and_the_least_connected_map() -> None:
+    map_of = np.array([0, 0, 0, 1, 1, 2, 2])
+    between = np.array([[0, 3], [1, 3], [2, 4], [0, 1]])
+    assert _support(between, np.array([0, 0, 0, 1, 1, 1, 1]), 0) == 2
+    assert _support(between, map_of, 0) == 0
+    assert _support(np.vstack([between, [[3, 5]]]), map_of, 0) == 1
+    assert _support(np.zeros((0, 2), int), map_of, 0) == 0
+    assert _support(between, np.zeros(7, int), 0) == 0
+
+
+def _adjusted(refused: str, graph_px: float, support: int) -> _Adjusted:
+    still = FrameCorrection(np.arange(2), np.tile(np.eye(4), (2, 1, 1)), np.zeros(2), 1.0, refused=refused, loops=9)
+    return _Adjusted(still, 0.5, 0.5, 0.5, graph_px, support)
+
+
+def test_where_tissue_moves_the_pose_graph_merges_maps_that_several_keyframes_connect() -> None:
+    alone = _adjusted("not rigid", 2.0, 0)
+    assert _adjusted("not rigid", 2.2, 4).accepted(alone, 0.8)
+    assert not _adjusted("not rigid", 2.2, 3).accepted(alone, 0.8)
+    assert not _adjusted("not rigid", 4.0, 9).accepted(alone, 0.8)
+    # A rigid map is merged by an adjustment that is accepted, and by nothing else.
+    assert not _adjusted("not rigid", 2.0, 9).accepted(_adjusted("", 2.0, 0), 0.8)
+    assert _adjusted("", 9.0, 0).accepted(_adjusted("", 2.0, 0), 0.8)
+
+
+def test_a_merge_by_the_pose_graph_is_told() -> None:
+    worlds = {0: Similarity.identity(), 3: Similarity.identity()}
+    found = replace(_adjusted("the scene is not rigid", 2.0, 4).correction, S_common_map=worlds)
+    expected = "mapping: poses are as tracked, 2 maps merged by 9 loop closures; the scene is not rigid"
+    assert found.description == expected

@@ -45,29 +45,34 @@ MOST_OBSERVATIONS = 1_000_000
 """Of an adjustment, unless memory is limited."""
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
 _MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
+# Keyframes of either map with loops to the other that the pose graph must accept where no adjustment tests them.
+_MIN_GRAPH_SUPPORT = 4
 
 
 class _Adjusted(NamedTuple):
     """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
 
-    Within the main map, the largest within one map, and between maps; the last two also as tracked, before adjustment.
+    Within the main map, the largest within one map, and between maps; the largest within one map before the adjustment,
+    from the pose graph. support : keyframes on either side of the accepted loops by which the least supported map is
+    connected.
     """
 
     correction: FrameCorrection
     main_px: float
     largest_px: float
     between_px: float
-    tracked_px: tuple[float, float]
+    graph_px: float
+    support: int
 
     def accepted(self, alone: _Adjusted, max_sigma_px: float) -> bool:
         """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
 
-        Where tissue moves, so that not even the main map is adjusted, they are merged as tracked, if what is seen from
-        both fits as well as what is seen from one.
+        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
+        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
         """
         if alone.correction.refused:
-            largest_px, between_px = self.tracked_px
-            return bool(self.correction.refused) and between_px <= _MAX_ERROR_FACTOR * largest_px
+            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
+            return bool(self.correction.refused) and fits and self.support >= _MIN_GRAPH_SUPPORT
         rigid = not self.correction.refused and self.largest_px <= max_sigma_px
         connected = self.correction.loops > 0 and self.between_px <= max_sigma_px
         return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
@@ -226,8 +231,8 @@ class Backend:
         assert self._camera is not None
         chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
         map_of = np.array([self._tracked[k].map for k in chosen])
-        problem, loops = self._problem(chosen, worlds, self._camera)
-        points, observations = problem.points, problem.observations
+        problem, accepted = self._problem(chosen, worlds, self._camera)
+        points, observations, loops = problem.points, problem.observations, len(accepted)
         found = adjust_in_windows(problem)
         refused, fields = self._judged(chosen, problem, found, worlds)
         if problem.start is not None and refused:
@@ -241,21 +246,24 @@ class Backend:
             within = [_sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds]
             return within, _sigma_px(length_px[host != observer])
 
-        (within, between), (tracked, between_tracked) = map(sigmas_px, (found.state, problem.tracked))
+        graph = problem.tracked if problem.start is None else problem.start
+        (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
         index = np.array([self._frames[k] for k in chosen])
-        correction = (
-            _correction(index, problem, found, loops, fields) if not refused else _no_correction(index, found, refused)
-        )
+        correction = _no_correction(index, found, refused)
+        if not refused:
+            correction = _correction(index, problem, found, loops, fields)
+        elif len(worlds) > 1 and problem.start is not None:
+            by_graph = _correction(index, problem, replace(found, state=graph), len(accepted), ())
+            correction = replace(by_graph, sigma_px=found.sigma_px, refused=refused)
         # A map of one keyframe has no observations: NaN.
-        main_px = within[list(worlds).index(main)]
-        return _Adjusted(
-            correction, main_px, np.fmax.reduce(within), between, (np.fmax.reduce(tracked), between_tracked)
-        )
+        largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
+        main_px, support = within[list(worlds).index(main)], _support(accepted, map_of, main)
+        return _Adjusted(correction, main_px, largest_px, between_px, graph_px, support)
 
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
-    ) -> tuple[BundleProblem, int]:
-        """Return the bundle adjustment of chosen keyframes, from the optimised pose graph, and its accepted loops."""
+    ) -> tuple[BundleProblem, np.ndarray]:
+        """Return the bundle adjustment of chosen keyframes, from the pose graph, and that's accepted loops (A, 2)."""
         settings, own = self.settings, [self._tracked[k] for k in chosen]
         T_world_camera = np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
         log_unit = np.log([worlds[pose.map].scale for pose in own])
@@ -276,11 +284,11 @@ class Backend:
         among, found = set(chosen), map(Loop.of_row, self._loops.read())
         loops = [loop.among(chosen, log_unit) for loop in found if {loop.past, loop.new} <= among]
         if not loops:
-            return problem, 0
+            return problem, np.zeros((0, 2), int)
         graph = optimise_pose_graph(T_world_camera, pairs, loops, _median_depth_mm(points))
         log_depth = points.log_depth + graph.log_scale[points.host]
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
-        return replace(problem, start=start), graph.accepted_loops
+        return replace(problem, start=start), graph.accepted
 
     def _judged(
         self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
@@ -327,6 +335,17 @@ class Backend:
             data = (position[own], points.log_depth[own], error[own], found.log_depth_sigma[own])
             fields.append(fit_depth_correction(*data, self.settings.depth_step_sigma))
         return tuple(fields)
+
+
+def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
+    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
+    least = []
+    for number in sorted(set(map_of.tolist()) - {main}):
+        inside = map_of[loops] == number
+        ends = loops[inside.sum(1) == 1]
+        own = map_of[ends] == number
+        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
+    return min(least, default=0)
 
 
 def _correction(

@@ -38,11 +38,16 @@ _MAX_DRIFT_SHARE = 0.5
 
 
 class PoseGraph(NamedTuple):
-    """Poses T_world_camera (K, 4, 4), ln of the depth scales (K,), and the number of accepted loops."""
+    """Poses T_world_camera (K, 4, 4), ln of the depth scales (K,), and the keyframes (A, 2) int of accepted loops."""
 
     T_world_camera: np.ndarray
     log_scale: np.ndarray
-    accepted_loops: int
+    accepted: np.ndarray
+
+    @property
+    def accepted_loops(self) -> int:
+        """Number of accepted loops."""
+        return len(self.accepted)
 
 
 class _Edges(NamedTuple):
@@ -113,7 +118,8 @@ def optimise_pose_graph(
     R, p, s = state(x)
     poses = [se3(rotation, depth_mm * position) for rotation, position in zip(R.as_matrix(), p, strict=True)]
     loop_error = np.linalg.norm(errors(x).reshape(-1, _UNKNOWNS)[len(neighbours) :], axis=1) / np.sqrt(_UNKNOWNS)
-    return PoseGraph(np.stack(poses), s, int((loop_error < _MAX_LOOP_ERROR).sum()))
+    ends = np.array([(loop.past, loop.new) for loop in loops], dtype=int).reshape(-1, 2)
+    return PoseGraph(np.stack(poses), s, ends[loop_error < _MAX_LOOP_ERROR])
 
 
 def _explained_by_drift(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:

@@ -59,7 +59,9 @@ class FrameCorrection:
         if not np.isfinite(self.sigma_px):
             return f"mapping: poses are as tracked; the {len(self.index)} keyframes have no common observations"
         if self.refused:
-            return f"mapping: poses are as tracked; {self.refused}"
+            merged = len(self.S_common_map)
+            by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
+            return f"mapping: poses are as tracked{by_loops}; {self.refused}"
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         text = f"mapping: {len(self.index)} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg"
         text += f", {self.loops} loops closed" if self.loops else ""
