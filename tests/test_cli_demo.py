@@ -86,7 +86,7 @@ def test_nothing_from_outside_is_used(demo: Demonstration, nothing_outside: Path
     assert list(nothing_outside.iterdir()) == []
     parts = demo.result.provenance["estimators"]
     assert (parts["depth"], parts["model"]) == ("scopenet", "that come with the package")
-    assert [name for name in parts if "sha256" in name] == ["sha256 scopenet.onnx"]
+    assert [name for name in parts if "sha256" in name] == ["sha256 scopenet.onnx", "features sha256 alike.onnx"]
 
 
 def test_pictures_show_something(demo: Demonstration, out: Path) -> None:
