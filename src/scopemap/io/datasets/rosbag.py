@@ -261,7 +261,7 @@ class RosBag(Source):
         topics: dict[str, _Topic] = {}
         for (name, kind), count in counts.items():
             try:
-                for first in islice(self._messages(reader, [name]), min(count, 1)):
+                for first in islice(self._messages(reader, [name]), int(count > 0)):
                     encoding = "" if kind == _CAMERA_INFO else encoding_of(first.content)
                     topics[name] = _Topic(name, kind, count, encoding, first)
             except InputError as error:
