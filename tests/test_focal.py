@@ -329,7 +329,7 @@ class _Rectified:
         self._sequence, self.path = sequence, sequence.path
         self.name, self.width, self.height = "pretended", sequence.camera.width, sequence.camera.height
         self.count, self.pixel_aspect = sequence.count, sequence.camera.fy / sequence.camera.fx
-        self.masks, self.notes, self.warnings = None, [], []
+        self.masks, self.notes, self.warnings, self.frame_limit_s = None, [], [], None
 
     def frames(self, selection: slice) -> Iterator[Frame]:
         return iter(list(self._sequence.frames())[selection])

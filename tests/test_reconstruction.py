@@ -246,16 +246,17 @@ def test_the_deviation_of_depth_is_read_back_to_two_hundredths(run: _Run, tmp_pa
 def test_a_run_that_is_stopped_writes_the_frames_until_then(
     run: _Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, every = Event(), Sequence.frames
+    read, asked, every = Event(), Event(), Sequence.frames
 
     def frames(self: Sequence, after: int = -1) -> Iterator[Frame]:
         for frame in every(self):
             if frame.index == LOST - 1:
+                read.set()
                 assert asked.wait(60)
             yield frame
 
     def ask(step: Step) -> bool:
-        return step.frame.index == 1
+        return step.frame.index == 1 and read.wait(60)
 
     def told_after(step: Step) -> None:
         if step.frame.index == 2:

@@ -52,7 +52,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "tracking": ("tracking.tracker:Tracker.track",),
     "corners": ("flow.corners:KeyframeMatcher.match", "flow.corners:KeyframeMatcher.set_keyframe"),
     "pose from corners": ("tracking.tracker:pose_from_correspondences",),
-    "photometric alignment": ("tracking.tracker:align", "tracking.relocalisation:align"),
+    "photometric alignment": ("tracking.tracker:align",),
     "relocalisation": ("tracking.relocalisation:Relocaliser.find",),
     "MAPIS": ("depth.mapis:Mapis.refine",),
     "keyframe": ("tracking.tracker:Tracker.insert_keyframe", "mapping.submaps:Mapper.add_keyframe"),
