@@ -161,7 +161,10 @@ class Tracker:
             frame,
             lambda keyframe, relative: self._align_from(keyframe, frame, views, relative),
             lambda keyframe, alignment: (
-                self._is_accepted(keyframe, alignment) and not self._is_obscured(sharpness, alignment)
+                self._is_accepted(keyframe, alignment)
+                # Of many keyframes one always fits a wall without texture.
+                and (keyframe.measured or alignment.texture >= _MIN_TEXTURE)
+                and not self._is_obscured(sharpness, alignment)
             ),
             near=near,
             recent=failed or self._frames_lost > 0,
