@@ -77,7 +77,7 @@ def test_meshes_lie_under_the_depth(folder: Path) -> None:
     moved = trimesh.load(folder / "mesh_truth" / "0002.ply", process=False)
     assert np.abs(phantom.volume.values_at(np.asarray(rest.vertices))[0]).max() < 1e-3
     shift = np.asarray(moved.vertices) - np.asarray(rest.vertices)
-    np.testing.assert_allclose(shift, phantom.breath.at(2).at(np.asarray(moved.vertices)), atol=1e-4)
+    np.testing.assert_allclose(shift, phantom.motion.at(2).at(np.asarray(moved.vertices)), atol=1e-4)
     assert np.linalg.norm(shift, axis=1).max() > 0.5
 
 

@@ -80,7 +80,7 @@ def test_tube_is_featureless_and_colon_is_not() -> None:
 def test_texture_sticks_to_moving_tissue() -> None:
     spec = PhantomSpec(deform=True, breath_frames=8.0, **SMALL)
     phantom = prepare(spec)
-    displacement = phantom.breath.at(4)
+    displacement = phantom.motion.at(4)
     surface = march(phantom.volume, spec.camera, phantom.poses[0], displacement)
     footprint = np.full(surface.depth_mm.shape, 0.1, np.float32)
     rest = surface.rest_mm.reshape(-1, 3).astype(float)

@@ -300,5 +300,6 @@ def test_the_command_line_goes_on_and_says_so(folder: Path, tmp_path: Path, capf
     assert "resuming after" in said.err
     found = re.search(r"time: ([\d.]+) s since it was resumed after frame (\d), ([\d.]+) frames/s", said.out)
     assert found is not None
-    frames, seconds = FRAMES - 1 - int(found[2]), float(found[1])  # printed to a tenth: the rate is that of some time within it
+    # Seconds are printed to a tenth: the rate is that of some time within it.
+    frames, seconds = FRAMES - 1 - int(found[2]), float(found[1])
     assert frames / (seconds + 0.05) - 0.05 <= float(found[3]) <= frames / max(seconds - 0.05, 1e-9) + 0.05

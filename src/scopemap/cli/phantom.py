@@ -24,7 +24,12 @@ def phantom(
     ] = None,
     deform: Annotated[bool, typer.Option("--deform", help="let the tissue breathe")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="end in exactly the first pose")] = False,
-    events: Annotated[str, typer.Option(help="bad segments: black:A-B,blur:A-B,smoke:A-B (inclusive)")] = "",
+    events: Annotated[
+        str,
+        typer.Option(
+            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, fluid, instrument, turn, contact, push"
+        ),
+    ] = "",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, shutter, h264_crf, ..."),

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from scopemap.geometry.se3 import se3, so3_exp
 
 _SPEED_MM = 0.45
+_TURN_DEG = 30.0
+_CONTACT_TURN_DEG = 55.0
+_CONTACT_MM = 4.0
+_CONTACT_STEP_MM = 0.25
 _SWAY_FRAMES = (90.0, 170.0)
 
 
@@ -36,6 +42,36 @@ def sweep_path(frames: int, loop: bool, seed: int) -> np.ndarray:
     positions += _sway(frames, loop, rng, (1.0, 1.0, 1.0))
     look = np.stack([positions[:, 1] / 90.0, -positions[:, 0] / 90.0, np.zeros(frames)], -1)
     return _poses(positions, look + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
+
+
+def turned(poses: np.ndarray, first: int, last: int, back: bool = False) -> np.ndarray:
+    """Return poses (N, 4, 4) that turn by 30 degrees about their y axis over frames `first` to `last`, and stay so."""
+    before = first - 1
+    share = np.clip((np.arange(len(poses)) - before) / (last - before), 0.0, 1.0)
+    angle = np.radians(-_TURN_DEG if back else _TURN_DEG) * 0.5 * (1 - np.cos(np.pi * share))
+    return np.array(
+        [pose @ se3(so3_exp(np.array([0, a, 0])), np.zeros(3)) for pose, a in zip(poses, angle, strict=True)]
+    )
+
+
+def touching(poses: np.ndarray, first: int, last: int, space_mm: Callable[[np.ndarray], float]) -> np.ndarray:
+    """Return poses (N, 4, 4) that turn to the wall, come as close as 4 mm half way from `first` to `last`, and go back.
+
+    space_mm : free space, mm, around a point (3,); the camera stops where less than 4 mm are left.
+    """
+    poses = poses.copy()
+    middle = min((first + last) // 2, len(poses) - 1)
+    aside = so3_exp(np.array([0, np.radians(_CONTACT_TURN_DEG), 0]))
+    towards = poses[middle, :3, :3] @ aside[:, 2]
+    reach = 0.0
+    while space_mm(poses[middle, :3, 3] + (reach + _CONTACT_STEP_MM) * towards) > _CONTACT_MM:
+        reach += _CONTACT_STEP_MM
+    for index in range(first, min(last + 1, len(poses))):
+        share = 0.5 - 0.5 * np.cos(2 * np.pi * (index - first + 1) / (last - first + 2))
+        turn = so3_exp(np.array([0, share * np.radians(_CONTACT_TURN_DEG), 0]))
+        poses[index, :3, 3] += share * reach * towards
+        poses[index, :3, :3] = poses[index, :3, :3] @ turn
+    return poses
 
 
 def _phase(frames: int) -> np.ndarray:

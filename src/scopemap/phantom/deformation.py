@@ -1,4 +1,4 @@
-"""Deformation: breathing tissue, as a smooth periodic displacement with bounded gradient.
+"""Deformation: tissue that breathes or is pushed, as a smooth displacement with bounded gradient.
 
 The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves.
 """
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 _FIXED_POINT_STEPS = 40
+_PUSH_MM = 6.0
+_PUSH_LENGTH_MM = 110.0
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,45 @@ class Breathing:
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
-        strength = 0.5 - 0.5 * np.cos(2 * np.pi * time / self.period_frames)
-        return Displacement(self.waves * [1, 1, 1, strength, strength, strength, 1])
+        return _scaled(self.waves, 0.5 - 0.5 * np.cos(2 * np.pi * time / self.period_frames))
+
+
+@dataclass(frozen=True)
+class Push:
+    """Waves (M, 7) as in `Displacement`, from rest at the frame `first` to their full amplitude at `last`."""
+
+    waves: np.ndarray
+    first: int
+    last: int
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
+        return _scaled(self.waves, 0.5 - 0.5 * np.cos(np.pi * share))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """All that moves the tissue."""
+
+    parts: tuple[Breathing | Push, ...]
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        return Displacement(np.concatenate([REST.waves, *(part.at(time).waves for part in self.parts)]))
+
+
+def _scaled(waves: np.ndarray, strength: float) -> Displacement:
+    return Displacement(waves * [1, 1, 1, strength, strength, strength, 1])
+
+
+def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) -> Push:
+    """Return a push of the tissue `distance_mm` ahead of a camera: up on the left of its view, down on the right."""
+    right, down, ahead = T_world_camera[:3, :3].T
+    along = 2 * np.pi / _PUSH_LENGTH_MM * right
+    middle = T_world_camera[:3, 3] + distance_mm * ahead
+    wave = np.concatenate([along, _PUSH_MM * (0.8 * down - 0.6 * ahead), [-along @ middle]])
+    return Push(wave[None], first, last)
 
 
 def breathing(amplitude_mm: float, period_frames: float, seed: int) -> Breathing:

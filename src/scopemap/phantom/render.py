@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scopemap.errors import InputError
-from scopemap.phantom.camera_path import lumen_path, sweep_path
+from scopemap.phantom.camera_path import lumen_path, sweep_path, touching, turned
 from scopemap.phantom.cavity import Tint, laparoscopy_volume
-from scopemap.phantom.deformation import Breathing, breathing
+from scopemap.phantom.deformation import Breathing, Motion, Push, breathing, push
 from scopemap.phantom.exposing import exposure_times, lagging_gains, pose_at
+from scopemap.phantom.instrument import insert, instrument
 from scopemap.phantom.lumen import colon_volume, tube_volume
 from scopemap.phantom.march import SurfaceBuffers, march
 from scopemap.phantom.shading import develop, disturb, exposure_for, shade, vignette
-from scopemap.phantom.spec import DEFAULT_FRAMES, PhantomSpec
+from scopemap.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
 from scopemap.phantom.texture import Appearance
 from scopemap.phantom.volume import Volume
 from scopemap.trajectory.formats.text import read_poses
@@ -23,6 +24,7 @@ _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 # Exposure is measured in a small picture, as cameras do.
 _METERING_SHARE = 8
+_PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Phantom:
 
     Attributes
     ----------
-    volume, appearance : shape and appearance of the tissue at rest. breath : how it moves.
+    volume, appearance : shape and appearance of the tissue at rest. motion : how it moves.
     poses : (N, 4, 4) float64, camera to world, mm.
     exposure : gain of every frame, or of each (N,); None: each frame has its own.
     """
@@ -40,7 +42,7 @@ class Phantom:
     volume: Volume
     appearance: Appearance
     poses: np.ndarray
-    breath: Breathing
+    motion: Motion
     exposure: float | np.ndarray | None
 
 
@@ -51,11 +53,25 @@ def prepare(spec: PhantomSpec) -> Phantom:
     """
     poses = camera_path(spec)
     volume, appearance = build_scene(spec, poses)
-    breath = breathing(spec.breath_mm if spec.deform else 0.0, spec.breath_frames, spec.seed)
-    phantom = Phantom(spec, volume, appearance, poses, breath, None)
+    for event in _events(spec, "contact"):
+        poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
+    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses), None)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
     return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
+
+
+def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
+    return [event for event in spec.events if event.kind == kind]
+
+
+def _motion(spec: PhantomSpec, poses: np.ndarray) -> Motion:
+    """Breathing and pushes of the tissue."""
+    parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
+    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene == "laparoscopy" else "lumen"]
+    for event in _events(spec, "push"):
+        parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
+    return Motion(tuple(parts))
 
 
 def _lagging_exposure(phantom: Phantom) -> np.ndarray:
@@ -70,16 +86,25 @@ def _lagging_exposure(phantom: Phantom) -> np.ndarray:
 def camera_path(spec: PhantomSpec) -> np.ndarray:
     """Return the poses (N, 4, 4) of `spec`, camera to world, mm: from its file, or generated for its scene."""
     if spec.path_file is None:
-        frames = spec.frames or DEFAULT_FRAMES
+        # Every `speed`-th pose of a path that is as much longer.
+        frames = ((spec.frames or DEFAULT_FRAMES) - 1) * spec.speed + 1
         if spec.scene == "laparoscopy":
-            return sweep_path(frames, spec.loop, spec.seed)
-        return lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
+            path = sweep_path(frames, spec.loop, spec.seed)
+        else:
+            path = lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
+        return _with_turns(path[:: spec.speed], spec)
     poses = read_poses(spec.path_file)
     if spec.frames is not None and spec.frames > len(poses):
         raise InputError(
             f"{spec.path_file} holds {len(poses)} poses, {spec.frames} frames were asked for: ask for fewer"
         )
-    return poses[: spec.frames]
+    return _with_turns(poses[: spec.frames], spec)
+
+
+def _with_turns(poses: np.ndarray, spec: PhantomSpec) -> np.ndarray:
+    for number, event in enumerate(_events(spec, "turn")):
+        poses = turned(poses, event.first, event.last, back=number % 2 == 1)
+    return poses
 
 
 def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearance]:
@@ -111,10 +136,13 @@ def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
 def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers]:
     """Linear light at a moment, in frames, and the surface that it came from."""
     camera, look = phantom.spec.camera, phantom.appearance
-    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.breath.at(time))
+    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.motion.at(time))
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
+    for event in _events(phantom.spec, "instrument"):
+        tool = instrument(time, event.first, event.last, phantom.spec.scene == "laparoscopy", phantom.spec.seed)
+        radiance, surface = insert(tool, radiance, surface, camera)
     return radiance * vignette(camera), surface
 
 
@@ -126,4 +154,4 @@ def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffe
     gain = gain if isinstance(gain, float) else gain[index]
     rng = np.random.default_rng((spec.seed, 4, index))
     kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
-    return develop(disturb(linear * np.float32(gain), kinds, rng), spec.noise, rng), surface
+    return develop(disturb(linear * np.float32(gain), kinds, rng, index), spec.noise, rng), surface

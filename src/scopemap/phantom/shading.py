@@ -10,6 +10,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.phantom.march import SurfaceBuffers
+from scopemap.phantom.noise import noise_at
 from scopemap.phantom.spec import EventName
 
 _FILM_TILT = 0.3
@@ -22,6 +23,10 @@ _EXPOSED_SHARE = 80.0
 _EXPOSED_LEVEL = 0.48
 _SHOT_NOISE = 2.5
 _BLUR_PX = 13
+_WATER_PX = 5.0
+_WATER_LENGTH_PX = 40.0
+_WATER_FRAMES = 7.0
+_WATER_RGB = np.array([0.55, 0.45, 0.22], np.float32)
 _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
 
 
@@ -66,8 +71,10 @@ def exposure_for(radiance: np.ndarray) -> float:
     return _EXPOSED_LEVEL / float(np.percentile(lit, _EXPOSED_SHARE)) if lit.size else 1.0
 
 
-def disturb(linear: np.ndarray, kinds: set[EventName], rng: np.random.Generator) -> np.ndarray:
-    """Return exposed light (H, W, 3) with smoke, with motion and defocus blur, or all black."""
+def disturb(linear: np.ndarray, kinds: set[EventName], rng: np.random.Generator, index: int = 0) -> np.ndarray:
+    """Return exposed light (H, W, 3) of frame `index` seen through water, with smoke, with blur, or all black."""
+    if "fluid" in kinds:
+        linear = _fluid(linear, index)
     if "smoke" in kinds:
         linear = _smoke(linear, rng)
     if "blur" in kinds:
@@ -88,6 +95,18 @@ def develop(linear: np.ndarray, noise: float, rng: np.random.Generator) -> np.nd
     signal = np.clip(signal, 0, 1)
     encoded = np.where(signal <= 0.0031308, 12.92 * signal, 1.055 * np.maximum(signal, 1e-6) ** (1 / 2.4) - 0.055)
     return np.rint(255 * encoded).astype(np.uint8)
+
+
+def _fluid(linear: np.ndarray, index: int) -> np.ndarray:
+    """Bend the view by water that runs over the lens, and cloud it where it carries something along."""
+    height, width = linear.shape[:2]
+    px = width / 320
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    points = np.stack([x, y - 6.0 * px * index, np.full_like(x, index * _WATER_LENGTH_PX * px / _WATER_FRAMES)], -1)
+    bend = [_WATER_PX * px * noise_at(points, _WATER_LENGTH_PX * px, seed).astype(np.float32) for seed in (71, 72)]
+    bent = cv2.remap(linear, x + bend[0], y + bend[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    thickness = np.clip(1.4 * noise_at(points, 2 * _WATER_LENGTH_PX * px, 73), 0, 0.7)[..., None].astype(np.float32)
+    return bent * (1 - thickness) + float(linear.mean()) * _WATER_RGB / _WATER_RGB.mean() * thickness
 
 
 def _smoke(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -14,7 +14,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "tube"]
-EventName = Literal["black", "blur", "smoke"]
+EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push"]
 
 DEFAULT_FRAMES = 200
 C3VD_DEPTH_SCALE_MM = 100.0 / 65535
@@ -22,7 +22,12 @@ C3VD_DEPTH_SCALE_MM = 100.0 / 65535
 
 @dataclass(frozen=True)
 class Event:
-    """A disturbance of the frames `first` to `last`, inclusive."""
+    """What happens from frame `first` to frame `last`, inclusive.
+
+    black, blur, smoke, fluid : of the picture. instrument : one enters, works and leaves. turn : the camera turns by 30
+    degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera turns to the wall
+    and touches it, then goes back. push : the tissue is pushed two ways from `first` on, and stays so from `last` on.
+    """
 
     kind: EventName
     first: int
@@ -43,7 +48,8 @@ class PhantomSpec:
     path_file : camera path to follow (`read_poses`), None: a hand-like path is generated.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
     loop : whether the generated path ends in exactly its first pose.
-    events : ranges of black, blurred or smoky frames.
+    speed : how many times faster than usual the camera goes along a generated path.
+    events : what happens on the way, see `Event`.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo.
     gloss : strength of the wet highlights, 1 = as in the clinic, 0 = none.
@@ -65,6 +71,7 @@ class PhantomSpec:
     path_file: Path | None = None
     deform: bool = False
     loop: bool = False
+    speed: int = 1
     events: tuple[Event, ...] = ()
     breath_mm: float = 2.0
     breath_frames: float = 120.0
@@ -86,6 +93,8 @@ class PhantomSpec:
             "width and height must be 16 to 4096 px": all(16 <= n <= 4096 for n in (self.width, self.height)),
             "fov_deg must be between 10 and 150": 10 <= self.fov_deg <= 150,
             "seed must not be negative": self.seed >= 0,
+            "speed must be at least 1, and needs a generated path": self.speed == 1
+            or (self.speed > 1 and self.path_file is None),
             "breath_mm must be between 0 and 4": 0 <= self.breath_mm <= 4,
             "breath_frames and fps must be positive": min(self.breath_frames, self.fps) > 0,
             "noise, texture and gloss must not be negative": min(self.noise, self.texture, self.gloss) >= 0,
@@ -95,6 +104,7 @@ class PhantomSpec:
             "indirect must be between 0 and 1": 0 <= self.indirect <= 1,
             "h264_crf must be between 0 and 51": self.h264_crf is None or 0 <= self.h264_crf <= 51,
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
+            "a turn does not go with loop": not (self.loop and any(event.kind == "turn" for event in self.events)),
             "loop needs a generated path of at least 3 frames, not a path file": not self.loop
             or (self.path_file is None and (self.frames is None or self.frames >= 3)),
         }
@@ -124,11 +134,11 @@ class PhantomSpec:
 
 def parse_events(text: str) -> tuple[Event, ...]:
     """Return the events of a text such as "black:40-49,blur:90-95"; raises `SettingsError`."""
-    events = []
+    events, kinds = [], ", ".join(get_args(EventName))
     for part in filter(None, (piece.strip() for piece in text.split(","))):
         match = re.fullmatch(rf"({'|'.join(get_args(EventName))}):(\d+)-(\d+)", part)
         if not match:
-            raise SettingsError(f"cannot read the event '{part}': expected black:A-B, blur:A-B or smoke:A-B")
+            raise SettingsError(f"cannot read the event '{part}': expected KIND:A-B, KIND one of {kinds}")
         kind, first, last = match[1], int(match[2]), int(match[3])
         if last < first:
             raise SettingsError(f"the event '{part}' ends before it begins: write {kind}:{last}-{first}")

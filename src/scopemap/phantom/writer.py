@@ -114,10 +114,10 @@ def _write_camera(spec: PhantomSpec, file: Path) -> None:
 
 def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None:
     mesh.export(folder / "mesh_truth.ply")
-    if phantom.spec.deform:
+    if phantom.motion.parts:
         (folder / "mesh_truth").mkdir(exist_ok=True)
         for index in range(len(phantom.poses)):
-            moved = phantom.breath.at(index).move(np.asarray(mesh.vertices))
+            moved = phantom.motion.at(index).move(np.asarray(mesh.vertices))
             trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
 
 
