@@ -28,7 +28,7 @@ from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, Fr
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
-COLUMNS += " depth_scale warped_share"
+COLUMNS += " depth_scale warped_share usable sharpness motion cause"
 LOST = 6
 STORED = 1.6e-4  # relative error of depth in the frame store
 
@@ -87,6 +87,7 @@ def test_frames_table(run: _Run) -> None:
     assert [int(row["keyframe"]) for row in rows] == [record.track.keyframe for record in run.result.records]
     np.testing.assert_allclose([float(row["time_s"]) for row in rows], np.arange(FRAMES) / 30, atol=1e-6)
     assert rows[LOST]["reason"]
+    assert [row["cause"] for row in rows] == ["too dark" if index == LOST else "" for index in range(FRAMES)]
     assert all(row["reason"] == "" for row in rows if row["status"] == "ok")
     assert [row["map"] for row in rows] == ["" if index == LOST else "0" for index in range(FRAMES)]
 

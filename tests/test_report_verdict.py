@@ -25,7 +25,9 @@ def run_of(place: list[int], *, mesh: trimesh.Trimesh | None = None, **facts: An
         "surface": GOOD_SURFACE,
     } | facts
     maps = [KeptMap(np.arange(3), np.tile(np.eye(4), (3, 1, 1)), tube() if mesh is None else mesh)]
-    return KeptRun(None, [{"index": str(i)} for i in range(len(place))], maps, np.array(place), provenance)
+    return KeptRun(
+        None, [{"index": str(i), "time_s": str(i / 10)} for i in range(len(place))], maps, np.array(place), provenance
+    )
 
 
 def surface(**figures: float) -> dict[str, float]:

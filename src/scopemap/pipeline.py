@@ -168,6 +168,7 @@ class Pipeline:
             step = self._track(preprocessed)
         except Exception as error:
             step = self._lost(preprocessed, self._tracking_faults.noted(preprocessed.frame.index, error))
+        step = replace(step, track=replace(step.track, motion=_motion(preprocessed.correspondence)))
         self.mapper.observe(step.track)
         self._last_track = step.track
         return step
@@ -257,6 +258,14 @@ class Pipeline:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from"
             return replace(track, status="lost", reason=unknown)
         return track
+
+
+def _motion(correspondence: DenseCorrespondence | None) -> float:
+    """Return the median flow since the frame before, share of the width."""
+    if correspondence is None:
+        return float("nan")
+    flow = correspondence.to_previous[::4, ::4]
+    return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / correspondence.to_previous.shape[1]
 
 
 def _blind(frame: Frame) -> Frame:

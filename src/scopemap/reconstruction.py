@@ -35,10 +35,12 @@ from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step
 from scopemap.report.kept_run import LOST, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
+from scopemap.report.losses import LostStretch, losses
 from scopemap.report.shown_mesh import simplified
 from scopemap.report.summary_picture import summary_picture
 from scopemap.report.verdict import verdict
 from scopemap.tracking.track import Track
+from scopemap.trajectory.causes import causes_of_loss
 from scopemap.trajectory.trajectory import OTHER_MAP, SKIPPED, TRACKED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
@@ -53,7 +55,7 @@ _SHOWN_FACES = 100_000
 _COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
-    *("depth_scale", "warped_share"),
+    *("depth_scale", "warped_share", "usable", "sharpness", "motion", "cause"),
 ]
 
 
@@ -64,7 +66,7 @@ class FrameRecord:
     T_world_camera : (4, 4), or None where the frame has no pose in this submap: `track.status` is then "lost" or
         "other-map". depth_scale : MAPIS' factor of its depth, times the back end's.
     map : number of the submap it was tracked in, 0 for the result and N for `maps/N`; None where it is lost, in a
-        submap too small to be saved, or not sorted yet.
+        submap too small to be saved, or not sorted yet. cause : why it is lost, by `causes_of_loss`.
     """
 
     index: int
@@ -75,6 +77,7 @@ class FrameRecord:
     depth_scale: float
     warped_share: float
     map: int | None = None
+    cause: str = ""
 
     @classmethod
     def of(cls, step: Step) -> FrameRecord:
@@ -93,6 +96,8 @@ class FrameRecord:
             *(number, str(track.keyframe)),
             *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
+            *("" if np.isnan(seen) else f"{seen:.4g}" for seen in (track.usable, track.sharpness, track.motion)),
+            self.cause,
         ]
 
 
@@ -125,7 +130,8 @@ def records_of(number: int, submaps: list[Submap], records: list[FrameRecord]) -
             out.append(replace(record, track=track, T_world_camera=None, map=found_in))
         elif number == 0:
             out.append(record)
-    return out
+    causes = causes_of_loss([record.track for record in out])
+    return [replace(record, cause=cause) if cause else record for record, cause in zip(out, causes, strict=True)]
 
 
 def frame_counts(records: list[FrameRecord]) -> dict[str, int]:
@@ -215,6 +221,11 @@ class Reconstruction:
         places = np.where(tracked, 0, elsewhere)
         rows = [dict(zip(_COLUMNS, record.row(), strict=True)) for record in self.records]
         return KeptRun(None, rows, maps, places.astype(np.int64), self.provenance)
+
+    @property
+    def losses(self) -> list[LostStretch]:
+        """The stretches of lost frames, with their causes."""
+        return losses(self._kept())
 
     @property
     def trajectory(self) -> Trajectory:

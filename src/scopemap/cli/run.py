@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
+_MOST_LOSSES = 5
 
 
 def run(
@@ -218,9 +219,11 @@ def summary_lines(result: Reconstruction) -> list[str]:
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
         lines.append(f"other maps: {', '.join(_other_map(n, other) for n, other in enumerate(result.others, 1))}")
-    lines += [f"lost: frame {record.index}, {record.track.reason}" for record in result.lost[:5]]
-    if len(result.lost) > 5:
-        lines.append(f"lost: {len(result.lost) - 5} more, see frames.csv")
+    lost = result.losses
+    longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
+    lines += [f"lost: {loss.when} ({loss.frames} frames), {loss.cause}: {loss.advice}" for loss in longest]
+    if len(lost) > _MOST_LOSSES:
+        lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter stretches, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]
 
 

@@ -74,7 +74,7 @@ class Push:
 
 
 @dataclass(frozen=True)
-class Motion:
+class TissueMotion:
     """All that moves the tissue."""
 
     parts: tuple[Breathing | Push, ...]

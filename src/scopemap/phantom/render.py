@@ -9,7 +9,7 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import lumen_path, sweep_path, touching, turned
 from scopemap.phantom.cavity import Tint, laparoscopy_volume
-from scopemap.phantom.deformation import Breathing, Motion, Push, breathing, push
+from scopemap.phantom.deformation import Breathing, Push, TissueMotion, breathing, push
 from scopemap.phantom.exposing import exposure_times, lagging_gains, pose_at
 from scopemap.phantom.instrument import insert, instrument
 from scopemap.phantom.lumen import colon_volume, tube_volume
@@ -42,7 +42,7 @@ class Phantom:
     volume: Volume
     appearance: Appearance
     poses: np.ndarray
-    motion: Motion
+    motion: TissueMotion
     exposure: float | np.ndarray | None
 
 
@@ -65,13 +65,13 @@ def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
     return [event for event in spec.events if event.kind == kind]
 
 
-def _motion(spec: PhantomSpec, poses: np.ndarray) -> Motion:
+def _motion(spec: PhantomSpec, poses: np.ndarray) -> TissueMotion:
     """Breathing and pushes of the tissue."""
     parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
     away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene == "laparoscopy" else "lumen"]
     for event in _events(spec, "push"):
         parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
-    return Motion(tuple(parts))
+    return TissueMotion(tuple(parts))
 
 
 def _lagging_exposure(phantom: Phantom) -> np.ndarray:

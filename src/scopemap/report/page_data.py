@@ -17,6 +17,7 @@ from scopemap.geometry.align import align_trajectories
 from scopemap.io.datasets.reference import read_reference
 from scopemap.report.frame_pictures import mask_of
 from scopemap.report.kept_run import NOT_USED, KeptRun
+from scopemap.report.losses import losses
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
 from scopemap.report.verdict import scale_is_known, scale_source, verdict
 from scopemap.trajectory.trajectory import Trajectory
@@ -75,6 +76,10 @@ def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", sh
         "depth_range": [near_mm, far_mm],
         "pictures": [_picture_data(picture, near_mm, far_mm) for picture in pictures],
         "maps": _maps(run, meshes, camera, pictures),
+        "losses": [
+            {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
+            for loss in losses(run)
+        ],
         "not_shown_maps": max(len(run.maps) - _MOST_MAPS, 0),
         "albedo": 'fusion.colours = "raw"' not in run.config,
         "truth": _truth(run),

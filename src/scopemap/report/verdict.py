@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
+from scopemap.report.losses import in_words, losses
 
 Level = Literal["good", "doubtful", "bad", "note"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
@@ -136,7 +137,8 @@ def _of_maps(run: KeptRun) -> list[Reason]:
         text = f"After losses {other} more frames form pieces of their own: where they belong is unknown{shown}."
         found.append(Reason("note", text))
     if lost:
-        found.append(Reason("note", f"In {lost} frames the camera could not be followed at all."))
+        words = f"In {lost} frames the camera could not be followed at all. {in_words(losses(run))}"
+        found.append(Reason("note", words.rstrip()))
     return found
 
 

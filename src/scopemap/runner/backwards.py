@@ -82,7 +82,7 @@ def _tracked_from(pipeline: Pipeline, start: Track, earlier: list[Track]) -> Ite
             tracker.remember(tracked)
         overlap += before.status != "lost"
         track = replace(track, T_world_camera=start.T_world_camera @ track.T_world_camera)
-        yield before, replace(track, reason=BACKWARDS, keyframe=start.index, map=start.map)
+        yield before, replace(track, reason=BACKWARDS, keyframe=start.index, map=start.map, motion=before.motion)
 
 
 def _agree(motions: list[np.ndarray], depth_mm: float) -> bool:

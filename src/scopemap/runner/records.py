@@ -11,11 +11,15 @@ from scopemap.frame import RowTable
 from scopemap.reconstruction import FrameRecord
 from scopemap.tracking.track import Status, Track
 
+_OF_TRACK = (
+    *("keyframe", "iterations", "map", "residual", "inlier_share", "correlation", "overlap"),
+    *("usable", "sharpness", "motion"),
+)
 _RECORD = np.dtype(
     [
         *((name, np.int64) for name in ("index", "keyframe", "iterations", "map", "text")),
         *((name, np.float64) for name in ("time_s", "residual", "inlier_share", "correlation", "overlap")),
-        *((name, np.float64) for name in ("depth_scale", "warped_share")),
+        *((name, np.float64) for name in ("depth_scale", "warped_share", "usable", "sharpness", "motion")),
         *((name, np.float64, (4, 4)) for name in ("T_tracked", "T_world_camera")),
         ("has_pose", np.int64),
         ("sizes", np.int64, (3,)),
@@ -43,7 +47,7 @@ class FrameRecords:
         """Put a record in; its submap is not known yet."""
         track, row = record.track, np.zeros(1, _RECORD)
         row["index"], row["time_s"], row["text"] = record.index, record.time_s, len(self._texts)
-        for name in ("keyframe", "iterations", "map", "residual", "inlier_share", "correlation", "overlap"):
+        for name in _OF_TRACK:
             row[name] = getattr(track, name)
         row["depth_scale"], row["warped_share"] = record.depth_scale, record.warped_share
         row["T_tracked"] = track.T_world_camera
@@ -85,6 +89,9 @@ def _record(row: np.void, texts: bytes) -> FrameRecord:
         float(row["overlap"]),
         int(row["iterations"]),
         int(row["map"]),
+        float(row["usable"]),
+        float(row["sharpness"]),
+        float(row["motion"]),
     )
     pose = row["T_world_camera"] if row["has_pose"] else None
     scale, share = float(row["depth_scale"]), float(row["warped_share"])

@@ -12,6 +12,7 @@ from scopemap.geometry.se3 import inverse
 
 Status = Literal["initial", "ok", "lost", "other-map"]
 
+TOO_DARK, TOO_BRIGHT = ", it is too dark", ", it is overexposed"
 RELOCALISED = "relocalised"
 """Reason of the track of a frame where features found the lost camera again."""
 
@@ -31,6 +32,8 @@ class Track:
     residual : robust standard deviation of the photometric residual, NaN if there was none.
     inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
     iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
+    usable : share of the image that shows tissue. sharpness : that of the image over the usual one. motion : median
+        optical flow since the frame before, share of the width. NaN where they are not known.
     """
 
     index: int
@@ -44,6 +47,9 @@ class Track:
     overlap: float = float("nan")
     iterations: int = 0
     map: int = 0
+    usable: float = float("nan")
+    sharpness: float = float("nan")
+    motion: float = float("nan")
 
 
 class FrameTracker(Protocol):

@@ -19,7 +19,7 @@ from scopemap.tracking.reprojection import pose_from_correspondences, reprojecti
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
-from scopemap.tracking.track import RELOCALISED, Status, Track
+from scopemap.tracking.track import RELOCALISED, TOO_BRIGHT, TOO_DARK, Status, Track
 
 _MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and more
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
@@ -28,6 +28,7 @@ _CLEAR_MATCHES = 40
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
+_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 
 
@@ -65,10 +66,16 @@ class Tracker:
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
         self._frames_since_keyframe += 1
-        if frame.valid.mean() < self.settings.min_valid_share:
+        usable = float(frame.valid.mean())
+        if usable < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
-            return self._lost(frame, f"only {frame.valid.mean():.0%} of the image is usable")
+            return replace(
+                self._lost(frame, f"only {usable:.0%} of the image is usable{_exposure(frame)}"), usable=usable
+            )
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
+        return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
+
+    def _track(self, frame: Frame, sharpness: float) -> Track:
         self._is_unsharp = sharpness < self.settings.min_sharpness
         unsharp = f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid"
         if self._keyframe is None:
@@ -306,6 +313,12 @@ class Tracker:
     def _enter_map(self, number: int) -> None:
         self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
+
+
+def _exposure(frame: Frame) -> str:
+    """Return in words that most of an image is dark or overexposed."""
+    low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
+    return TOO_DARK if middle < _DARK_LEVEL else TOO_BRIGHT if low > _BRIGHT_LEVEL else ""
 
 
 def _T_world_camera(keyframe: Keyframe, alignment: Alignment) -> np.ndarray:

@@ -156,6 +156,25 @@ function writePieces() {
   element("piece-list").replaceChildren(...buttons);
 }
 
+const MOST_LOSSES = 12;
+
+// The longest stretches, in the order of the video.
+function writeLosses() {
+  const all = run.losses, shortest = all.map((loss) => loss.frames).sort((a, b) => b - a)[MOST_LOSSES - 1] || 0;
+  const kept = all.filter((loss) => loss.frames >= shortest).slice(0, MOST_LOSSES), left = all.length - kept.length;
+  element("losses").hidden = !all.length;
+  element("loss-list").replaceChildren(...kept.map((loss) => {
+    const item = document.createElement("li"), button = document.createElement("button"), advice = document.createElement("span");
+    button.type = "button";
+    button.textContent = `${loss.when} (${loss.frames} ${loss.frames === 1 ? "frame" : "frames"}): ${loss.cause || "no cause was kept"}`;
+    advice.textContent = loss.advice;
+    button.addEventListener("click", () => setRow(loss.row));
+    item.append(button, advice);
+    return item;
+  }));
+  put("more-losses", left ? `And ${left} shorter ones: see frames.csv.` : "");
+}
+
 function open(number) {
   run = prepared(data.runs[number]);
   run.licences = data.licences;
@@ -166,6 +185,7 @@ function open(number) {
   writeVerdict(run);
   writeDetails(run);
   writePieces();
+  writeLosses();
   element("truth-key").hidden = !run.truth;
   const [near, far] = run.depth_range, unit = run.scale_known ? " mm" : "";
   put("depth-note", run.scale_known ? `red ${short(near)} to blue ${short(far)}${unit}` : "red near, blue far");

@@ -1,0 +1,63 @@
+"""The stretches of a video in which the camera was lost: when, why, and what the one who films can do about it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from itertools import groupby
+
+from scopemap.report.kept_run import LOST, NOT_USED, KeptRun
+from scopemap.trajectory.causes import ADVICE, NOT_FOUND_AGAIN
+
+
+@dataclass(frozen=True)
+class LostStretch:
+    """Successive frames that are lost: the rows and times of the first and the last, s, their number, and the cause."""
+
+    first: int
+    last: int
+    begin_s: float
+    end_s: float
+    frames: int
+    cause: str
+
+    @property
+    def advice(self) -> str:
+        """What the one who films can do about it; "" where a run of an earlier version kept no cause."""
+        return ADVICE.get(self.cause, "")
+
+    @property
+    def when(self) -> str:
+        """The time in words."""
+        return f"{self.begin_s:.2f} s" if self.first == self.last else f"{self.begin_s:.2f} to {self.end_s:.2f} s"
+
+
+def losses(run: KeptRun) -> list[LostStretch]:
+    """Return the stretches of lost frames of a run, in order; frames that were not used do not end one."""
+    used = [row for row in range(len(run.rows)) if run.place[row] != NOT_USED]
+    found = []
+    for is_lost, group in groupby(used, lambda row: run.place[row] == LOST):
+        rows = list(group)
+        if is_lost:
+            begin_s, end_s = (float(run.rows[row]["time_s"]) for row in (rows[0], rows[-1]))
+            found.append(LostStretch(rows[0], rows[-1], begin_s, end_s, len(rows), _main_cause(run, rows)))
+    return found
+
+
+def in_words(found: list[LostStretch]) -> str:
+    """Return what most of the lost frames were lost by, with the advice; "" where nothing is known of it."""
+    frames: Counter[str] = Counter()
+    for loss in found:
+        if loss.cause:
+            frames[loss.cause] += loss.frames
+    if not frames:
+        return ""
+    cause = frames.most_common(1)[0][0]
+    return f"Mostly by this: {cause}. Next time: {ADVICE[cause]}."
+
+
+def _main_cause(run: KeptRun, rows: list[int]) -> str:
+    """Return the cause of most frames; what began the loss counts, not that the camera is not found again later."""
+    causes = Counter(run.rows[row].get("cause", "") for row in rows)
+    began = {cause: count for cause, count in causes.items() if cause != NOT_FOUND_AGAIN}
+    return max(began or causes, key=lambda cause: causes[cause])
