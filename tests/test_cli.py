@@ -23,8 +23,8 @@ from scopemap.cli import main
 
 OPTIONS = {
     "run": "--out --preset --config --dataset --camera --fov --camera-fit --stereo --deinterlace --near-far --depth"
-    " --flow --frames --fps --size --device --colours --mesh-faces --mesh-smooth --mesh-watertight --set --overwrite"
-    " --resume --json --quiet",
+    " --camera-at-rest --surface-at --flow --frames --fps --size --device --colours --mesh-faces --mesh-smooth"
+    " --mesh-watertight --set --overwrite --resume --json --quiet",
     "evaluate": "--truth --align --unit --paper-units --json --quiet",
     "phantom": "--scene --frames --size --seed --path --deform --loop --events --set --json --quiet",
     "models list": "--json --quiet",

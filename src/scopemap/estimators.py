@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,6 +28,7 @@ from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
 from scopemap.pipeline import Estimators
 from scopemap.tracking.alike import AlikeFeatures
+from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
 
 _VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
@@ -59,15 +60,17 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
         sequence.depth_scale_mm,
         calibrated=sequence.calibrated,
     )
+    corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)
     return Estimators(
         depth,
         create_anchor(config.depth, networks.device),
         own.flow or create_flow(networks.flow, networks.device),
-        own.flow or create_flow(networks.keyframe_flow, networks.device),
+        corner_flow,
         own.flow or create_flow(networks.keyframe_flow, networks.device),
         create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks),
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
+        partial(CameraAtRest, config.tracking, corner_flow) if config.tracking.camera_at_rest else None,
     )
 
 

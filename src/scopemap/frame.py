@@ -17,6 +17,9 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import check_shape
 
+REGIONS = 6, 8
+"""Rows and columns of the regions of a picture whose tissue is looked at for motion of its own."""
+
 _CONSTANT_RANGE = 4
 # Width of the box filter that leaves little of a sensor's noise.
 _NOISE_WIDTH_PX = 9
@@ -39,6 +42,8 @@ class Frame:
     name : the file's own name, or "".
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: not estimated.
     highlights : (H, W) bool, True where `valid` is False for a specular highlight alone; None: not looked for.
+    nonrigidity : `REGIONS` float32, as `tracking.track.Track` has it; None: not measured.
+    weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
     """
 
     index: int
@@ -51,6 +56,8 @@ class Frame:
     name: str = ""
     depth_sigma_mm: np.ndarray | None = None
     highlights: np.ndarray | None = None
+    nonrigidity: np.ndarray | None = None
+    weight: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -64,6 +71,10 @@ class Frame:
             check_shape("Frame.highlights", self.highlights, size)
         if self.T_world_camera is not None:
             check_shape("Frame.T_world_camera", self.T_world_camera, (4, 4))
+        if self.nonrigidity is not None:
+            check_shape("Frame.nonrigidity", self.nonrigidity, REGIONS)
+        if self.weight is not None:
+            check_shape("Frame.weight", self.weight, size)
 
     def downscaled(self, factor: int) -> Frame:
         """Return the image with its valid pixels and camera at 1/factor of the size, without results of stages."""

@@ -14,6 +14,7 @@ it tracks.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -52,6 +53,7 @@ class Estimators:
     perceptual: PerceptualDistance
     masks: StoredMasks | None = None
     features: FeatureDetector = field(default_factory=SiftFeatures)
+    tracker: Callable[[], FrameTracker] | None = None  # makes what tracks in place of `Tracker`
 
 
 @dataclass(frozen=True)
@@ -110,10 +112,12 @@ class Pipeline:
         self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method == "full")
         self._masker = Masker(config.mask, estimators.masks)
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
-        self._tracker = tracker or Tracker(config.tracking, estimators.corner_flow, estimators.features)
+        self._tracker = tracker or (estimators.tracker or self._own_tracker)()
         self._mapis = Mapis(config.mapis)
         self._smooth = create_smoother(config.smoothing)
-        self.mapper = Mapper(config.mapping, estimators.keyframe_flow, store.table, estimators.features)
+        at_rest = {"method": "none"} if config.tracking.camera_at_rest else {}  # there is nothing to adjust
+        mapping = config.mapping.model_copy(update=at_rest)
+        self.mapper = Mapper(mapping, estimators.keyframe_flow, store.table, estimators.features)
         self._last_track: Track | None = None
         self._last_frame: tuple[Frame, Track] | None = None
         self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
@@ -180,6 +184,7 @@ class Pipeline:
             self._reset()
         refined = refined or self._refine(preprocessed, motion_between(last, track))
         frame = _with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
+        frame = replace(frame, nonrigidity=track.nonrigidity)
         self._add_last_keyframe(track)
         track = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":
@@ -203,8 +208,9 @@ class Pipeline:
 
     def new_tracker(self) -> Tracker | None:
         """Return a tracker that has seen no frame, to track lost frames anew; None where the caller's own tracks."""
-        if not isinstance(self._tracker, Tracker):
-            return None
+        return self._own_tracker() if isinstance(self._tracker, Tracker) else None
+
+    def _own_tracker(self) -> Tracker:
         return Tracker(self.config.tracking, self.estimators.corner_flow, self.estimators.features)
 
     def fuse(self, step: Step) -> None:

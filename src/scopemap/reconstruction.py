@@ -56,6 +56,7 @@ _COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
     *("depth_scale", "warped_share", "usable", "sharpness", "motion", "cause"),
+    *("moving_share", "moving_x", "moving_y"),
 ]
 
 
@@ -98,6 +99,7 @@ class FrameRecord:
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
             *("" if np.isnan(seen) else f"{seen:.4g}" for seen in (track.usable, track.sharpness, track.motion)),
             self.cause,
+            *("" if np.isnan(number) else f"{number:.3f}" for number in track.moving),
         ]
 
 

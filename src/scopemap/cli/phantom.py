@@ -27,7 +27,7 @@ def phantom(
     events: Annotated[
         str,
         typer.Option(
-            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, fluid, instrument, turn, contact, push"
+            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, fluid, instrument, turn, contact, push, poke"
         ),
     ] = "",
     settings: Annotated[

@@ -81,6 +81,16 @@ def run(
             metavar="X,Y,W,H", help="Blacken a box of the input's pictures, px, before anything sees it; repeatable."
         ),
     ] = None,
+    camera_at_rest: Annotated[
+        bool,
+        typer.Option(
+            "--camera-at-rest", help="The camera does not move (robotic surgery): one surface per frame, surfaces/."
+        ),
+    ] = False,
+    surface_at: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="The surface as seen at that second, where tissue moves on its own."),
+    ] = None,
     near_far: Annotated[
         str | None,
         typer.Option(
@@ -148,8 +158,10 @@ def run(
         "run.memory_mb": parse_memory(memory) if memory else None,
         "depth.backend": depth,
         "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
+        "tracking.camera_at_rest": camera_at_rest or None,
         "networks.flow": flow,
         "networks.device": device,
+        "fusion.surface_at_s": surface_at,
         "fusion.colours": colours,
         "fusion.mesh_faces": mesh_faces,
         "fusion.mesh_smooth": mesh_smooth,

@@ -96,6 +96,11 @@ class FusionSettings(Settings):
         None, gt=0, le=1e6, description="depth beyond this is not fused, mm; default: 200 voxels"
     )
     every: int = Field(1, ge=1, description="fuse every n-th tracked frame")
+    surface_at_s: float | None = Field(
+        None,
+        description="the surface as seen at this second, by the time stamps, where tissue moves on its own "
+        "(moving_share in frames.csv); default: the mean of all frames there, too",
+    )
     colours: Literal["albedo", "raw"] = Field(
         "albedo",
         description="colours of the mesh; albedo: the tissue's, without the lamp's fall-off, in one exposure for all "

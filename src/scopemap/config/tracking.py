@@ -58,6 +58,11 @@ class TrackingPaper(Settings):
 class TrackingSettings(Settings):
     """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
 
+    camera_at_rest: bool = Field(
+        False,
+        description="the camera is known not to move: poses stay the first one, motion is the tissue's, and every "
+        "frame has a surface of its own (surfaces/)",
+    )
     keyframe_every: int = Field(10, ge=1, description="every n-th frame becomes a keyframe (the paper: 2)")
     min_valid_share: float = Field(0.1, ge=0, le=1, description="a frame with a smaller usable overlap is lost")
     min_sharpness: float = Field(

@@ -10,8 +10,10 @@ import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import FusionSettings
 from scopemap.depth.estimate import PerceptualDistance
 from scopemap.depth.perceptual import structural_similarity
+from scopemap.frame import Frame
 from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
 
@@ -105,3 +107,14 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
     if lpips.size:
         figures["lpips"] = float(lpips.mean())
     return figures
+
+
+def surface_agreement(mesh: trimesh.Trimesh, settings: FusionSettings, frames: list[Frame]) -> dict[str, float]:
+    """Return the figures of a fusion's surface with some of its frames; {} without a surface or frames."""
+    agreements = []
+    for frame in frames if len(mesh.faces) else []:
+        if frame.T_world_camera is not None and frame.depth_mm is not None:
+            depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
+            seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+            agreements.append(compare_with_frame(mesh, *seen, albedo=settings.colours == "albedo")[0])
+    return agreement_figures(agreements) if agreements else {}

@@ -19,7 +19,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.frame import Frame, Rows
+from scopemap.frame import REGIONS, Frame, Rows
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP, _MIN_MM = 3e-4, 1e-4
@@ -38,6 +38,7 @@ _ENTRY = np.dtype(
         ("offset", np.int64),
         ("sizes", np.int64, (5,)),
         ("median_depth_mm", np.float64),
+        ("nonrigidity", np.float32, REGIONS),
     ]
 )
 """Small data of a frame, the number of its camera, and its images: offset in the file, sizes in bytes (0: none)."""
@@ -141,6 +142,7 @@ class FrameStore:
         entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, self._end
         entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), _median_depth_mm(frame)
         entry["sizes"][0, : len(parts)] = [len(part) for part in parts]
+        entry["nonrigidity"] = np.nan if frame.nonrigidity is None else frame.nonrigidity
         if frame.T_world_camera is not None:
             entry["has_pose"], entry["T_world_camera"] = True, frame.T_world_camera
         self._entries.append(entry)
@@ -252,6 +254,7 @@ class FrameStore:
             entry["T_world_camera"] if entry["has_pose"] else None,
             depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
             highlights=_bits(highlights, shape),
+            nonrigidity=entry["nonrigidity"].copy(),
         )
 
 

@@ -127,7 +127,8 @@ class TsdfVolume:
         surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
         weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
-        surface = surface._replace(weight=weight if advanced.weighted else (weight > 0).astype(np.float32))
+        weight = weight if advanced.weighted else (weight > 0).astype(np.float32)
+        surface = surface._replace(weight=weight if frame.weight is None else weight * frame.weight)
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
         else:

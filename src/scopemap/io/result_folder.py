@@ -36,7 +36,7 @@ _OWN_FILES = (
     *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
     *("config.toml", "provenance.json", "report.html", "summary.png", "SHA256SUMS"),
 )
-_OWN_FOLDERS = ("depth", "depth_sigma", "depth_preview", "frames", "pictures", "maps", "against_video")
+_OWN_FOLDERS = ("depth", "depth_sigma", "depth_preview", "frames", "pictures", "maps", "against_video", "surfaces")
 # Files by which a run's folder is recognised.
 _MARKS = ("provenance.json", "depth/depth.json")
 

@@ -1,47 +1,59 @@
 """Deformation: tissue that breathes or is pushed, as a smooth displacement with bounded gradient.
 
-The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves.
+The tissue at the point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 _FIXED_POINT_STEPS = 40
 _PUSH_MM = 6.0
+_POKE_MM, _POKED_SHARE = 8.0, 0.2
 _PUSH_LENGTH_MM = 110.0
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """The displacement of one instant: `waves` (M, 7) float64, wave vector (rad/mm), amplitude (mm), phase (rad)."""
+    """The displacement of one instant.
+
+    waves : (M, 7) float64, wave vector (rad/mm), amplitude (mm), phase (rad). bumps : (B, 7) float64, centre (mm),
+    amplitude (mm), and the q (1/mm^2) of a displacement of exp(-q distance^2) of it.
+    """
 
     waves: np.ndarray
+    bumps: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
 
     @property
     def stretch(self) -> float:
         """Upper bound of the slope of p -> p - u(p)."""
-        return 1.0 + float(
-            (np.linalg.norm(self.waves[:, :3], axis=1) * np.linalg.norm(self.waves[:, 3:6], axis=1)).sum()
-        )
+        waves = np.linalg.norm(self.waves[:, :3], axis=1) * np.linalg.norm(self.waves[:, 3:6], axis=1)
+        # A bump is steepest at the distance sqrt(1 / 2q).
+        bumps = np.sqrt(2 * self.bumps[:, 6] / np.e) * np.linalg.norm(self.bumps[:, 3:6], axis=1)
+        return 1.0 + float(waves.sum() + bumps.sum())
 
     def at(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement u (N, 3) in mm at points (N, 3) of space."""
-        return np.sin(points_mm @ self.waves[:, :3].T + self.waves[:, 6]) @ self.waves[:, 3:6]
+        moved: np.ndarray = np.sin(points_mm @ self.waves[:, :3].T + self.waves[:, 6]) @ self.waves[:, 3:6]
+        for bump in self.bumps:
+            moved = moved + np.exp(-bump[6] * ((points_mm - bump[:3]) ** 2).sum(1))[:, None] * bump[3:6]
+        return moved
 
     def move(self, rest_mm: np.ndarray) -> np.ndarray:
         """Return where rest points (N, 3) are now: the fixed point of p = q + u(p), to 1e-6 mm or better."""
         points = rest_mm
-        for _ in range(_FIXED_POINT_STEPS if len(self.waves) else 0):
+        for _ in range(_FIXED_POINT_STEPS if len(self.waves) or len(self.bumps) else 0):
             points = rest_mm + self.at(points)
         return points
 
-    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
-        """Return the waves (M, 7) for coordinates in voxels from `origin_mm`."""
+    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the waves (M, 7) and the bumps (B, 7) for coordinates in voxels from `origin_mm`."""
         k, amplitude, phase = self.waves[:, :3], self.waves[:, 3:6], self.waves[:, 6:]
-        return np.concatenate([k * voxel_mm, amplitude / voxel_mm, phase + (k @ origin_mm)[:, None]], axis=1)
+        waves = np.concatenate([k * voxel_mm, amplitude / voxel_mm, phase + (k @ origin_mm)[:, None]], axis=1)
+        centre, poke, q = self.bumps[:, :3], self.bumps[:, 3:6], self.bumps[:, 6:]
+        return waves, np.concatenate([(centre - origin_mm) / voxel_mm, poke / voxel_mm, q * voxel_mm**2], axis=1)
 
 
 REST = Displacement(np.zeros((0, 7)))
@@ -61,16 +73,17 @@ class Breathing:
 
 @dataclass(frozen=True)
 class Push:
-    """Waves (M, 7) as in `Displacement`, from rest at the frame `first` to their full amplitude at `last`."""
+    """Waves (M, 7) and bumps (B, 7) as in `Displacement`, from rest at the frame `first` to their full amplitude at `last`."""
 
     waves: np.ndarray
     first: int
     last: int
+    bumps: np.ndarray = field(default_factory=lambda: REST.bumps)
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
         share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
-        return _scaled(self.waves, 0.5 - 0.5 * np.cos(np.pi * share))
+        return _scaled(self.waves, 0.5 - 0.5 * np.cos(np.pi * share), self.bumps)
 
 
 @dataclass(frozen=True)
@@ -81,11 +94,13 @@ class TissueMotion:
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
-        return Displacement(np.concatenate([REST.waves, *(part.at(time).waves for part in self.parts)]))
+        parts = [REST, *(part.at(time) for part in self.parts)]
+        return Displacement(np.concatenate([p.waves for p in parts]), np.concatenate([p.bumps for p in parts]))
 
 
-def _scaled(waves: np.ndarray, strength: float) -> Displacement:
-    return Displacement(waves * [1, 1, 1, strength, strength, strength, 1])
+def _scaled(waves: np.ndarray, strength: float, bumps: np.ndarray = REST.bumps) -> Displacement:
+    factors = [1, 1, 1, strength, strength, strength, 1]
+    return Displacement(waves * factors, bumps * factors)
 
 
 def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) -> Push:
@@ -95,6 +110,13 @@ def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) 
     middle = T_world_camera[:3, 3] + distance_mm * ahead
     wave = np.concatenate([along, _PUSH_MM * (0.8 * down - 0.6 * ahead), [-along @ middle]])
     return Push(wave[None], first, last)
+
+
+def poke(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Push:
+    """Return a push of the tissue around a point (3,), seen from so far, along a unit vector (3,); the rest stays."""
+    radius_mm = max(_POKED_SHARE * distance_mm, 2 * _POKE_MM)
+    bump = np.concatenate([point_mm, _POKE_MM * direction, [0.5 / radius_mm**2]])
+    return Push(REST.waves, first, last, bump[None])
 
 
 def breathing(amplitude_mm: float, period_frames: float, seed: int) -> Breathing:

@@ -9,7 +9,7 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.phantom.camera_path import lumen_path, sweep_path, touching, turned
 from scopemap.phantom.cavity import Tint, laparoscopy_volume
-from scopemap.phantom.deformation import Breathing, Push, TissueMotion, breathing, push
+from scopemap.phantom.deformation import REST, Breathing, Push, TissueMotion, breathing, poke, push
 from scopemap.phantom.exposing import exposure_times, lagging_gains, pose_at
 from scopemap.phantom.instrument import insert, instrument
 from scopemap.phantom.lumen import colon_volume, tube_volume
@@ -24,6 +24,8 @@ _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 # Exposure is measured in a small picture, as cameras do.
 _METERING_SHARE = 8
+# Where a frame shows what is poked, over its height and width.
+_POKED_AT = 0.5, 0.68
 _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
 
@@ -55,7 +57,7 @@ def prepare(spec: PhantomSpec) -> Phantom:
     volume, appearance = build_scene(spec, poses)
     for event in _events(spec, "contact"):
         poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
-    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses), None)
+    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
     return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
@@ -65,13 +67,30 @@ def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
     return [event for event in spec.events if event.kind == kind]
 
 
-def _motion(spec: PhantomSpec, poses: np.ndarray) -> TissueMotion:
+def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotion:
     """Breathing and pushes of the tissue."""
     parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
     away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene == "laparoscopy" else "lumen"]
     for event in _events(spec, "push"):
         parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
+    parts += [_poke(spec, event, poses[min(event.first, len(poses) - 1)], volume) for event in _events(spec, "poke")]
     return TissueMotion(tuple(parts))
+
+
+def _poke(spec: PhantomSpec, event: Event, T_world_camera: np.ndarray, volume: Volume) -> Push:
+    """Return the push of what a camera sees on the right of its middle: half into the wall, half along it.
+
+    Raises `InputError` where nothing is seen there.
+    """
+    surface = march(volume, spec.camera, T_world_camera, REST)
+    row, column = (round(share * side) for share, side in zip(_POKED_AT, surface.depth_mm.shape, strict=True))
+    if not np.isfinite(surface.depth_mm[row, column]):
+        raise InputError(f"nothing to poke: frame {event.first} shows no tissue on the right of its middle")
+    normal = T_world_camera[:3, :3] @ surface.normal[row, column]
+    along = np.cross(normal, T_world_camera[:3, 1])
+    direction = along / np.linalg.norm(along) - normal
+    direction /= np.linalg.norm(direction)
+    return poke(event.first, event.last, surface.rest_mm[row, column], direction, surface.depth_mm[row, column])
 
 
 def _lagging_exposure(phantom: Phantom) -> np.ndarray:

@@ -14,7 +14,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "tube"]
-EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push"]
+EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push", "poke"]
 
 DEFAULT_FRAMES = 200
 C3VD_DEPTH_SCALE_MM = 100.0 / 65535
@@ -27,6 +27,7 @@ class Event:
     black, blur, smoke, fluid : of the picture. instrument : one enters, works and leaves. turn : the camera turns by 30
     degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera turns to the wall
     and touches it, then goes back. push : the tissue is pushed two ways from `first` on, and stays so from `last` on.
+    poke : so is the part of it on the right of the view alone, by 8 mm, half into the wall and half along it.
     """
 
     kind: EventName

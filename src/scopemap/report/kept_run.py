@@ -123,7 +123,7 @@ def _kept_map(folder: Path, trajectory: Trajectory) -> KeptMap:
 
 
 def _read_mesh(file: Path) -> trimesh.Trimesh:
-    """Return the mesh in a file with its vertices' confidence; an empty one where there is no file or no face."""
+    """Return the mesh in a file with its vertices' attributes; an empty one where there is no file or no face."""
     if not file.is_file():
         return trimesh.Trimesh()
     with reporting(f"cannot read {file}"):
@@ -132,8 +132,8 @@ def _read_mesh(file: Path) -> trimesh.Trimesh:
             return trimesh.Trimesh()
         # trimesh leaves properties that it does not know in the raw table.
         vertices = mesh.metadata["_ply_raw"]["vertex"]["data"]
-        if "confidence" in vertices.dtype.names:
-            mesh.vertex_attributes["confidence"] = np.array(vertices["confidence"])
+        for name in {"confidence", "moving"} & set(vertices.dtype.names):
+            mesh.vertex_attributes[name] = np.array(vertices[name])
     return mesh
 
 

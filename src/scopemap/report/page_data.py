@@ -29,7 +29,7 @@ _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
 _DEPTH_WIDTH_PX = 160
 _LOOKED_AT = 25
-_CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale"}
+_CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale", "moving": "moving_share"}
 _LEVELS = 254
 
 

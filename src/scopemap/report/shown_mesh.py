@@ -85,11 +85,15 @@ def times_seen(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCa
 def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera) -> dict[str, Any]:
     """Return a mesh for the page: base64 arrays; `seen` is how often each vertex was seen, 255 = in all frames.
 
-    positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, seen: uint8. faces: uint32.
+    positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, moving, seen: uint8.
+    faces: uint32.
     """
     low, high = (np.zeros(3), np.ones(3)) if not len(mesh.vertices) else np.asarray(mesh.bounds)
     spread = np.maximum(high - low, 1e-9)
-    confidence = np.asarray(mesh.vertex_attributes.get("confidence", np.ones(len(mesh.vertices))), np.float64)
+    confidence, moving = (
+        np.asarray(mesh.vertex_attributes.get(name, np.full(len(mesh.vertices), otherwise)), np.float64)
+        for name, otherwise in (("confidence", 1.0), ("moving", 0.0))
+    )
     seen = times_seen(mesh, frames, camera)
     return {
         "vertices": len(mesh.vertices),
@@ -99,6 +103,7 @@ def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCam
         "normals": base64_of(np.round(127 * np.asarray(mesh.vertex_normals)), "i1"),
         "colours": base64_of(vertex_colours(mesh)[:, :3], "u1"),
         "confidence": base64_of(np.round(255 * np.clip(confidence.ravel(), 0, 1)), "u1"),
+        "moving": base64_of(np.round(255 * np.clip(moving.ravel(), 0, 1)), "u1"),
         "seen": base64_of(np.round(255 * seen / max(len(frames), 1)), "u1"),
         "looked": len(frames),
         "faces": base64_of(mesh.faces, "u4"),

@@ -170,8 +170,14 @@ def _of_camera(run: KeptRun) -> list[Reason]:
     if "the scene is not rigid or the focal length is wrong" in notes:
         text = "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed."
         found.append(Reason("doubtful", text))
-    if "the camera is at rest while the tissue moves" in notes:
+    if "the camera is at rest, as stated" in notes:
+        text = "The camera was stated to be at rest: each frame has a surface of its own. Had it moved, all were wrong."
+        found.append(Reason("note", text))
+    elif "the camera is at rest while the tissue moves" in notes:
         found.append(Reason("doubtful", "The camera hardly moves while the tissue does: the path means little."))
+    if moving := re.search(r"tissue: in (\d+) of (\d+) frames", notes):
+        text = f"Tissue moves on its own in {moving[1]} of {moving[2]} frames: there the surface is a mean."
+        found.append(Reason("note", f"{text} Tissue that moves as a whole looks like a moving camera."))
     if "the lens has radial distortion" in notes:
         found.append(Reason("doubtful", "The lens bends straight lines: shapes are bent, too. A calibration mends it."))
     return found

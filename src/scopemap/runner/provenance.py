@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections import Counter
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from scopemap.estimators import estimators_provenance, package_versions, scale_f
 from scopemap.io.sequence import Sequence
 from scopemap.pipeline import Estimators
 from scopemap.reconstruction import FrameRecord, frame_counts
+
+_MOVING_SHARE = 0.1  # of the picture: less may be chance, such as a few false matches
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,23 @@ class Limits:
     frames: int | None = None
     maps: int | None = None
     blocks: int | None = None
+
+
+def motion_notes(records: list[FrameRecord], config: Config) -> list[str]:
+    """Return whether the camera was stated to be at rest, and where and how often tissue moves on its own."""
+    at_rest = ["tracking: the camera is at rest, as stated: all motion is the tissue's"]
+    found = at_rest if config.tracking.camera_at_rest else []
+    measured = [(record.index, *record.track.moving) for record in records if record.T_world_camera is not None]
+    measured = [one for one in measured if not math.isnan(one[1])]
+    moving = [one for one in measured if one[1] > _MOVING_SHARE]
+    if not moving:
+        return found
+    index, share, x, y = max(moving, key=lambda one: one[1])
+    return [
+        *found,
+        f"tissue: in {len(moving)} of {len(measured)} frames more than {_MOVING_SHARE:.0%} of the picture moves on its "
+        f"own; most in frame {index}: {share:.0%}, around {x:.2f} of the width and {y:.2f} of the height",
+    ]
 
 
 def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 
-from scopemap.frame import RowTable
+from scopemap.errors import InputError
+from scopemap.frame import REGIONS, RowTable
 from scopemap.reconstruction import FrameRecord
 from scopemap.tracking.track import Status, Track
 
@@ -20,6 +22,7 @@ _RECORD = np.dtype(
         *((name, np.int64) for name in ("index", "keyframe", "iterations", "map", "text")),
         *((name, np.float64) for name in ("time_s", "residual", "inlier_share", "correlation", "overlap")),
         *((name, np.float64) for name in ("depth_scale", "warped_share", "usable", "sharpness", "motion")),
+        ("nonrigidity", np.float32, REGIONS),
         *((name, np.float64, (4, 4)) for name in ("T_tracked", "T_world_camera")),
         ("has_pose", np.int64),
         ("sizes", np.int64, (3,)),
@@ -51,6 +54,7 @@ class FrameRecords:
             row[name] = getattr(track, name)
         row["depth_scale"], row["warped_share"] = record.depth_scale, record.warped_share
         row["T_tracked"] = track.T_world_camera
+        row["nonrigidity"] = np.nan if track.nonrigidity is None else track.nonrigidity
         if record.T_world_camera is not None:
             row["has_pose"], row["T_world_camera"] = True, record.T_world_camera
         # A file's name may hold bytes that are no UTF-8.
@@ -74,6 +78,14 @@ class FrameRecords:
         return set(forgotten.tolist())
 
 
+def check_tracked(records: list[FrameRecord], path: Path) -> None:
+    """Raise `InputError` where no frame of the input at a path was tracked."""
+    if all(record.track.status == "lost" for record in records):
+        reason = records[0].track.reason if records else "interrupted before the first"
+        guess = "" if "max_depth_mm" in reason else " (black or constant?)"
+        raise InputError(f"no frame of {path} could be used: {reason}{guess}")
+
+
 def _record(row: np.void, texts: bytes) -> FrameRecord:
     ends = (row["text"] + np.cumsum([0, *row["sizes"]])).tolist()
     name, status, reason = (texts[a:b].decode("utf-8", "surrogateescape") for a, b in pairwise(ends))
@@ -92,6 +104,7 @@ def _record(row: np.void, texts: bytes) -> FrameRecord:
         float(row["usable"]),
         float(row["sharpness"]),
         float(row["motion"]),
+        row["nonrigidity"].copy(),
     )
     pose = row["T_world_camera"] if row["has_pose"] else None
     scale, share = float(row["depth_scale"]), float(row["warped_share"])

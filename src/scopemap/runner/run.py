@@ -19,12 +19,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from scopemap.config import Config
-from scopemap.errors import InputError
 from scopemap.estimators import compiling_s, largest_depth_mm
 from scopemap.frame import Frame, Rows
-from scopemap.fusion.agreement import agreement_figures, compare_with_frame
+from scopemap.fusion.agreement import surface_agreement
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.moving import MovingTissue, block_edge_mm
+from scopemap.fusion.seen_at import SeenAt
 from scopemap.fusion.volume import FusedSurface, depth_warnings
 from scopemap.io.checksums import input_checksum, write_checksums
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
@@ -41,10 +42,11 @@ from scopemap.reconstruction import (
 )
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
+from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import Progress, prepare
-from scopemap.runner.provenance import Limits, provenance_of, refuse_own_input
-from scopemap.runner.records import FrameRecords
+from scopemap.runner.provenance import Limits, motion_notes, provenance_of, refuse_own_input
+from scopemap.runner.records import FrameRecords, check_tracked
 from scopemap.tracking.track import FrameTracker, Track
 
 Observer = Callable[[Step], bool | None]
@@ -99,6 +101,8 @@ def reconstruct(
         write = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
         with closing(store):
             run = Run(sequence, config, Pipeline(config, estimators, store, tracker), clock, write, progress)
+            if folder is not None and config.tracking.camera_at_rest:
+                run.write_surface = SurfaceWriter(folder, config, estimators)
             if folder is None:
                 run.track(observers)
             else:
@@ -131,6 +135,7 @@ class Run:
     clock: Clock
     write: DepthWriter | None
     progress: Progress
+    write_surface: SurfaceWriter | None = None
     stopped: bool = False
     interrupted: bool = False
     records: FrameRecords = field(init=False)
@@ -171,8 +176,8 @@ class Run:
         some_mm = step.refined.depth_mm[::4, ::4]
         if np.isfinite(some_mm).any():
             self.median_depths_mm.append(np.array([np.nanmedian(some_mm)]))
-        if self.write is not None and not self.pipeline.fusion.at_end:
-            self.write(step.frame)
+        if not self.pipeline.fusion.at_end:
+            self._write_depth(step.frame)
         if self.pipeline.fusion.at_once:
             self.checked[step.track.map].put(step.frame)
         self.records.append(FrameRecord.of(step))
@@ -195,13 +200,6 @@ class Run:
             self.pipeline.mapper.forget(older)
             self.forgotten += len(older)
 
-    def check(self, records: list[FrameRecord]) -> None:
-        """Raise `InputError` where no frame was tracked."""
-        if all(record.track.status == "lost" for record in records):
-            reason = records[0].track.reason if records else "interrupted before the first"
-            guess = "" if "max_depth_mm" in reason else " (black or constant?)"
-            raise InputError(f"no frame of {self.sequence.path} could be used: {reason}{guess}")
-
     def _frames(self, after: int) -> Iterator[Frame]:
         """Yield the frames after one until an observer asks for a stop."""
         for frame in self.sequence.frames(after):
@@ -213,7 +211,7 @@ class Run:
     def result(self, notes: list[str]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         records = self.records.read()
-        self.check(records)
+        check_tracked(records, self.sequence.path)
         records = self.clock.timed("track backwards", self._after_going_back, records)
         self.progress("adjusting keyframes", 0, 0)
         submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
@@ -249,23 +247,27 @@ class Run:
         depths = self._triangulated_depths(final)
         with closing(depths) if depths is not None else nullcontext():
             corrected = _ahead(final.frames(None if depths is None else depths.depth), "correct")
-            frames = _ahead(self._written(corrected, submap.main), "write")
+            # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
+            median_mm = store.median_depth_mm(submap.main_frames)
+            moving, at_s = MovingTissue(block_edge_mm(median_mm)), self.config.fusion.surface_at_s
+            seen_at = None if at_s is None else SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
+            written = self._written(corrected, submap.main, moving)
+            frames = _ahead(written if seen_at is None else map(seen_at.weighted, written), "write")
             with closing(frames):
                 fused: FusedSurface = self.clock.timed(
                     "fuse", pipeline.fusion.fuse, frames, submap.main_frames, submap.main
                 )
         fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
+        fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
         checked = self.checked.pop(submap.main, _SpreadFrames()).frames
-        agreement = self.clock.timed("check surface", _surface_agreement, fused, checked)
+        agreement = self.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked)
         provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, records)
         correction = [] if submap.correction is None else [submap.correction.description]
-        provenance["notes"] += (
-            notes + self.plan.notes + correction + ([] if depths is None else [depths.description]) + fused.notes
-        )
+        depth_notes = [] if depths is None else [depths.description]
+        motion = motion_notes(records, self.config) + ([] if seen_at is None else [seen_at.note])
+        provenance["notes"] += notes + self.plan.notes + motion + correction + depth_notes + fused.notes
         masks = pipeline.estimators.masks
         provenance["warnings"] += [] if masks is None else masks.warnings
-        # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
-        median_mm = store.median_depth_mm(submap.main_frames)
         medians_mm = self.median_depths_mm.read().tolist() if median_mm is None else [median_mm]
         provenance["warnings"] += depth_warnings(medians_mm, fused.settings)
         provenance["surface"] = agreement
@@ -283,31 +285,27 @@ class Run:
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
 
-    def _written(self, frames: Iterator[Frame], main: int) -> Iterator[Frame]:
-        """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked."""
+    def _written(self, frames: Iterator[Frame], main: int, moving: MovingTissue) -> Iterator[Frame]:
+        """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked.
+
+        moving : counts them all.
+        """
         for frame in frames:
+            if frame.nonrigidity is not None and frame.T_world_camera is not None:
+                usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
+                moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
             self.checked[main].put(frame)
             yield self._write_depth(frame)
             self.final_done += 1
             self.progress("fusing", self.final_done, self.final_frames)
 
     def _write_depth(self, frame: Frame) -> Frame:
-        """Write the final depth of a frame."""
+        """Write the final depth of a frame, and its surface where each has one of its own."""
         if self.write is not None:
             self.write(frame)
+        if self.write_surface is not None and frame.T_world_camera is not None:
+            self.write_surface(frame)
         return frame
-
-
-def _surface_agreement(fused: FusedSurface, frames: list[Frame]) -> dict[str, float]:
-    """Return the agreement of a surface with some of its frames; {} without a surface or frames."""
-    agreements = []
-    for frame in frames if len(fused.mesh.faces) else []:
-        if frame.T_world_camera is not None and frame.depth_mm is not None:
-            depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
-            seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
-            found, _ = compare_with_frame(fused.mesh, *seen, albedo=fused.settings.colours == "albedo")
-            agreements.append(found)
-    return agreement_figures(agreements) if agreements else {}
 
 
 class _SpreadFrames:

@@ -5,7 +5,8 @@ A relative error of depth moves a point along its epipolar line. The covariance 
     sigma^2 I + (s a)(s a)^T,    a = d(pixel) / d(ln depth),    s: relative standard deviation of depth,
 
 and its inverse follows from Sherman and Morrison. Errors across the line count in full, so that rotations, which move
-all points alike, are not biased by wrong depth.
+all points alike, are not biased by wrong depth. By the same covariance errors are significant, or not: where those of
+neighbouring points agree and noise does not explain them, the tissue moves on its own.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from numba import njit
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.flow.corners import Correspondences2D3D
+from scopemap.frame import REGIONS
 from scopemap.geometry.least_squares import DenseModel, Options, Problem, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 
 _MIN_POINTS = 50
+_MIN_REGION_POINTS = 4
 _SIGMA_PX = 0.5
 _MIN_SCALE = 0.1
 _MAX_RESCALES = 20
@@ -60,6 +63,33 @@ def reprojection_error_px(correspondences: Correspondences2D3D, camera: PinholeC
     projected, _, in_front = _projected(correspondences.points_mm, camera, T)
     errors = np.linalg.norm(projected - correspondences.pixels, axis=1)
     return float(np.median(np.where(in_front, errors, np.inf)))
+
+
+def nonrigidity(
+    correspondences: Correspondences2D3D, camera: PinholeCamera, T: np.ndarray, depth_sigma_share: float
+) -> np.ndarray:
+    """Return by how many standard deviations each region of the picture moves against a rigid scene, `REGIONS` float32.
+
+    T : T_current_reference (4, 4). NaN in regions with fewer than 4 points. It is the length of the region's median
+    reprojection error over its covariance, as above; the scatter of the region's errors adds to the matching's noise,
+    since false matches scatter and tissue moves as one.
+    """
+    projected, along, in_front = _projected(correspondences.points_mm, camera, T)
+    errors, along = correspondences.pixels - projected, along * depth_sigma_share
+    rows, columns = REGIONS
+    place = (correspondences.pixels + 0.5) / [camera.width, camera.height] * [columns, rows]
+    column, row = np.clip(place.astype(int), 0, [columns - 1, rows - 1]).T
+    region, found = np.where(in_front, row * columns + column, -1), np.full(rows * columns, np.nan, np.float32)
+    for number in range(rows * columns):
+        own = np.flatnonzero(region == number)
+        if len(own) < _MIN_REGION_POINTS:
+            continue
+        error, line = np.median(errors[own], 0), np.median(along[own], 0)
+        scatter = robust_sigma_2d(np.linalg.norm(errors[own] - error, axis=1))
+        variance = _SIGMA_PX**2 + scatter**2
+        square = (error @ error - (error @ line) ** 2 / (variance + line @ line)) / variance
+        found[number] = np.sqrt(max(square, 0.0))
+    return found.reshape(REGIONS)
 
 
 def _problem(data: tuple[object, ...], unit_mm: float) -> Problem[np.ndarray]:

@@ -53,6 +53,7 @@ class Alignment:
     texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
     is_supported : whether matched corners confirm the motion. matches : inliers of the features that it was found by.
+    nonrigidity : as `tracking.track.Track` has it.
     """
 
     motion: Motion
@@ -64,6 +65,7 @@ class Alignment:
     iterations: int
     is_supported: bool = False
     matches: int = 0
+    nonrigidity: np.ndarray | None = None
 
     @property
     def agreement(self) -> float:

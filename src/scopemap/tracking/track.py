@@ -13,6 +13,9 @@ from scopemap.geometry.se3 import inverse
 Status = Literal["initial", "ok", "lost", "other-map"]
 
 TOO_DARK, TOO_BRIGHT = ", it is too dark", ", it is overexposed"
+MOVING_SIGMAS = 3.0
+"""Standard deviations of noise beyond which tissue moves on its own."""
+
 RELOCALISED = "relocalised"
 """Reason of the track of a frame where features found the lost camera again."""
 
@@ -34,6 +37,8 @@ class Track:
     iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
     usable : share of the image that shows tissue. sharpness : that of the image over the usual one. motion : median
         optical flow since the frame before, share of the width. NaN where they are not known.
+    nonrigidity : `REGIONS` float32, by how many standard deviations the tissue in each region of the picture moves
+        against the rigid scene, NaN where too few corners are matched; None: not measured.
     """
 
     index: int
@@ -50,6 +55,22 @@ class Track:
     usable: float = float("nan")
     sharpness: float = float("nan")
     motion: float = float("nan")
+    nonrigidity: np.ndarray | None = None
+
+    @property
+    def moving(self) -> tuple[float, float, float]:
+        """The share of the measured regions whose tissue moves on its own, and their mean place, x and y over the size.
+
+        NaN where no region is measured, the place also where none moves.
+        """
+        if self.nonrigidity is None or not np.isfinite(self.nonrigidity).any():
+            return np.nan, np.nan, np.nan
+        moves = np.nan_to_num(self.nonrigidity) > MOVING_SIGMAS
+        share = float(moves.sum() / np.isfinite(self.nonrigidity).sum())
+        if not moves.any():
+            return share, np.nan, np.nan
+        y, x = (np.argwhere(moves).mean(0) + 0.5) / moves.shape
+        return share, float(x), float(y)
 
 
 class FrameTracker(Protocol):

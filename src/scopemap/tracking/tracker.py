@@ -15,7 +15,7 @@ from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_
 from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.relocalisation import Keyframe, Relocaliser
-from scopemap.tracking.reprojection import pose_from_correspondences, reprojection_error_px
+from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
@@ -232,7 +232,8 @@ class Tracker:
         self._coverage = correspondences.coverage
         error_px = reprojection_error_px(correspondences, frame.camera, T)
         is_supported = correspondences.coverage >= _MIN_COVERAGE and error_px <= _MAX_SUPPORT_PX
-        return replace(alignment, is_supported=is_supported)
+        moving = nonrigidity(correspondences, frame.camera, T, depth_sigma)
+        return replace(alignment, is_supported=is_supported, nonrigidity=moving)
 
     def _pyramid(self, keyframe: Keyframe, frame: Frame) -> list[View]:
         # The keyframe's points are moved: the frame's own depth counts only if it is measured.
@@ -342,4 +343,5 @@ def _track_of(
         alignment.overlap,
         alignment.iterations,
         keyframe.map,
+        nonrigidity=alignment.nonrigidity,
     )

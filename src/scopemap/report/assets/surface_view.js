@@ -1,9 +1,9 @@
 // The meshes of a run in WebGL 2: on the screen with path and camera, and into pictures for the panels.
 
 const MESH_VERTEX = `#version 300 es
-in vec3 position; in vec3 normal; in vec3 colour; in vec2 scalars;
+in vec3 position; in vec3 normal; in vec3 colour; in vec3 scalars;
 uniform vec3 low, spread; uniform mat4 view, lens;
-out vec3 vEye, vNormal, vColour; out vec2 vScalars;
+out vec3 vEye, vNormal, vColour; out vec3 vScalars;
 void main() {
   vec4 eye = view * vec4(low + position * spread, 1.0);
   vEye = eye.xyz; vNormal = mat3(view) * normal; vColour = colour; vScalars = scalars;
@@ -13,7 +13,7 @@ void main() {
 // purpose 0: for the screen; 1: as the lamp at the lens shows it; 2: log depth in 16 bits.
 const MESH_FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 vEye, vNormal, vColour; in vec2 vScalars;
+in vec3 vEye, vNormal, vColour; in vec3 vScalars;
 uniform int purpose, paint; uniform bool cut, lamp; uniform float gain; uniform vec2 depthRange; uniform sampler2D ramp;
 out vec4 result;
 void main() {
@@ -29,6 +29,7 @@ void main() {
   vec3 base = purpose == 0 ? min(gain * vColour, 1.0) : vColour;
   if (paint == 1) base = texture(ramp, vec2(sqrt(vScalars.y), 0.5)).rgb;
   if (paint == 2) base = texture(ramp, vec2(vScalars.x, 0.5)).rgb;
+  if (paint == 4) base = texture(ramp, vec2(vScalars.z, 0.5)).rgb;
   if (paint == 3) base = vec3(0.74, 0.72, 0.70);
   if (purpose == 1) {
     float light = lamp ? pow(max(facing, 0.02) / dot(vEye, vEye), 1.0 / 2.2) : 1.0;
@@ -125,13 +126,14 @@ class SurfaceView {
   #uploadedMesh(mesh) {
     if (this.uploaded.has(mesh)) return this.uploaded.get(mesh);
     const gl = this.gl, vao = gl.createVertexArray(), at = this.programs.mesh.attributes;
-    const scalars = new Uint8Array(2 * mesh.vertices);
-    new Uint8Array(bytesOf(mesh.confidence)).forEach((value, i) => (scalars[2 * i] = value));
-    new Uint8Array(bytesOf(mesh.seen)).forEach((value, i) => (scalars[2 * i + 1] = value));
+    const scalars = new Uint8Array(3 * mesh.vertices);
+    new Uint8Array(bytesOf(mesh.confidence)).forEach((value, i) => (scalars[3 * i] = value));
+    new Uint8Array(bytesOf(mesh.seen)).forEach((value, i) => (scalars[3 * i + 1] = value));
+    new Uint8Array(bytesOf(mesh.moving)).forEach((value, i) => (scalars[3 * i + 2] = value));
     gl.bindVertexArray(vao);
     const arrays = [
       ["position", bytesOf(mesh.positions), 3, gl.UNSIGNED_SHORT], ["normal", bytesOf(mesh.normals), 3, gl.BYTE],
-      ["colour", bytesOf(mesh.colours), 3, gl.UNSIGNED_BYTE], ["scalars", scalars, 2, gl.UNSIGNED_BYTE],
+      ["colour", bytesOf(mesh.colours), 3, gl.UNSIGNED_BYTE], ["scalars", scalars, 3, gl.UNSIGNED_BYTE],
     ];
     for (const [name, values, count, kind] of arrays) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());

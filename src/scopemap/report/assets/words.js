@@ -67,5 +67,6 @@ function statusOf(run, row) {
 
 function legendOf(run, map, paint) {
   if (paint === 1) return ["never", `in all of ${map.looked} frames looked at`];
+  if (paint === 4) return ["never moves on its own", "in all frames that see it"];
   return paint === 2 ? ["little", "much: seen often, near, from the front"] : null;
 }

@@ -1,0 +1,46 @@
+"""The surface that one frame sees: its depth as a grid of triangles, without any other frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import trimesh
+
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import transform
+
+
+def frame_surface(frame: Frame, step_px: int, min_incidence: float) -> trimesh.Trimesh:
+    """Return the surface of every n-th usable pixel of a frame with depth and a pose, world mm, in the video's colours.
+
+    step_px : n. min_incidence : cosine of incidence below which neighbours are two surfaces, not a slanted one.
+    Normals point to the camera. The mesh may be empty.
+    """
+    assert frame.depth_mm is not None
+    assert frame.T_world_camera is not None
+    some = (slice(step_px // 2, None, step_px),) * 2
+    depth_mm = np.where(frame.valid & (frame.depth_mm > 0), frame.depth_mm, np.nan)[some].astype(np.float64)
+    rows, columns = depth_mm.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    upper, lower = (number[:-1, :-1], number[:-1, 1:]), (number[1:, :-1], number[1:, 1:])
+    # Counter-clockwise seen from the camera, which looks along z with y down.
+    faces = np.concatenate(
+        [
+            np.stack([upper[0], lower[0], upper[1]], -1).reshape(-1, 3),
+            np.stack([upper[1], lower[0], lower[1]], -1).reshape(-1, 3),
+        ]
+    )
+    corners_mm = depth_mm.ravel()[faces]
+    largest_step = step_px * math.sqrt(1 / min_incidence**2 - 1) / min(frame.camera.fx, frame.camera.fy)
+    with np.errstate(invalid="ignore"):
+        near_mm, far_mm = corners_mm.min(1), corners_mm.max(1)
+        faces = faces[far_mm - near_mm <= largest_step * near_mm]
+    used, faces = np.unique(faces, return_inverse=True)
+    points = (frame.camera.rays[some] * depth_mm[..., None]).reshape(-1, 3)[used]
+    return trimesh.Trimesh(
+        transform(frame.T_world_camera, points),
+        faces.reshape(-1, 3),
+        vertex_colors=frame.rgb[some].reshape(-1, 3)[used],
+        process=False,
+    )

@@ -1,0 +1,37 @@
+"""Writes the surface of every frame of a camera at rest, where the tissue moves and one surface would smear it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scopemap.config import Config
+from scopemap.depth.anchor import depth_downscale
+from scopemap.errors import reporting
+from scopemap.estimators import scale_facts
+from scopemap.frame import Frame
+from scopemap.fusion.frame_surface import frame_surface
+from scopemap.fusion.mesh_files import save_mesh
+from scopemap.pipeline import Estimators
+from scopemap.reconstruction import scale_words
+
+SURFACES = "surfaces"
+"""Folder of a result with a PLY per frame, named by its number."""
+
+
+class SurfaceWriter:
+    """Writes surfaces/000000.ply, ...: usable pixels alone, as far apart as those of the depth estimate.
+
+    Raises `InputError` where nothing can be written.
+    """
+
+    def __init__(self, folder: Path, config: Config, estimators: Estimators) -> None:
+        self._folder, self._config, self._estimators = folder / SURFACES, config, estimators
+
+    def __call__(self, frame: Frame) -> None:
+        """Write the surface of a frame; without any usable pixel it has no vertex."""
+        step_px = depth_downscale(self._config.depth, max(frame.valid.shape))
+        mesh = frame_surface(frame, step_px, max(self._config.fusion.advanced.min_incidence, 0.05))
+        with reporting(f"cannot write to {self._folder}"):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            scale = scale_words(scale_facts(self._estimators))
+            save_mesh(mesh, self._folder / f"{frame.index:06d}.ply", comment=scale)

@@ -1,0 +1,265 @@
+"""Tissue that moves on its own is told from noise, counted in the world, and, with a camera at rest, all that moves."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from tiny_phantom import write_tiny
+
+from scopemap import Config, open_sequence, reconstruct
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import FusionSettings
+from scopemap.flow.corners import Correspondences2D3D
+from scopemap.flow.dis import DisFlow
+from scopemap.frame import REGIONS, Frame
+from scopemap.fusion.frame_surface import frame_surface
+from scopemap.fusion.moving import MovingTissue, block_edge_mm
+from scopemap.fusion.seen_at import SeenAt
+from scopemap.fusion.volume import TsdfVolume
+from scopemap.geometry.se3 import se3_exp
+from scopemap.io.decoding import read_decoded
+from scopemap.phantom.render import prepare, render_frame
+from scopemap.phantom.spec import PhantomSpec, parse_events
+from scopemap.phantom.writer import write_phantom
+from scopemap.runner.provenance import motion_notes
+from scopemap.tracking.at_rest import CameraAtRest
+from scopemap.tracking.reprojection import nonrigidity
+from scopemap.tracking.track import MOVING_SIGMAS, Track
+
+CAMERA = PinholeCamera(160.0, 160.0, 159.5, 119.5, 320, 240)
+MOTION = se3_exp(np.array([0.01, -0.02, 0.01, 2.0, 0.5, -1.0]))
+COUNT = 800
+
+
+def _correspondences(moved_px: np.ndarray, depth_error: float = 0.0) -> tuple[Correspondences2D3D, np.ndarray]:
+    """Corners all over the picture, their pixels moved (COUNT, 2) beside what the motion explains, with noise."""
+    rng = np.random.default_rng(5)
+    points = CAMERA.unproject(rng.uniform([0, 0], [320, 240], (COUNT, 2))) * rng.uniform(30, 50, (COUNT, 1))
+    seen = CAMERA.project(points @ MOTION[:3, :3].T + MOTION[:3, 3])
+    pixels = seen + moved_px + rng.normal(0, 0.3, (COUNT, 2))
+    points = points * np.exp(rng.normal(0, depth_error, (COUNT, 1)))
+    return Correspondences2D3D(points, pixels, 1.0, 0), seen
+
+
+def _moves(correspondences: Correspondences2D3D) -> np.ndarray:
+    return np.nan_to_num(nonrigidity(correspondences, CAMERA, MOTION, 0.2)) > MOVING_SIGMAS
+
+
+@pytest.mark.parametrize("depth_error", [0.0, 0.15])
+def test_nothing_moves_in_a_rigid_scene(depth_error: float) -> None:
+    assert not _moves(_correspondences(np.zeros((COUNT, 2)), depth_error)[0]).any()
+
+
+def test_the_region_that_moves_is_found_and_no_other() -> None:
+    _, seen = _correspondences(np.zeros((COUNT, 2)))
+    there = (seen[:, 0] >= 200) & (seen[:, 0] < 280) & (seen[:, 1] >= 80) & (seen[:, 1] < 160)
+    moves = _moves(_correspondences(np.where(there[:, None], [3.0, 3.0], 0.0))[0])
+    expected = np.zeros(REGIONS, bool)
+    expected[2:4, 5:7] = True
+    np.testing.assert_array_equal(moves, expected)
+
+
+def test_false_matches_scatter_and_do_not_count() -> None:
+    wrong = np.random.default_rng(2).uniform(-12, 12, (COUNT, 2))
+    assert not _moves(_correspondences(wrong)[0]).any()
+
+
+def test_regions_with_few_corners_are_unknown() -> None:
+    all_of_them, seen = _correspondences(np.zeros((COUNT, 2)))
+    kept = seen[:, 0] < 150
+    few = Correspondences2D3D(all_of_them.points_mm[kept], all_of_them.pixels[kept], 1.0, 0)
+    found = nonrigidity(few, CAMERA, MOTION, 0.2)
+    assert np.isfinite(found[:, :3]).all()
+    assert np.isnan(found[:, 4:]).all()
+
+
+def test_a_track_tells_how_much_moves_and_where() -> None:
+    found = np.full(REGIONS, np.nan, np.float32)
+    found[:, :4] = 1.0
+    found[2, 0] = found[2, 1] = 9.0
+    track = Track(0, "ok", "", np.eye(4), 0, nonrigidity=found)
+    assert track.moving == pytest.approx((2 / 24, 1 / 8, 2.5 / 6))
+    assert np.isnan(replace(track, nonrigidity=None).moving).all()
+    still = replace(track, nonrigidity=np.zeros(REGIONS, np.float32)).moving
+    assert still[0] == 0.0
+    assert np.isnan(still[1:]).all()
+
+
+def test_shares_are_of_the_frames_that_see_a_place() -> None:
+    moving = MovingTissue(10.0)
+    wall = np.full((240, 320), 60.0)
+    wall[:, :160] = np.nan  # the left half is never seen
+    pushed = np.zeros(REGIONS, np.float32)
+    pushed[:, 6:] = 8.0
+    for values in (pushed, np.zeros(REGIONS, np.float32), np.full(REGIONS, np.nan, np.float32), pushed):
+        moving.put(wall, values, CAMERA, np.eye(4))
+    rays = CAMERA.unproject(np.array([[300.0, 120.0], [190.0, 120.0], [40.0, 120.0]]))
+    np.testing.assert_allclose(moving.shares(60.0 * rays), [2 / 3, 0, 0], atol=1e-6)
+    assert MovingTissue(10.0).shares(rays).tolist() == [0, 0, 0]
+
+
+def _frame(depth_mm: np.ndarray, valid: np.ndarray) -> Frame:
+    rgb = np.broadcast_to(np.array([200, 90, 80], np.uint8), (240, 320, 3)).copy()
+    return Frame(3, 0.1, rgb, CAMERA, valid, depth_mm.astype(np.float32), np.eye(4))
+
+
+def test_a_frames_surface_has_its_usable_pixels_and_no_wall_between_depths() -> None:
+    depth_mm = np.full((240, 320), 40.0)
+    depth_mm[:, 160:] = 80.0
+    valid = np.ones((240, 320), bool)
+    valid[100:140, 40:80] = False
+    mesh = frame_surface(_frame(depth_mm, valid), 2, 0.1)
+    assert sorted(set(np.round(mesh.vertices[:, 2]))) == [40, 80]
+    assert len(set(np.ptp(np.round(mesh.triangles[:, :, 2]), axis=1))) == 1  # no face joins the two depths
+    pixels = np.round(CAMERA.project(np.asarray(mesh.vertices))).astype(int)
+    assert valid[pixels[:, 1], pixels[:, 0]].all()
+    assert len(mesh.vertices) == 120 * 160 - 20 * 20
+    assert (mesh.face_normals[:, 2] < 0).all()
+    assert (mesh.visual.vertex_colors[:, :3] == [200, 90, 80]).all()
+
+
+def test_a_frame_without_usable_pixels_has_an_empty_surface() -> None:
+    mesh = frame_surface(_frame(np.full((240, 320), 40.0), np.zeros((240, 320), bool)), 2, 0.1)
+    assert len(mesh.vertices) == len(mesh.faces) == 0
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera at rest before a wall of which a part is pushed."""
+    folder = tmp_path_factory.mktemp("pushed")
+    write_tiny(folder / "moving", frames=6)
+    pose = (folder / "moving" / "pose.txt").read_text().splitlines()[0]
+    path = folder / "path.txt"
+    path.write_text("\n".join([pose] * 10) + "\n")
+    spec = PhantomSpec("laparoscopy", width=160, height=128, seed=3, path_file=path, events=parse_events("poke:4-6"))
+    write_phantom(spec, folder / "phantom")
+    return folder / "phantom"
+
+
+def test_the_phantom_moves_where_it_is_pushed_and_nowhere_else(pushed: Path) -> None:
+    first, before, after, last = (
+        np.asarray(trimesh.load(pushed / "mesh_truth" / f"{index:04d}.ply", process=False).vertices)
+        for index in (0, 4, 6, 9)
+    )
+    assert np.abs(before - first).max() < 1e-6
+    np.testing.assert_allclose(after, last, atol=1e-6)
+    moved_mm = np.linalg.norm(last - first, axis=1)
+    assert moved_mm.max() == pytest.approx(8.0, rel=0.1)
+    assert np.median(moved_mm) < 0.1 * moved_mm.max()
+
+
+def test_depth_of_pushed_tissue_lies_on_it() -> None:
+    phantom = prepare(PhantomSpec("laparoscopy", 10, 96, 80, seed=3, events=parse_events("poke:4-6")))
+    _, surface = render_frame(phantom, 9)
+    seen = np.isfinite(surface.depth_mm)
+    camera, T = phantom.spec.camera, phantom.poses[9]
+    points = (camera.rays[seen] * surface.depth_mm[seen, None]) @ T[:3, :3].T + T[:3, 3]
+    rest = points - phantom.motion.at(9).at(points)
+    np.testing.assert_allclose(rest, surface.rest_mm[seen], atol=1e-2)
+    assert np.abs(phantom.volume.values_at(rest)[0]).max() < 1e-2
+
+
+@pytest.fixture(scope="module")
+def run(pushed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("at_rest") / "run"
+    settings = {"depth.backend": f"files:{pushed}", "tracking.camera_at_rest": True, "tracking.keyframe_every": 4}
+    reconstruct(open_sequence(pushed), Config.load(settings=settings), out=out)
+    return out
+
+
+def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushed: Path) -> None:
+    with (run / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["initial"] + ["ok"] * 9
+    lines = [line for line in (run / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
+    assert {line.split(" ", 1)[1] for line in lines} == {lines[0].split(" ", 1)[1]}
+    assert sorted(file.name for file in (run / "surfaces").iterdir()) == [f"{index:06d}.ply" for index in range(10)]
+    camera = open_sequence(pushed).camera
+    for index in (0, 9):
+        vertices = np.asarray(trimesh.load(run / "surfaces" / f"{index:06d}.ply", process=False).vertices)
+        column, row = np.rint(camera.project(vertices)).astype(int).T
+        truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)  # type: ignore[index]
+        assert len(vertices) > 5000
+        assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
+
+
+def test_motion_is_told_where_and_when_it_is(run: Path) -> None:
+    with (run / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    share = np.array([float(row["moving_share"] or "nan") for row in rows])
+    assert np.nanmax(share[:5]) == 0.0
+    assert 0.02 < np.nanmax(share[5:8]) < 0.5
+    most = rows[int(np.nanargmax(share))]
+    assert float(most["moving_x"]) == pytest.approx(0.68, abs=0.15)
+    assert float(most["moving_y"]) == pytest.approx(0.5, abs=0.15)
+
+
+def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
+    settings = Config().tracking
+    tracker = CameraAtRest(settings, DisFlow())
+    wall, everywhere = np.full((240, 320), 40.0), np.ones((240, 320), bool)
+    status = []
+    for valid in (everywhere, np.zeros_like(everywhere), everywhere):
+        frame = _frame(wall, valid)
+        status.append(tracker.track(frame).status)
+        if tracker.needs_keyframe() and status[-1] != "lost":
+            assert tracker.insert_keyframe(frame, measured=False)
+    assert status == ["initial", "lost", "ok"]
+    unknown = CameraAtRest(settings, DisFlow())
+    unknown.track(_frame(wall, everywhere))
+    assert not unknown.insert_keyframe(_frame(np.full((240, 320), np.nan), everywhere), measured=False)
+
+
+def test_notes_say_that_the_camera_was_stated_to_be_at_rest() -> None:
+    assert motion_notes([], Config()) == []
+    assert "at rest, as stated" in motion_notes([], Config.load(settings={"tracking.camera_at_rest": True}))[0]
+
+
+def _states() -> list[Frame]:
+    """Frames of ten seconds: the right half of a wall goes from 60 to 80 mm between the fourth and the seventh."""
+    frames = []
+    for index in range(41):
+        second, depth_mm = index / 4, np.full((240, 320), 60.0)
+        depth_mm[:, 160:] += 20.0 * np.clip((second - 3) / 3, 0, 1)
+        moving = np.zeros(REGIONS, np.float32)
+        moving[:, 4:] = 9.0 if 3 < second <= 6 else 0.5
+        still = _frame(depth_mm, np.ones((240, 320), bool))
+        frames.append(replace(still, index=index, time_s=second, nonrigidity=moving))
+    return frames
+
+
+def _fused(frames: list[Frame]) -> np.ndarray:
+    """The vertices of the surface of frames."""
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=200.0))
+    for frame in frames:
+        volume.integrate(frame)
+    return np.asarray(volume.extract_mesh().vertices)
+
+
+@pytest.mark.parametrize(("at_s", "expected_mm"), [(0.0, 60.0), (10.0, 80.0)])
+def test_the_surface_as_seen_at_a_second_has_no_other_state(at_s: float, expected_mm: float) -> None:
+    frames = _states()
+    seen_at = SeenAt(frames, at_s, block_edge_mm(60.0))
+    weighted = [seen_at.weighted(frame) for frame in frames]
+    vertices = _fused(weighted)
+    pixels = CAMERA.project(vertices)
+    right, left = (vertices[chosen, 2] for chosen in (pixels[:, 0] > 190, pixels[:, 0] < 130))
+    assert len(right) > 1000
+    np.testing.assert_allclose(np.percentile(right, [1, 99]), expected_mm, atol=1.0)
+    np.testing.assert_allclose(left, 60.0, atol=0.2)
+    assert f"second {at_s:g}" in seen_at.note
+    # All frames count where nothing moves, and without a time the states are all there.
+    assert all(frame.weight is None or frame.weight[120, 40] == 1.0 for frame in weighted)
+    assert np.ptp(_fused(frames)[:, 2]) > 15.0
+
+
+def test_where_nothing_moves_every_frame_counts() -> None:
+    still = [replace(frame, nonrigidity=np.zeros(REGIONS, np.float32)) for frame in _states()]
+    seen_at = SeenAt(still, 9.0, 8.0)
+    assert all(seen_at.weighted(frame).weight is None for frame in still)
+    assert "nowhere" in seen_at.note
