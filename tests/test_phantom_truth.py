@@ -162,7 +162,7 @@ def test_mesh_covers_what_the_cameras_see(phantom: Phantom) -> None:
 
 
 def test_depth_of_moving_tissue_lies_on_moving_tissue(breathing_colon: Phantom) -> None:
-    displacement = breathing_colon.deformation.at(5)
+    displacement = breathing_colon.motion.at(5)
     points = world_points(breathing_colon, 5)
     shift = displacement.at(points)
     assert np.linalg.norm(shift, axis=1).max() > 1.0
@@ -183,7 +183,7 @@ def test_moving_mesh_agrees_with_moving_depth(breathing_colon: Phantom) -> None:
         _, nearest = cKDTree(corners.mean(1)).query(points)
         return np.abs(((points - corners.mean(1)[nearest]) * normals[nearest]).sum(1))
 
-    assert np.median(to_plane(breathing_colon.deformation.at(5).move(np.asarray(mesh.vertices)))) < 0.05
+    assert np.median(to_plane(breathing_colon.motion.at(5).move(np.asarray(mesh.vertices)))) < 0.05
     assert np.median(to_plane(mesh.vertices)) > 0.2
 
 

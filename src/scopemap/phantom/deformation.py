@@ -73,7 +73,7 @@ class Breathing:
 
 @dataclass(frozen=True)
 class Push:
-    """Waves (M, 7) and bumps (B, 7) as in `Displacement`, from rest at the frame `first` to their full amplitude at `last`."""
+    """Waves (M, 7) and bumps (B, 7) as in `Displacement`, at rest until the frame `first`, in full from `last` on."""
 
     waves: np.ndarray
     first: int
