@@ -16,6 +16,9 @@ import trimesh
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap.benchmark.climb_check import submission_problems
+from scopemap.benchmark.climb_submission import write_submission
+from scopemap.cli.run import summary_lines
 from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
@@ -32,6 +35,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
+from scopemap.report.pieces import pieces_in_time
 from scopemap.tracking.track import RELOCALISED, Track
 from scopemap.trajectory.formats.opening import read_trajectory
 
@@ -120,6 +124,32 @@ def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: 
         assert [row["map"] for row in csv.DictReader(file)][:FIRST] == ["1"] * FIRST
     mesh = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
     np.testing.assert_allclose(mesh.bounds, other.mesh.bounds, atol=1e-3)
+
+
+def test_the_summary_has_the_maps_in_order_of_time(result: Reconstruction) -> None:
+    line = next(line for line in summary_lines(result) if line.startswith("maps in order of time"))
+    assert line.index("maps/1 with") < line.index("the result with")
+    assert f"maps/1 with {FIRST} frames (0 to {FIRST - 1}, " in line
+    doubtful = next(line for line in summary_lines(result) if line.startswith("most doubtful map"))
+    pieces = {piece.name: piece.inlier_share for piece in pieces_in_time(result.kept())}
+    assert doubtful.startswith(f"most doubtful map: {min(pieces, key=lambda name: pieces[name])}, frames ")
+
+
+def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: Path, tmp_path: Path) -> None:
+    write_submission(out, tmp_path, "Seq_001_a")
+    assert submission_problems(tmp_path) == []
+    found = read_trajectory(tmp_path / "Seq_001_a" / "5")
+    assert len(found.others) == 1
+    for number, (submap, own) in enumerate(zip((found, *found.others), (result, *result.others), strict=True)):
+        known = own.trajectory.rows(own.trajectory.tracked)
+        assert submap.indices.tolist() == known.indices.tolist()
+        np.testing.assert_allclose(submap.T_world_camera, known.T_world_camera, atol=1e-6)
+        folder = tmp_path / "Seq_001_a" / "5"
+        points = np.loadtxt(folder / "3D_maps" / str(number) / "points3D.txt")[:, 1:4]
+        assert (points >= own.mesh.bounds[0] - 1e-3).all()
+        assert (points <= own.mesh.bounds[1] + 1e-3).all()
+        rows = (folder / "camera_trajectory" / f"cam_traj_map_{number:03d}.txt").read_text().splitlines()
+        assert rows[1].split(",")[1] == f"{known.indices[0] + 1:06d}.png"
 
 
 def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: Path) -> None:

@@ -9,10 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.io.opening import open_sequence
 from scopemap.phantom.coding import VideoCoding
 from scopemap.phantom.exposing import MAX_SAMPLES, exposure_times, lagging_gains, pose_at
+from scopemap.phantom.march import march, rays_of
 from scopemap.phantom.render import Phantom, light, prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
@@ -126,6 +131,30 @@ def test_written_frames_are_coded(tmp_path: Path, phantom: Phantom) -> None:
     expected = [coding(render_frame(plain, n)[0]) for n in range(2)]
     np.testing.assert_array_equal(stored, expected[1])
     assert np.abs(stored.astype(int) - render_frame(plain, 1)[0]).mean() > 1
+
+
+def test_a_scene_is_seen_through_the_lens_of_a_calibration(tmp_path: Path) -> None:
+    lens = FisheyeCamera(PinholeCamera(60.0, 60.0, 63.0, 48.0, 128, 96), (-0.14, 0.0, 0.0015, -0.0001))
+    write_calibration(lens, tmp_path / "lens.yaml")
+    spec = replace(SMALL, frames=2, camera_file=tmp_path / "lens.yaml")
+    write_phantom(spec, tmp_path / "seen")
+    sequence = open_sequence(tmp_path / "seen")
+    found = sequence.rectifier.source
+    assert isinstance(found, FisheyeCamera)
+    assert found.plane == lens.resized(64, 48).plane
+    # Both cameras show the same surface: what the lens saw at a pixel is at the place where a pinhole sees it.
+    fisheye, pinhole = prepare(spec), prepare(replace(SMALL, frames=2))
+    rays = rays_of(fisheye.spec.camera)
+    seen = march(fisheye.volume, fisheye.spec.camera, fisheye.poses[0], fisheye.motion.at(0)).depth_mm
+    assert np.isnan(rays[0, 0]).all()
+    assert np.isnan(seen[0, 0])
+    points = (rays * seen[..., None])[20:28, 28:36].reshape(-1, 3)
+    plain = march(pinhole.volume, SMALL.camera, pinhole.poses[0], pinhole.motion.at(0)).depth_mm
+    x, y = np.rint(SMALL.camera.project(points)).astype(int).T
+    # Nearly everywhere: behind the edges of folds a pixel's rounding sees something else.
+    assert np.mean(np.abs(plain[y, x] / points[:, 2] - 1) < 0.05) > 0.8
+    rgb, _ = render_frame(fisheye, 0)
+    assert rgb[0, 0].max() < 20 < rgb[24, 32].max()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from drawn_run import GOOD_SURFACE, tube
 
 from scopemap.report import verdict as rules
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptMap, KeptRun
+from scopemap.report.pieces import doubt_words, most_doubtful, pieces_in_time
 from scopemap.report.verdict import longest_stretch, scale_is_known, verdict
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
@@ -121,6 +123,34 @@ def test_lost_frames_and_other_maps_are_told_apart() -> None:
     assert "6 more frames form pieces of their own" in texts
     assert "In 4 frames the camera could not be followed" in texts
     assert "Longest gap: 10 frames" in texts
+
+
+def run_of_pieces(*pieces: tuple[int, int, float]) -> KeptRun:
+    """A run of pieces: number of the map, its frames, and their inlier share; in the order of the frames."""
+    place = [number for number, frames, _ in pieces for _ in range(frames)]
+    shares = [share for _, frames, share in pieces for _ in range(frames)]
+    run = run_of(place)
+    rows = [row | {"inlier_share": f"{share}"} for row, share in zip(run.rows, shares, strict=True)]
+    return replace(run, rows=rows, maps=run.maps * (max(place) + 1))
+
+
+def test_pieces_are_in_order_of_time_and_the_worst_is_named() -> None:
+    run = run_of_pieces((2, 20, 0.7), (0, 50, 0.9), (1, 30, 0.55))
+    pieces = pieces_in_time(run)
+    assert [(piece.name, piece.first, piece.last) for piece in pieces] == [
+        ("maps/2", 0, 19),
+        ("the result", 20, 69),
+        ("maps/1", 70, 99),
+    ]
+    texts = [reason.text for reason in verdict(run).reasons]
+    assert "Most doubtful of the pieces is maps/1, frames 70 to 99, with 55% inliers against 70% to 90%." in texts
+    assert most_doubtful(pieces) is pieces[2]
+
+
+def test_one_piece_is_not_compared() -> None:
+    assert doubt_words(pieces_in_time(run_of_pieces((0, 50, 0.2)))) == ""
+    assert doubt_words(pieces_in_time(run_of_pieces((0, 50, 0.2), (1, 20, float("nan"))))) == ""
+    assert "doubtful" not in " ".join(reason.text for reason in verdict(run_of([0] * 50)).reasons)
 
 
 def test_frames_that_were_not_used_are_no_gap() -> None:

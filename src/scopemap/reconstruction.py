@@ -36,7 +36,7 @@ from scopemap.pipeline import Step
 from scopemap.report.kept_run import LOST, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
 from scopemap.report.losses import LostStretch, losses
-from scopemap.report.shown_mesh import simplified
+from scopemap.report.page_data import shown_meshes
 from scopemap.report.summary_picture import summary_picture
 from scopemap.report.verdict import verdict
 from scopemap.tracking.track import Track
@@ -201,16 +201,16 @@ class Reconstruction:
     others: list[Reconstruction] = field(default_factory=list)
 
     def __repr__(self) -> str:
-        return f"<Reconstruction, {verdict(self._kept()).word}: {verdict(self._kept()).sentence}>"
+        return f"<Reconstruction, {verdict(self.kept()).word}: {verdict(self.kept()).sentence}>"
 
     def _repr_html_(self) -> str:
         """Return the summary picture for a notebook."""
-        kept, file = self._kept(), BytesIO()
-        summary_picture(kept, simplified(self.mesh, _SHOWN_FACES)).save(file, "JPEG", quality=88)
+        kept, file = self.kept(), BytesIO()
+        summary_picture(kept, shown_meshes(kept, _SHOWN_FACES)).save(file, "JPEG", quality=88)
         picture, words = b64encode(file.getvalue()).decode(), html.escape(repr(self))
         return f'<p>{words}</p><img alt="{words}" src="data:image/jpeg;base64,{picture}" style="max-width: 100%">'
 
-    def _kept(self) -> KeptRun:
+    def kept(self) -> KeptRun:
         """Return this result in the form that reports are made from."""
         maps = []
         for result in (self, *self.others):
@@ -227,7 +227,7 @@ class Reconstruction:
     @property
     def losses(self) -> list[LostStretch]:
         """The stretches of lost frames, with their causes."""
-        return losses(self._kept())
+        return losses(self.kept())
 
     @property
     def trajectory(self) -> Trajectory:

@@ -28,6 +28,7 @@ from scopemap.cli.progress import run_progress
 if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.reconstruction import Reconstruction
+    from scopemap.report.pieces import Piece
 
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
@@ -215,6 +216,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
     from scopemap.reconstruction import scale_words
+    from scopemap.report.pieces import doubt_words, pieces_in_time
 
     facts, known = result.provenance, result.provenance["scale"]["known"]
     unit = " mm" if known else " (scale unknown)"
@@ -230,7 +232,9 @@ def summary_lines(result: Reconstruction) -> list[str]:
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
-        lines.append(f"other maps: {', '.join(_other_map(n, other) for n, other in enumerate(result.others, 1))}")
+        pieces = pieces_in_time(result.kept())
+        lines.append(f"maps in order of time: {', '.join(_map_words(piece) for piece in pieces)}")
+        lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(pieces)] if doubt]
     lost = result.losses
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
     lines += [f"lost: {loss.when} ({loss.frames} frames), {loss.cause}: {loss.advice}" for loss in longest]
@@ -266,9 +270,9 @@ def _counted(facts: dict[str, Any]) -> str:
     return ", ".join(parts + [f"{facts[key]} {words}" for key, words in others if facts[key]])
 
 
-def _other_map(number: int, other: Reconstruction) -> str:
-    first, last = other.records[0].index, other.records[-1].index
-    return f"maps/{number} with {len(other.records)} frames ({first} to {last})"
+def _map_words(piece: Piece) -> str:
+    facts = ", ".join(filter(None, (f"{piece.first} to {piece.last}", piece.inliers)))
+    return f"{piece.name} with {piece.frames} frames ({facts})"
 
 
 def _surface(figures: dict[str, float]) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel
 from scopemap.geometry.se3 import inverse, mean_near, transform
-from scopemap.phantom.march import SurfaceBuffers
+from scopemap.phantom.march import SurfaceBuffers, rays_of
 
 MAX_SAMPLES = 8
 """Of light within one exposure."""
@@ -24,7 +24,7 @@ def pose_at(poses: np.ndarray, time: float) -> np.ndarray:
 
 
 def exposure_times(
-    index: int, shutter: float, poses: np.ndarray, surface: SurfaceBuffers, camera: PinholeCamera
+    index: int, shutter: float, poses: np.ndarray, surface: SurfaceBuffers, camera: CameraModel
 ) -> list[float]:
     """Return the times, in frames, at which the light of frame `index` is sampled; `[index]` where nothing moves.
 
@@ -34,13 +34,14 @@ def exposure_times(
     start, end = (pose_at(poses, index + half) for half in (-0.5 * shutter, 0.5 * shutter))
     rows, columns = np.arange(0, camera.height, 4), np.arange(0, camera.width, 4)
     seen = surface.depth_mm[np.ix_(rows, columns)].astype(np.float64)
-    points = transform(poses[index], (camera.rays[np.ix_(rows, columns)] * seen[..., None])[np.isfinite(seen)])
+    points = transform(poses[index], (rays_of(camera)[np.ix_(rows, columns)] * seen[..., None])[np.isfinite(seen)])
     pixels = []
     for pose in (start, end):
         local = transform(inverse(pose), points)
-        pixels.append(local[:, :2] / np.maximum(local[:, 2:], 1e-3) * [camera.fx, camera.fy])
+        pixels.append(camera.project(local))
     shift_px = np.linalg.norm(pixels[1] - pixels[0], axis=1)
-    wanted = float(np.percentile(shift_px, _SHIFT_PERCENTILE)) if len(points) else 0.0
+    shift_px = shift_px[np.isfinite(shift_px)]
+    wanted = float(np.percentile(shift_px, _SHIFT_PERCENTILE)) if len(shift_px) else 0.0
     samples = int(np.clip(np.ceil(wanted / _PX_PER_SAMPLE), 1, MAX_SAMPLES))
     return [index + shutter * ((n + 0.5) / samples - 0.5) for n in range(samples)]
 

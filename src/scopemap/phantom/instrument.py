@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.phantom.march import SurfaceBuffers
+from scopemap.cameras.camera import CameraModel
+from scopemap.phantom.march import SurfaceBuffers, rays_of
 
 _METAL = np.array([0.50, 0.51, 0.53], np.float32)
 _SHAFT = np.array([0.09, 0.09, 0.10], np.float32)
@@ -50,12 +50,13 @@ def instrument(time: float, first: int, last: int, rigid: bool, seed: int) -> Ca
 
 
 def insert(
-    tool: Capsules | None, radiance: np.ndarray, surface: SurfaceBuffers, camera: PinholeCamera
+    tool: Capsules | None, radiance: np.ndarray, surface: SurfaceBuffers, camera: CameraModel
 ) -> tuple[np.ndarray, SurfaceBuffers]:
     """Return light (H, W, 3) and surface of a view with an instrument in front; the depth that it hides is unknown."""
     if tool is None:
         return radiance, surface
-    rays = camera.rays / np.linalg.norm(camera.rays, axis=-1, keepdims=True)
+    rays = rays_of(camera).astype(np.float32)
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     nearest, normal = np.full(rays.shape[:2], np.inf), np.zeros_like(rays)
     colour = np.zeros_like(radiance)
     for ends, radius, shade in zip(tool.ends, tool.radii, tool.colours, strict=True):

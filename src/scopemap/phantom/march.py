@@ -7,11 +7,13 @@ surface by value over steepest slope, and at the surface by bracketed Newton ste
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel
 from scopemap.phantom.deformation import Displacement
 from scopemap.phantom.volume import Volume, inside, spline
 
@@ -135,6 +137,9 @@ def _march_image(grids: Grids, moved: Moved, T_grid_camera: np.ndarray, rays: np
         here, d = np.empty(7), np.empty(3)
         for column in range(rays.shape[1]):
             ray = rays[row, column]
+            if np.isnan(ray[0]):
+                out[row, column] = np.nan
+                continue
             length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
             for axis in range(3):
                 d[axis] = (R[axis, 0] * ray[0] + R[axis, 1] * ray[1] + R[axis, 2] * ray[2]) / length
@@ -144,16 +149,29 @@ def _march_image(grids: Grids, moved: Moved, T_grid_camera: np.ndarray, rays: np
                 out[row, column, n] = here[n] if np.isfinite(distance) else np.nan
 
 
+def rays_of(camera: CameraModel) -> np.ndarray:
+    """Return the rays (H, W, 3) float64, z = 1, of a camera's pixels; NaN beyond the field of its lens."""
+    key: Any = camera  # every camera can be one, though the protocol does not say so
+    return _rays_of(key)
+
+
+@lru_cache(maxsize=2)
+def _rays_of(camera: Any) -> np.ndarray:
+    rays: np.ndarray = camera.unproject(np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1))
+    return rays
+
+
 def march(
-    volume: Volume, camera: PinholeCamera, T_world_camera: np.ndarray, displacement: Displacement
+    volume: Volume, camera: CameraModel, T_world_camera: np.ndarray, displacement: Displacement
 ) -> SurfaceBuffers:
     """Return the surface of `volume` seen by `camera` from `T_world_camera` (4, 4) while the tissue is displaced.
 
-    Depth is exact to 1e-4 mm before rounding to float32. A camera inside tissue sees nothing (NaN).
+    Depth is exact to 1e-4 mm before rounding to float32. A camera inside tissue, and a pixel beyond the field of the
+    lens, see nothing (NaN).
     """
     T_grid_camera = np.array(T_world_camera, dtype=np.float64)
     T_grid_camera[:3, 3] = (T_grid_camera[:3, 3] - volume.origin_mm) / volume.voxel_mm
-    rays = camera.unproject(np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1))
+    rays = rays_of(camera)
     out = np.empty((camera.height, camera.width, 7))
     grids = (volume.coefficients, volume.skip, *volume.steepest, displacement.stretch)
     _march_image(grids, displacement.in_grid(volume.origin_mm, volume.voxel_mm), T_grid_camera, rays, out)

@@ -156,7 +156,7 @@ def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers
     """Linear light at a moment, in frames, and the surface that it came from."""
     camera, look = phantom.spec.camera, phantom.appearance
     surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.motion.at(time))
-    rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.fx)
+    rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
     for event in _events(phantom.spec, "instrument"):

@@ -8,8 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.phantom.march import SurfaceBuffers
+from scopemap.cameras.camera import CameraModel
+from scopemap.phantom.march import SurfaceBuffers, rays_of
 from scopemap.phantom.noise import noise_at
 from scopemap.phantom.spec import EventName
 
@@ -35,7 +35,7 @@ def shade(
     albedo: np.ndarray,
     ripple: np.ndarray,
     film: np.ndarray,
-    camera: PinholeCamera,
+    camera: CameraModel,
     indirect: float = 0.0,
 ) -> np.ndarray:
     """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen.
@@ -43,7 +43,8 @@ def shade(
     `albedo` (H, W, 3) linear RGB, `ripple` (H, W, 3) tilt of the fluid film, `film` (H, W) strength of reflection.
     `indirect` : share of the lamp's light that reaches every point alike after scattering in the cavity.
     """
-    towards = -camera.rays / np.linalg.norm(camera.rays, axis=-1, keepdims=True)
+    rays = rays_of(camera).astype(np.float32)
+    towards = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     light = 1.0 / surface.distance_mm[..., None] ** 2
     cosine = np.clip((surface.normal * towards).sum(-1, keepdims=True), 0, 1)
     irradiance = cosine * light
@@ -58,9 +59,10 @@ def shade(
     return np.nan_to_num(radiance, nan=0.0, posinf=0.0).astype(np.float32)
 
 
-def vignette(camera: PinholeCamera) -> np.ndarray:
+def vignette(camera: CameraModel) -> np.ndarray:
     """Return the lens's transmission (H, W, 1) float32: 1 at the centre, less towards the corners."""
-    squared = (camera.rays[..., :2] ** 2).sum(-1, keepdims=True)
+    # By the place in the image: a fisheye's widest rays have no end on the plane z = 1.
+    squared = (camera.central.rays[..., :2] ** 2).sum(-1, keepdims=True)
     return 1.0 - _VIGNETTE * squared / squared.max()
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "tube"]
@@ -44,7 +46,8 @@ class PhantomSpec:
     scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
     frames : number of frames; None: every pose of `path_file`, or 200.
     width, height : image size, px.
-    fov_deg : horizontal field of view, degrees.
+    fov_deg : horizontal field of view of a pinhole camera, degrees; a `camera_file` has its own.
+    camera_file : calibration of the camera that sees the scene, scaled to the image size; None: a pinhole camera.
     seed : of everything random.
     path_file : camera path to follow (`read_poses`), None: a hand-like path is generated.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
@@ -68,6 +71,7 @@ class PhantomSpec:
     width: int = 320
     height: int = 256
     fov_deg: float = 90.0
+    camera_file: Path | None = None
     seed: int = 0
     path_file: Path | None = None
     deform: bool = False
@@ -113,9 +117,15 @@ class PhantomSpec:
             if not fine:
                 raise SettingsError(f"impossible phantom: {message}")
 
-    @property
-    def camera(self) -> PinholeCamera:
-        """The pinhole camera: square pixels, principal point at the centre of the image."""
+    @cached_property
+    def camera(self) -> CameraModel:
+        """The camera of `camera_file`; else a pinhole with square pixels, its principal point at the image's centre.
+
+        Raises `CalibrationError` where the file holds no camera for an image of this aspect.
+        """
+        if self.camera_file is not None:
+            calibration = read_calibration(self.camera_file, (self.width, self.height), "scale")
+            return calibration.camera
         focal = 0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2)
         return PinholeCamera(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, self.width, self.height)
 

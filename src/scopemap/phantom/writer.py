@@ -12,11 +12,11 @@ from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 from scipy import ndimage
 
+from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import marching_cubes
 from scopemap.io.decoding import write_encoded
@@ -72,7 +72,7 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
         # C3VD's lines: 16 numbers, transposed, so that the translation is the last row.
         rows = phantom.poses.transpose(0, 2, 1).reshape(-1, 16)
         np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
-        _write_camera(spec, folder / "camera.yaml")
+        write_calibration(spec.camera, folder / "camera.yaml", spec.depth_scale_mm, rate_hz=spec.fps)
         seen = np.zeros(phantom.volume.coefficients.shape, bool)
         coding = None if spec.h264_crf is None else VideoCoding(spec.h264_crf, spec.width, spec.height)
         for index in range(len(phantom.poses)):
@@ -101,17 +101,6 @@ def _check_free(folder: Path) -> None:
         raise InputError(f"will not write a phantom into {folder}: it holds other files; name a new or empty folder")
 
 
-def _write_camera(spec: PhantomSpec, file: Path) -> None:
-    storage = cv2.FileStorage(file.name, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    storage.write("image_width", spec.width)
-    storage.write("image_height", spec.height)
-    storage.write("camera_matrix", spec.camera.matrix)
-    storage.write("distortion_coefficients", np.zeros((1, 5)))
-    storage.write("depth_scale", spec.depth_scale_mm)
-    storage.write("fps", spec.fps)
-    file.write_text(storage.releaseAndGetString(), encoding="utf-8")
-
-
 def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None:
     mesh.export(folder / "mesh_truth.ply")
     if phantom.motion.parts:
@@ -122,7 +111,8 @@ def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None
 
 
 def _write_description(phantom: Phantom, file: Path) -> None:
-    spec = asdict(phantom.spec) | {"path_file": phantom.spec.path_file and str(phantom.spec.path_file)}
+    files = ("path_file", "camera_file")
+    spec = {key: str(value) if key in files and value else value for key, value in asdict(phantom.spec).items()}
     description = {
         "made_by": f"scopemap {version('scopemap')}",
         "spec": spec,

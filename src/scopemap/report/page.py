@@ -43,7 +43,7 @@ def write_report(folder: Path | str, pictures: FramePictures | None = None) -> l
     with reporting(f"cannot write {page}"):
         page.write_text(page_html([page_data(run, meshes)]), encoding="utf-8")
     with reporting(f"cannot write {picture}"):
-        summary_picture(run, meshes[0]).save(picture, compress_level=1)
+        summary_picture(run, meshes).save(picture, compress_level=1)
     if (Path(folder) / SUMS).is_file():
         write_checksums(Path(folder), only=(PAGE, PICTURE, PICTURES))
     return [page, picture]

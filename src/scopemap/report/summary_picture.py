@@ -1,6 +1,10 @@
-"""The picture of summary.png: a run on one sheet: the verdict, frames, their depth, and the surface with the path."""
+"""The picture of summary.png: a run on one sheet: the verdict, frames, their depth, the surface with the path, and
+the pieces side by side where there are several.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -20,6 +24,7 @@ from scopemap.report.mesh_figures import (
     outside_views,
     view_from_behind,
 )
+from scopemap.report.pieces import Piece, most_doubtful, pieces_in_time
 from scopemap.report.verdict import Verdict, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
@@ -30,10 +35,13 @@ _INK, _SOFT, _GROUND = "#17202b", "#566373", "#ffffff"
 _UNKNOWN = 32
 
 
-def summary_picture(run: KeptRun, mesh: trimesh.Trimesh) -> Image.Image:
-    """Return the summary of a run as a picture; `mesh` is the result's, world mm, or one with fewer faces."""
+def summary_picture(run: KeptRun, meshes: Sequence[trimesh.Trimesh]) -> Image.Image:
+    """Return the summary of a run as a picture.
+
+    meshes : of its maps, the result's first, world mm, or some with fewer faces; maps beyond them are not drawn.
+    """
     frames = _spread(run)
-    rows = [_frames_row(run, frames), _depth_row(run, frames), _mesh_row(run, mesh)]
+    rows = [_frames_row(run, frames), _depth_row(run, frames), _mesh_row(run, meshes[0]), *_piece_rows(run, meshes)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
@@ -107,6 +115,28 @@ def _mesh_row(run: KeptRun, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     middle = inside_view(poses[len(poses) // 2])
     inside = mesh_picture(_opened(mesh, middle), middle, smooth=False)
     return pictures | {"from the middle of the path": _fitted(inside)}
+
+
+def _piece_rows(run: KeptRun, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
+    """Return the pieces of a run that has several, in order of time, in rows: each from outside with its path."""
+    pieces = pieces_in_time(run)
+    if len(pieces) < 2:
+        return []
+    worst, shown = most_doubtful(pieces), {}
+    for piece in pieces:
+        if piece.number < len(meshes) and len(meshes[piece.number].faces):
+            poses = run.maps[piece.number].T_world_camera
+            view = outside_views(meshes[piece.number], poses[0], poses[:, :3, 3])["from outside"]
+            picture = mesh_picture(_opened(meshes[piece.number], view), view, smooth=False)
+            draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR, thickness_px=2)
+            shown[_piece_title(piece, is_worst=piece is worst)] = _fitted(cropped(picture))
+    titles = list(shown)
+    return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
+
+
+def _piece_title(piece: Piece, *, is_worst: bool) -> str:
+    facts = [f"{piece.name}: frames {piece.first} to {piece.last}", piece.inliers, "most doubtful" * is_worst]
+    return ", ".join(filter(None, facts))
 
 
 def _opened(mesh: trimesh.Trimesh, view: MeshView) -> trimesh.Trimesh:

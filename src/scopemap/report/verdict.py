@@ -10,6 +10,7 @@ import numpy as np
 
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
 from scopemap.report.losses import in_words, losses
+from scopemap.report.pieces import doubt_words, pieces_in_time
 
 Level = Literal["good", "doubtful", "bad", "note"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
@@ -25,6 +26,7 @@ GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
 _PLAIN_WORDS: list[tuple[str, Level, str]] = [
     ("^[0-9]+ submaps: the camera was lost", "note", ""),
     ("^interrupted at frame", "note", ""),
+    ("^the camera is unknown", "note", ""),
     ("in the result: too few to judge it by", "note", ""),
     ("most of the scene is not fused", "doubtful", "Most of what was seen is too far away to be in the surface"),
     ("^masks: .* frames have none", "doubtful", "Most frames have no mask: instruments may be part of the surface"),
@@ -136,6 +138,9 @@ def _of_maps(run: KeptRun) -> list[Reason]:
         shown = f"; {kept} {'piece is' if kept == 1 else 'pieces are'} shown below" if kept else ""
         text = f"After losses {other} more frames form pieces of their own: where they belong is unknown{shown}."
         found.append(Reason("note", text))
+    doubt = doubt_words(pieces_in_time(run))
+    if doubt:
+        found.append(Reason("note", f"Most doubtful of the pieces is {doubt}."))
     if lost:
         words = f"In {lost} frames the camera could not be followed at all. {in_words(losses(run))}"
         found.append(Reason("note", words.rstrip()))

@@ -17,11 +17,13 @@ def write_calibration(
     file: Path | str,
     depth_scale_mm: float | None = None,
     focal_sigma_px: float | None = None,
+    rate_hz: float | None = None,
 ) -> None:
     """Write `camera` as OpenCV YAML that `read_calibration` reads back exactly.
 
     `depth_scale_mm` is written as `depth_scale`: mm per unit of the depth files beside it; `focal_sigma_px` under its
-    own name: the standard deviation of fx, for people. Raises `CalibrationError` where the file cannot be written.
+    own name: the standard deviation of fx, for people; `rate_hz` as `fps`, frames per second. Raises `CalibrationError`
+    where the file cannot be written.
     """
     # In memory: OpenCV takes no names outside of the system's code page on Windows.
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -42,6 +44,8 @@ def write_calibration(
         storage.write("depth_scale", float(depth_scale_mm))
     if focal_sigma_px is not None:
         storage.write("focal_sigma_px", float(focal_sigma_px))
+    if rate_hz is not None:
+        storage.write("fps", float(rate_hz))
     try:
         Path(file).write_text(storage.releaseAndGetString(), encoding="utf-8")
     except OSError as error:

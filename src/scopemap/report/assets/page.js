@@ -122,7 +122,7 @@ function showMap(number) {
   shown = number;
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
   put("piece", run.maps.length > 1 ? (number ? `Piece ${number}: where it lies is unknown` : "The result") : "");
-  document.querySelectorAll("#piece-list button").forEach((button, k) => button.setAttribute("aria-pressed", String(k === number)));
+  document.querySelectorAll("#piece-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
 
@@ -142,9 +142,10 @@ function writePieces() {
     const button = document.createElement("button"), canvas = document.createElement("canvas"), first = run.places.indexOf(number);
     const note = document.createElement("small");
     button.type = "button";
+    button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", number ? `Surface of piece ${number}` : "Surface of the result");
-    note.textContent = `${map.frames} frames, from ${run.times[Math.max(first, 0)].toFixed(1)} s on`;
+    note.textContent = [`${map.frames} frames, from ${run.times[Math.max(first, 0)].toFixed(1)} s on`, map.inliers].filter(Boolean).join(", ");
     button.append(canvas, number ? `Piece ${number} (maps/${number})` : "The result", note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
@@ -153,7 +154,7 @@ function writePieces() {
     }
     return button;
   });
-  element("piece-list").replaceChildren(...buttons);
+  element("piece-list").replaceChildren(...buttons.sort((one, other) => run.maps[one.dataset.map].turn - run.maps[other.dataset.map].turn));
 }
 
 const MOST_LOSSES = 12;
