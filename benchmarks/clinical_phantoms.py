@@ -45,7 +45,7 @@ def row(name: str, phantom: Path, out: Path, preset: str) -> str:
     arguments = ("evaluate", str(out), "--truth", str(phantom), "--align", "sim3", "--json")
     printed = scopemap(*arguments, check=False)
     found = json.loads(printed) if printed else {}
-    cells = [f"{told['tracked'] + told['in_other_maps']} of {FRAMES}", str(told["tracked"])]
+    cells = [f"{told['tracked'] + told.get('in_other_maps', 0)} of {FRAMES}", str(told["tracked"])]
     cells.append(str(1 + len(list((out / "maps").glob("*")))))
     cells.append(f"{found['ate_rmse_mm']:.3f}" if found else "")
     angles = ("rotation_unaligned_mean_deg", "rotation_unaligned_max_deg")

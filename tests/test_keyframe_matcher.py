@@ -16,6 +16,7 @@ from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
+from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -177,3 +178,50 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
         tracker.insert_keyframe(_frame(0, HERE), measured=False)
         assert tracker.track(replace(_frame(1, THERE), valid=valid)).status == "ok"
         assert tracker.needs_keyframe() == wanted
+
+
+def _to_and_fro(tracker: Tracker) -> list[Track]:
+    """Track a camera that goes 16 mm and comes back; each keyframe's depth is wrong by 3 % more than the last one's."""
+    tracks: list[Track] = []
+    keyframes = 0
+    for index, way in enumerate([*range(9), *range(7, -1, -1)]):
+        frame = _frame(index, plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)))
+        track = tracker.track(replace(frame, T_world_camera=None))
+        assert track.status != "lost", track.reason
+        if tracker.needs_keyframe():
+            wrong_mm = frame.depth_mm * np.float32(1.03**keyframes)
+            keyframe = replace(frame, depth_mm=wrong_mm, T_world_camera=track.T_world_camera)
+            assert tracker.insert_keyframe(keyframe, measured=False)
+            keyframes += 1
+        tracks.append(track)
+    return tracks
+
+
+def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = chosen(TrackingSettings, keyframe_every=2)
+    again = _to_and_fro(Tracker(settings, DisFlow()))
+    assert again[-1].keyframe == 0
+    assert len({track.keyframe for track in again}) <= 6
+    assert np.linalg.norm(again[-1].T_world_camera[:3, 3]) < 0.1
+    monkeypatch.setattr("scopemap.tracking.relocalisation.PassedKeyframes.nearer", lambda *_: None)
+    onwards = _to_and_fro(Tracker(settings, DisFlow()))
+    assert np.linalg.norm(onwards[-1].T_world_camera[:3, 3]) > 0.5
+    assert onwards[-1].keyframe > 10
+
+
+def test_the_nearest_passed_keyframe_is_asked_for_where_it_is_clearly_nearer() -> None:
+    passed = PassedKeyframes()
+    current = Keyframe(
+        _frame(9, plane_scene.pose(at_mm=(20.0, 0, 0))), plane_scene.pose(at_mm=(20.0, 0, 0)), [], 50.0, False, 0
+    )
+    assert passed.nearer(HERE, current) is None
+    for index, x_mm in enumerate((0.0, 8.0, 20.0)):
+        passed.add(_frame(index, plane_scene.pose(at_mm=(x_mm, 0, 0))))
+
+    def nearer(x_mm: float) -> int | None:
+        found = passed.nearer(plane_scene.pose(at_mm=(x_mm, 0, 0)), current)
+        return None if found is None else found.index
+
+    assert [nearer(x_mm) for x_mm in (0.0, 7.0, 13.0, 16.0, 19.0, -16.0)] == [0, 1, None, None, None, None]
+    passed.clear()
+    assert nearer(0.0) is None

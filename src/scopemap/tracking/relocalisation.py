@@ -1,4 +1,4 @@
-"""Relocalisation: finds a lost camera in recent keyframes by features, PnP and alignment from there."""
+"""Keyframes that are known: a lost camera is found again in them by features, PnP and alignment from there."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import numpy as np
 
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.tracking.features import FeatureDetector, Features, RelativePose, relative_pose_pnp
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment
 
 _MIN_INLIERS = 20
+_PASSED_KEYFRAMES = 64
+_MAX_APART, _NEARER = 0.3, 0.7  # distance of a passed keyframe's view, at most, and over that of the current one
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
 
 
@@ -34,6 +37,38 @@ class Keyframe:
     depth_mm: float
     measured: bool
     map: int
+
+
+class PassedKeyframes:
+    """Earlier keyframes of the current map, 64 at most, that the camera may come back to."""
+
+    def __init__(self) -> None:
+        self._frames: deque[Frame] = deque(maxlen=_PASSED_KEYFRAMES)
+
+    def add(self, frame: Frame) -> None:
+        """Add a keyframe with its pose and its depth."""
+        self._frames.append(replace(frame, depth_sigma_mm=None))
+
+    def clear(self) -> None:
+        """Forget them: the world is another one."""
+        self._frames.clear()
+
+    def nearer(self, T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
+        """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
+
+        The distance of two views is the turn, rad, plus the way over the scene's depth.
+        """
+
+        def distance(T_world_other: np.ndarray | None) -> float:
+            assert T_world_other is not None
+            T = inverse(T_world_other) @ T_world_camera
+            return float(rotation_angle_rad(T[:3, :3])) + float(np.linalg.norm(T[:3, 3])) / current.depth_mm
+
+        nearest = min(self._frames, key=lambda frame: distance(frame.T_world_camera), default=None)
+        if nearest is None or nearest.index == current.frame.index:
+            return None
+        limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
+        return nearest if distance(nearest.T_world_camera) <= limit else None
 
 
 class Relocaliser:

@@ -14,7 +14,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
 from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.relocalisation import Keyframe, Relocaliser
+from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes, Relocaliser
 from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
@@ -28,6 +28,7 @@ _CLEAR_MATCHES = 40
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
+_SEEN_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
 _DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 
@@ -60,6 +61,8 @@ class Tracker:
         self._agreement: list[float] = []
         self._is_unsharp = False
         self._coverage = 1.0
+        self._passed = PassedKeyframes()
+        self._is_seen_again = False
         self._map, self._map_count = 0, 1
         self._frames_of_map: Counter[int] = Counter()
 
@@ -86,6 +89,12 @@ class Tracker:
             self._sharp_frames_lost += not self._is_unsharp
             return self._lost(frame, f"not searched: one of {self.settings.search_every} lost frames is")
         alignment, pyramid = self._align(self._keyframe, frame)
+        if (
+            self._is_due([alignment.agreement])
+            and not self._frames_lost
+            and not self._reject_reason(self._keyframe, alignment)
+        ):
+            alignment = self._seen_again(frame, alignment)
         obscured = self._is_obscured(sharpness, alignment)
         rejected, reason = self._reject_reason(self._keyframe, alignment), ""
         failed, is_weak = obscured or bool(rejected), self._coverage < _WEAK_COVERAGE
@@ -117,12 +126,15 @@ class Tracker:
         """Return whether the frame that was tracked last should become a keyframe."""
         if self._keyframe is None:
             return True
-        agreement, least = self._agreement, self.settings.advanced.min_keyframe_agreement
-        is_due = self._frames_since_keyframe >= self.settings.keyframe_every
-        fits_worse = bool(agreement) and agreement[-1] < least * agreement[0]
         # The depth of an unsharp frame is no better than its image.
-        few_corners = self._coverage < _KEYFRAME_COVERAGE
-        return (is_due or fits_worse or few_corners) and not self._is_unsharp
+        return (self._is_seen_again or self._is_due(self._agreement[-1:])) and not self._is_unsharp
+
+    def _is_due(self, agreement: list[float]) -> bool:
+        """Whether a frame with this agreement, [] where it is not known, should become a keyframe."""
+        is_old = self._frames_since_keyframe >= self.settings.keyframe_every
+        least = self.settings.advanced.min_keyframe_agreement
+        fits_worse = bool(agreement and self._agreement) and agreement[-1] < least * self._agreement[0]
+        return is_old or fits_worse or self._coverage < _KEYFRAME_COVERAGE
 
     def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
@@ -131,13 +143,43 @@ class Tracker:
         """
         if frame.depth_mm is None or frame.T_world_camera is None:
             raise ValueError("a keyframe needs a depth and a pose")
+        if self._is_seen_again:
+            self._is_seen_again, self._frames_since_keyframe = False, 0
+            return True
         keyframe = self._keyframe_of(frame, measured)
         if keyframe is None:
             return False
         self._use_keyframe(keyframe)
         self._relocaliser.add(keyframe)
+        self._passed.add(frame)
         self._frames_since_keyframe = 0
         return True
+
+    def _seen_again(self, frame: Frame, alignment: Alignment) -> Alignment:
+        """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces.
+
+        Errors of poses and scale since then are gone: a camera that goes to and fro does not drift on and on.
+        """
+        current = self._keyframe
+        assert current is not None
+        self._is_seen_again = False
+        if self._matcher is None or current.measured:
+            return alignment
+        T_world_camera = _T_world_camera(current, alignment)
+        nearest = self._passed.nearer(T_world_camera, current)
+        keyframe = None if nearest is None else self._keyframe_of(nearest, current.measured)
+        if keyframe is None:
+            return alignment
+        T_start, coverage = inverse(T_world_camera) @ keyframe.T_world_camera, self._coverage
+        self._matcher.set_keyframe(keyframe.frame, frame, T_start)
+        found = self._align_by_corners(keyframe, frame, T_start)
+        if found is None or self._coverage < _SEEN_COVERAGE or not self._is_accepted(keyframe, found):
+            self._matcher.set_keyframe(current.frame)
+            self._coverage = coverage
+            return alignment
+        self._use_keyframe(keyframe)
+        self._is_seen_again = True
+        return found
 
     def _keyframe_of(self, frame: Frame, measured: bool) -> Keyframe | None:
         """Return a keyframe of the current map; None where too little of the frame's depth is known."""
@@ -312,6 +354,7 @@ class Tracker:
         return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._map)
 
     def _enter_map(self, number: int) -> None:
+        self._passed.clear()
         self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
 
