@@ -17,7 +17,7 @@ from numba import njit
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.flow.corners import Correspondences2D3D
 from scopemap.frame import REGIONS
-from scopemap.geometry.least_squares import DenseModel, Options, Problem, minimise, robust_sigma_2d
+from scopemap.geometry.least_squares import RAYLEIGH_TO_SIGMA, DenseModel, Options, Problem, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import orthonormalised, se3_exp
 
 _MIN_POINTS = 50
@@ -79,17 +79,27 @@ def nonrigidity(
     rows, columns = REGIONS
     place = (correspondences.pixels + 0.5) / [camera.width, camera.height] * [columns, rows]
     column, row = np.clip(place.astype(int), 0, [columns - 1, rows - 1]).T
-    region, found = np.where(in_front, row * columns + column, -1), np.full(rows * columns, np.nan, np.float32)
-    for number in range(rows * columns):
-        own = np.flatnonzero(region == number)
-        if len(own) < _MIN_REGION_POINTS:
-            continue
-        error, line = np.median(errors[own], 0), np.median(along[own], 0)
-        scatter = robust_sigma_2d(np.linalg.norm(errors[own] - error, axis=1))
-        variance = _SIGMA_PX**2 + scatter**2
-        square = (error @ error - (error @ line) ** 2 / (variance + line @ line)) / variance
-        found[number] = np.sqrt(max(square, 0.0))
-    return found.reshape(REGIONS)
+    region = np.where(in_front, row * columns + column, rows * columns)  # what is behind has a region of its own
+    count, median = _medians(np.hstack([errors, along]), region, rows * columns + 1)
+    error, line = median[:, :2], median[:, 2:]
+    _, scatter = _medians(np.linalg.norm(errors - error[region], axis=1)[:, None], region, rows * columns + 1)
+    variance = _SIGMA_PX**2 + (RAYLEIGH_TO_SIGMA * scatter[:, 0]) ** 2
+    on_line, length = (error * line).sum(1), (line**2).sum(1)
+    square = ((error**2).sum(1) - on_line**2 / (variance + length)) / variance
+    found = np.where(count >= _MIN_REGION_POINTS, np.sqrt(np.maximum(square, 0.0)), np.nan)
+    return found[:-1].reshape(REGIONS).astype(np.float32)
+
+
+def _medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the count (G,) and the medians (G, k) of the values (N, k) of each group (N,); NaN of none."""
+    count, order = np.bincount(group, minlength=groups), np.argsort(group, kind="stable")
+    place = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
+    padded = np.full((groups, max(int(count.max(initial=0)), 1), values.shape[1]), np.inf)
+    padded[group[order], place] = values[order]
+    padded.sort(1)
+    each, last = np.arange(groups), np.maximum(count - 1, 0)
+    middle = (padded[each, last // 2] + padded[each, (last + 1) // 2]) / 2
+    return count, np.where(count[:, None] > 0, middle, np.nan)
 
 
 def _problem(data: tuple[object, ...], unit_mm: float) -> Problem[np.ndarray]:

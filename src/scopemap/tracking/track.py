@@ -13,7 +13,7 @@ from scopemap.geometry.se3 import inverse
 Status = Literal["initial", "ok", "lost", "other-map"]
 
 TOO_DARK, TOO_BRIGHT = ", it is too dark", ", it is overexposed"
-MOVING_SIGMAS = 3.0
+MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
 RELOCALISED = "relocalised"
