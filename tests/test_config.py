@@ -28,10 +28,10 @@ READERS = {
     "depth": ["depth/*.py"],
     "mapis": ["depth/*.py", "pipeline.py"],
     "networks": ["estimators.py"],
-    "tracking": ["tracking/*.py"],
+    "tracking": ["tracking/*.py", "estimators.py"],
     "smoothing": ["tracking/smoothing.py"],
     "mapping": ["mapping/*.py", "estimators.py", "pipeline.py", "runner/*.py"],
-    "fusion": ["fusion/*.py", "pipeline.py"],
+    "fusion": ["fusion/*.py", "pipeline.py", "runner/run.py"],
 }
 
 

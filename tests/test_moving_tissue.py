@@ -26,6 +26,7 @@ from scopemap.io.decoding import read_decoded
 from scopemap.phantom.render import prepare, render_frame
 from scopemap.phantom.spec import PhantomSpec, parse_events
 from scopemap.phantom.writer import write_phantom
+from scopemap.pipeline import Step
 from scopemap.runner.provenance import motion_notes
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.reprojection import nonrigidity
@@ -186,6 +187,29 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
         truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)  # type: ignore[index]
         assert len(vertices) > 5000
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
+
+
+def test_a_killed_run_of_a_camera_at_rest_ends_in_the_same_bytes(
+    run: Path, pushed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
+    monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
+    config, out = Config.load(file=run / "config.toml", settings={"fusion.surface_at_s": 0.3}), tmp_path / "killed"
+
+    for last in (3, 6, 8):
+
+        def kill(step: Step, last: int = last) -> None:
+            if step.frame.index >= last:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(open_sequence(pushed), config, out=out, observers=(kill,))
+    resumed = reconstruct(open_sequence(pushed), config, out=out)
+    assert resumed.provenance["resumed_after_frame"] >= 1
+    whole = reconstruct(open_sequence(pushed), config, out=tmp_path / "whole")
+    for file in ("frames.csv", "mesh.ply", "trajectory.tum", "surfaces/000002.ply", "surfaces/000009.ply"):
+        assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
+    assert any("as seen at second 0.3" in note for note in whole.provenance["notes"])
 
 
 def test_motion_is_told_where_and_when_it_is(run: Path) -> None:

@@ -57,7 +57,7 @@ def test_every_frame_is_on_the_page_with_its_pose_and_place(page: str) -> None:
     np.testing.assert_allclose(poses[5], pose_of(5)[:3], atol=1e-5)
     np.testing.assert_allclose(poses[-1], pose_of(FRAMES - 1)[:3], atol=1e-5)
     assert {frames["reasons"][k] for k in numbers(frames["reason"], "i2")[lost]} == {"too blurred"}
-    assert set(frames["curves"]) == {"inliers", "agreement", "scale", "sharpness", "ms"}
+    assert set(frames["curves"]) == {"inliers", "agreement", "scale", "moving", "sharpness", "ms"}
     assert np.isfinite(numbers(frames["curves"]["sharpness"], "f4")).all()
 
 
