@@ -63,9 +63,9 @@ def test_robust_scale_in_closed_form() -> None:
 def test_robust_scale_needs_an_overlap() -> None:
     few = np.full(SHAPE, np.nan, np.float32)
     assert robust_scale(DEPTH, few, 0.7) == 0.7
-    few.ravel()[: int(0.019 * few.size)] = 99.0
+    few.ravel()[: int(0.19 * few.size)] = 99.0
     assert robust_scale(DEPTH, few, 0.7) == 0.7
-    few.ravel()[: int(0.021 * few.size) + 1] = 99.0
+    few.ravel()[: int(0.21 * few.size) + 1] = 99.0
     assert robust_scale(DEPTH, few, 0.7) != 0.7
 
 

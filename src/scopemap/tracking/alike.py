@@ -27,6 +27,8 @@ _MAPS = ["map1", "map2", "map3", "map4"]
 _MAX_FEATURES = 1000  # twice those of SIFT: where tissue is bare, the weaker half holds a third of the matches
 _RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
 _TEMPERATURE = 0.1  # of the soft argmax
+# Local brightness that pictures are brought to, its width as a share of the picture's, and what is added to the dark.
+_EVEN_LEVEL, _EVEN_SHARE, _DARKEST, _LOW_RESOLUTION = 110.0, 1 / 16, 8.0, 4
 
 
 class AlikeFeatures:
@@ -40,7 +42,7 @@ class AlikeFeatures:
         Raises `WeightsError` where the installation lacks the network.
         """
         height, width = frame.valid.shape
-        scores, maps, head = network_answer(frame.rgb)
+        scores, maps, head = network_answer(evenly_lit(frame.rgb))
         scores = scores[:height, :width]
         pixels = _keypoints(scores, usable_pixels(frame.valid))
         if not len(pixels):
@@ -56,6 +58,19 @@ class AlikeFeatures:
             sha256 = sha256_of(file) if file.is_file() else "missing"
         runtime = f"onnxruntime {onnxruntime.__version__}"
         return {"features": self.name, f"sha256 {_NETWORK}": sha256, "runtime": runtime}
+
+
+def evenly_lit(rgb: np.ndarray) -> np.ndarray:
+    """Return a picture (H, W, 3) uint8 over its local brightness: the lamp moves with the camera, the tissue does not.
+
+    What was a dark lumen is matched with the bright wall that it becomes.
+    """
+    height, width = rgb.shape[:2]
+    brightest = cv2.max(cv2.max(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
+    size = (max(1, width // _LOW_RESOLUTION), max(1, height // _LOW_RESOLUTION))
+    small = cv2.resize(brightest, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    local = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(_EVEN_SHARE * size[0], 1.0)), (width, height))
+    return np.clip(rgb * (_EVEN_LEVEL / (local + _DARKEST))[..., None], 0, 255).astype(np.uint8)
 
 
 def network_answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:

@@ -25,6 +25,7 @@ _MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and m
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
 _DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost, unless so many features match: by chance 20 at most
 _CLEAR_MATCHES = 40
+_FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
@@ -211,6 +212,7 @@ class Tracker:
             lambda keyframe, relative: self._align_from(keyframe, frame, views, relative),
             lambda keyframe, alignment: (
                 self._is_accepted(keyframe, alignment)
+                and alignment.overlap >= _FOUND_OVERLAP
                 # Of many keyframes one always fits a wall without texture.
                 and (keyframe.measured or alignment.texture >= _MIN_TEXTURE)
                 and not self._is_obscured(sharpness, alignment)
@@ -315,7 +317,8 @@ class Tracker:
             # A supported pose may be a pixel off, which decorrelates fine texture.
             if alignment.correlation < settings.min_correlation / 3 or not alignment.is_supported:
                 return f"correlation {alignment.correlation:.2f} with the keyframe"
-        if keyframe.map != self._map:
+        # A cut may turn the view by any angle: so many features do not match by chance.
+        if keyframe.map != self._map or alignment.matches >= _CLEAR_MATCHES:
             return ""
         T_step = inverse(self._T_world_last) @ T_world_camera
         rotation_rad = float(rotation_angle_rad(T_step[:3, :3]))
