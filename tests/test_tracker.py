@@ -144,14 +144,18 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
     assert turned_deg < 0.4
 
 
-def test_a_jump_is_not_believed() -> None:
-    frames, _ = _sequence()
-    tracker = Tracker(chosen(TrackingSettings, **PLAIN, max_step=1e-4))
-    first = tracker.track(frames[0])
-    tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
-    track = tracker.track(frames[4])
-    assert track.status == "lost"
-    assert "jump" in track.reason
+def test_a_jump_is_believed_only_where_many_features_confirm_it() -> None:
+    frames, truth = _sequence()
+    tracks = []
+    for searched in (0, 10):
+        tracker = Tracker(chosen(TrackingSettings, **PLAIN, max_step=1e-4, relocalisation_keyframes=searched))
+        first = tracker.track(frames[0])
+        tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+        tracks.append(tracker.track(frames[4]))
+    assert tracks[0].status == "lost"
+    assert "jump" in tracks[0].reason
+    assert tracks[1].status == "ok"
+    assert max(_errors(tracks[1].T_world_camera, truth[4])) < 0.3
 
 
 @pytest.mark.parametrize(("share", "wanted"), [(0.7, True), (0.0, False)])
