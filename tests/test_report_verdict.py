@@ -178,3 +178,33 @@ def test_the_document_states_the_thresholds() -> None:
     for share in (*shares, rules.GOOD_DISAGREEMENT, rules.MOST_DISAGREEMENT):
         assert f"{share:.0%}".replace("%", " %") in text
     assert f"fewer than {rules.LEAST_FRAMES} frames" in text
+
+
+@pytest.mark.parametrize(
+    ("notes", "expected"),
+    [
+        ([], "there the surface is a mean. Tissue that moves as a whole looks like a moving camera."),
+        (
+            ["fusion: as seen at second 3 where tissue moves on its own"],
+            "there the surface is as seen at one moment. Tis",
+        ),
+        (["tracking: the camera is at rest, as stated: all motion is the tissue's"], "there the surface is a mean."),
+    ],
+)
+def test_moving_tissue_is_said_and_does_not_change_the_word(notes: list[str], expected: str) -> None:
+    moving = "tissue: in 41 of 62 frames more than 10% of the picture moves on its own; most in frame 47: 94%"
+    found = verdict(run_of([0] * 62, notes=[moving, *notes]))
+    said = [reason for reason in found.reasons if "moves on its own in 41 of 62 frames" in reason.text]
+    assert [reason.level for reason in said] == ["note"]
+    assert expected in said[0].text
+    assert found.word == "good"
+    assert ("looks like a moving camera" in said[0].text) == (not any("as stated" in note for note in notes))
+
+
+def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
+    of_the_data = "the camera is at rest while the tissue moves: errors of the path say little here"
+    stated = "tracking: the camera is at rest, as stated: all motion is the tissue's"
+    assert verdict(run_of([0] * 62, notes=[of_the_data])).word == "doubtful"
+    found = verdict(run_of([0] * 62, notes=[of_the_data, stated]))
+    assert found.word == "good"
+    assert any("stated to be at rest" in reason.text for reason in found.reasons)

@@ -181,8 +181,10 @@ def _of_camera(run: KeptRun) -> list[Reason]:
     elif "the camera is at rest while the tissue moves" in notes:
         found.append(Reason("doubtful", "The camera hardly moves while the tissue does: the path means little."))
     if moving := re.search(r"tissue: in (\d+) of (\d+) frames", notes):
-        text = f"Tissue moves on its own in {moving[1]} of {moving[2]} frames: there the surface is a mean."
-        found.append(Reason("note", f"{text} Tissue that moves as a whole looks like a moving camera."))
+        shown = "as seen at one moment" if "fusion: as seen at second" in notes else "a mean"
+        text = f"Tissue moves on its own in {moving[1]} of {moving[2]} frames: there the surface is {shown}."
+        whole = "" if "as stated" in notes else " Tissue that moves as a whole looks like a moving camera."
+        found.append(Reason("note", text + whole))
     if "the lens has radial distortion" in notes:
         found.append(Reason("doubtful", "The lens bends straight lines: shapes are bent, too. A calibration mends it."))
     return found
