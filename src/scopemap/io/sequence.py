@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth
@@ -140,14 +141,19 @@ class Sequence:
                 raise InputError(f"reading {late}") from None
             self.source.warnings.append(f"{late}; the frames until then were used")
 
-    def with_focal(self, focal_px: float, source: str, sigma_px: float | None = None) -> Sequence:
+    def with_focal(
+        self, focal_px: float, source: str, sigma_px: float | None = None, fisheye: tuple[float, ...] = ()
+    ) -> Sequence:
         """Return the sequence with another guess of an unknown camera.
 
         `focal_px` is the horizontal focal length at the working size, `sigma_px` its standard deviation where one is
-        known; `source` says how it is known. Raises `CalibrationError` where the camera is known.
+        known; `source` says how it is known. `fisheye` : coefficients of a `FisheyeCamera`; none: a pinhole. Raises
+        `CalibrationError` where the camera is known.
         """
         if self.calibrated:
             raise CalibrationError(f"the focal length of {self.path} is known ({self.camera_source}); it stays")
-        camera = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
+        camera: CameraModel = assumed_camera(self.source, focal_px * self.source.width / self.camera.width)
+        if fisheye:
+            camera = FisheyeCamera(camera.central, fisheye)
         target = working_camera(camera, (self.camera.width, self.camera.height))
         return replace(self, rectifier=Rectifier(camera, target), camera_source=source, focal_sigma_px=sigma_px)

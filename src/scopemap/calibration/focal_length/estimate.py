@@ -4,7 +4,8 @@ Windows differ by more than their standard deviations, so the variance between t
 Laird, "Meta-analysis in clinical trials", 1986). They also have a common error: a lamp that moves with the camera
 biases the flow, and the estimated rotation, by about 0.4 degrees. If the optical axis tilts by T degrees, the relative
 error of the focal length is 0.4 / T, for any number of windows. The assumed focal length of an unknown camera is kept
-unless the estimate contradicts it significantly.
+unless the estimate contradicts it significantly. Where the motion does not tell, or the lens bends straight lines, the
+same windows are tried through lenses of several kinds (`trial`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
-from scopemap.calibration.focal_length.windows import MAX_FRAMES, windows_of
+from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
+from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, windows_of
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.io.sequence import Sequence
@@ -73,7 +75,8 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     `input.focal` "flow" takes any estimate, "auto" one of small deviation that contradicts the assumed focal length.
     Raises `CalibrationError` where there is no estimate for "flow".
     """
-    estimate, assumed_px = focal_from_motion(sequence, config), sequence.camera.fx
+    windows: list[Window] = []
+    estimate, assumed_px = focal_from_motion(sequence, config, windows), sequence.camera.fx
     wanted = config.input.focal == "flow"
     if wanted and estimate.reason:
         raise CalibrationError(
@@ -89,7 +92,18 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         kept = f"the motion does not determine it: {estimate.reason}"
     elif not wanted and estimate.share > MAX_SHARE:
         kept = f"the estimate from the motion is uncertain: {described}"
-    elif not wanted and not estimate.differs_from(assumed_px):
+    is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
+    if not wanted and (is_unknown or bends):
+        tried = try_lenses(windows)
+        if tried is not None and not tried.reason:
+            return _with_tried(sequence, tried, windows), []
+        if is_unknown:
+            kept += "; " + _undecided(tried)
+            default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
+            sequence.source.warnings.append(
+                f"{default}; a calibration (--camera) or the field of view (--fov) mends it"
+            )
+    if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
@@ -98,14 +112,30 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         "from the centre; only a calibration corrects it (--camera)"
     )
     source = f"estimated: from the motion of {min(sequence.count or MAX_FRAMES, MAX_FRAMES)} frames, {described}"
-    notes = [distorted] * (abs(estimate.distortion) >= _MIN_DISTORTION)
-    return sequence.with_focal(estimate.focal_px, source, estimate.sigma_px), notes
+    return sequence.with_focal(estimate.focal_px, source, estimate.sigma_px), [distorted] * bends
 
 
-def focal_from_motion(sequence: Sequence, config: Config) -> FocalEstimate:
+def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> Sequence:
+    """Return the sequence seen through the lens that a trial found."""
+    scale = sequence.camera.width / (2 * windows[0].half_width_px)
+    focal_px, sigma_px = scale * tried.focal_px, scale * tried.focal_px * tried.share
+    source = (
+        f"estimated: by trial of lenses in {tried.windows} windows, {tried.kind}, fx {focal_px:.0f} +- "
+        f"{max(sigma_px, 1):.0f} px, horizontal field of view {tried.fov_deg:.0f} deg"
+    )
+    return sequence.with_focal(focal_px, source, sigma_px, KINDS[tried.kind])
+
+
+def _undecided(tried: LensTrial | None) -> str:
+    """Return what a trial of lenses that settles nothing says, one phrase."""
+    said = "fewer than two windows show a rigid scene" if tried is None else tried.reason
+    return f"a trial of lenses does not tell it either: {said}"
+
+
+def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
     """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior.
 
-    The principal point is the camera's.
+    The principal point is the camera's. windows : to which those that are used are appended.
     """
     camera, scale = sequence.camera, 1.0
     # Flow, of the next window, and the adjustment of this one take about equally long.
@@ -114,6 +144,8 @@ def focal_from_motion(sequence: Sequence, config: Config) -> FocalEstimate:
         for window in windows_of(sequence, config):
             # All windows have one size, which may be smaller than the sequence's.
             scale = 2 * window.half_width_px / camera.width
+            if windows is not None:
+                windows.append(window)
             pending.append(adjusting.submit(adjust_window, window, camera.fx * scale))
     found = [fit for fit in (one.result() for one in pending) if fit is not None]
     fits = [fit for fit in found if fit.residual_px <= _MAX_RESIDUAL * scale * camera.width]

@@ -16,6 +16,7 @@ import numpy as np
 
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
 from scopemap.config import Config
+from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.errors import InputError
 from scopemap.flow.corners import detect_corners, normalised_brightness
 from scopemap.frame import Frame, is_constant
@@ -44,13 +45,15 @@ class Window:
     Attributes
     ----------
     start : (N, 2) float64 px in the host, from the principal point. seen : (N, K, 2) the same in the partners, NaN
-    where not observed. half_width_px : half the width of the image. aspect : fy over fx.
+    where not observed. half_width_px : half the width of the image. aspect : fy over fx. log_distance : (N,) ln of the
+    estimated distance of the corners along their rays, mm; None: not estimated.
     """
 
     start: np.ndarray
     seen: np.ndarray
     half_width_px: float
     aspect: float = 1.0
+    log_distance: np.ndarray | None = None
 
 
 def windows_of(sequence: Sequence, config: Config) -> Iterator[Window]:
@@ -58,13 +61,22 @@ def windows_of(sequence: Sequence, config: Config) -> Iterator[Window]:
 
     A window ends where the host's corners are lost; one with less than two partners or 40 corners is left out.
     """
-    frames = _kept(_at_default_size(sequence), config)
+    frames, depth = _kept(_at_default_size(sequence), config), ScopeNetDepth(rays_known=False)
     patterns = [normalised_brightness(frame.rgb) for frame in frames]
     for number in range(0, len(frames) - 2, _HOST_EVERY):
         some = slice(number, number + _MAX_GAP + 1)
         window = _window(frames[some], patterns[some])
         if window is not None:
-            yield window
+            yield replace(window, log_distance=_log_distance(window, depth, frames[number]))
+
+
+def _log_distance(window: Window, depth: ScopeNetDepth, host: Frame) -> np.ndarray:
+    """Return ln of the estimated distance of a window's corners in its host along their rays, mm, (N,)."""
+    camera = host.camera
+    column, row = np.rint(window.start + np.array([camera.cx, camera.cy])).astype(int).T
+    rays = camera.rays[row, column]
+    found: np.ndarray = np.log(depth.estimate(host).values[row, column] * np.linalg.norm(rays, axis=1))
+    return found
 
 
 def _at_default_size(sequence: Sequence) -> Sequence:

@@ -1,0 +1,232 @@
+"""The lens of an unknown camera by trial: windows are adjusted through lenses of several kinds and focal lengths.
+
+A lens that bends straight lines tells its focal length by how strongly it bends them, even where the camera does not
+turn; a straight one tells it where the camera turns and the tissue's depth is about known, which keeps a turn from
+being taken for a translation. The depth is scopenet's, without rays: it hardly depends on the lens. The kinds have no
+parameter but the focal length: the radius of a ray at the angle t from the axis is f tan t, f t or f sin t.
+
+The cost of a lens is that of its reprojection errors, in pixels of the picture, so that lenses can be compared, by
+Cauchy's kernel. Errors of neighbouring corners, and those of a corner in successive frames, are alike: `_CORRELATED`
+of them count as one, a number chosen on phantoms (benchmarks/focal_length.py). What is left is a probability over
+kinds and focal lengths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from scopemap.calibration.focal_length.windows import Window
+from scopemap.cameras.camera import CameraModel, PinholeCamera
+from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.geometry.least_squares import cauchy, robust_sigma_2d
+from scopemap.mapping.bundle_adjustment import adjust
+from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors, State, reproject
+
+KINDS: dict[str, tuple[float, ...]] = {
+    "pinhole": (),
+    "equidistant fisheye": (0.0, 0.0, 0.0, 0.0),
+    "orthographic fisheye": (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880),
+}
+"""Kinds of lenses, and the coefficients of fisheyes as of `FisheyeCamera`: f t, and f sin t as a series."""
+
+MAX_SHARE = 0.07
+"""Standard deviation of ln fx above which a trial does not tell it, chosen with `_CORRELATED`."""
+
+# Focal lengths over the width: pinholes of 122 to 42 degrees, equidistant fisheyes of 150 and less.
+_COARSE = np.geomspace(0.28, 1.3, 10)
+_FINER = (_COARSE[1] / _COARSE[0]) ** np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])
+_FIRST_FOCAL = 0.55
+_WIDEST_RAD = math.radians(86)  # farther out a straightened picture has no end
+_LEAST_SEEN = 0.6  # of the observations, within that angle
+_CORRELATED = 30.0
+_CAUCHY = 2.0
+_OUTSIDE_PX = 50.0
+_LOG_DEPTH_SIGMA, _ESTIMATED_SIGMA = 1.0, 0.3  # of a depth that is not known, and of an estimated one
+_MIN_SIGMA_PX = 0.03
+_FIRST, _NEXT = 15, 8  # iterations, from a start without motion and from that of the lens before
+_STEP_PX = 0.5
+_LEAST_CERTAIN = 0.95
+_MOST_AT_END = 0.02  # of the probability, within a twentieth of the range of either end
+_MIN_WINDOWS = 2
+_MAX_RESIDUAL = 0.001  # share of the width that the best lens may leave: tissue deforms where it is more
+_FINE = 200
+
+
+@dataclass(frozen=True)
+class LensTrial:
+    """What a trial of lenses says.
+
+    Attributes
+    ----------
+    kind : of the lens that fits best, one of `KINDS`. focal_px : its fx, at the windows' size. share : standard
+    deviation of ln fx over all kinds. fov_deg : horizontal field of view. certainty : probability of the kind.
+    windows : number of windows used. reason : why this does not tell the lens, or "".
+    """
+
+    kind: str
+    focal_px: float
+    share: float
+    fov_deg: float
+    certainty: float
+    windows: int
+    reason: str = ""
+
+
+def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
+    """Return what windows of one camera say of its lens; None where fewer than two show a rigid scene."""
+    tried = []
+    for window in windows:
+        one = _Tried(window)
+        for kind in KINDS:
+            one.at(kind, _COARSE)
+        if one.sigma_px <= _MAX_RESIDUAL * one.width_px:
+            tried.append(one)
+    if len(tried) < _MIN_WINDOWS:
+        return None
+    for kind, of_kind in _costs(tried).items():
+        best = min(of_kind, key=lambda share: of_kind[share])
+        for one in tried:
+            one.at(kind, best * _FINER)
+    return _judged(_costs(tried), 2 * windows[0].half_width_px, len(tried))
+
+
+class _Tried:
+    """A window with the reprojection errors through each lens that was tried: by kind and focal length over width."""
+
+    def __init__(self, window: Window) -> None:
+        self.window, self.width_px = window, 2 * window.half_width_px
+        self.errors: dict[tuple[str, float], np.ndarray] = {}
+        self._states: dict[tuple[str, float], State] = {}
+
+    @property
+    def sigma_px(self) -> float:
+        """Noise of the window: the robust standard deviation of the errors that the best lens leaves, px."""
+        known = (found[np.isfinite(found)] for found in self.errors.values())
+        return min(robust_sigma_2d(found, _MIN_SIGMA_PX) for found in known if len(found))
+
+    def at(self, kind: str, shares: np.ndarray) -> None:
+        """Adjust the window through lenses of a kind, each from where a lens like it ended."""
+        # Small motion converges best through a wide lens.
+        for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / _FIRST_FOCAL))):
+            camera = _camera(share * self.width_px, self.window, kind)
+            # Of its own kind where there is one, then of the nearest focal length.
+            near = min(self._states, key=lambda key: (key[0] != kind, abs(math.log(key[1] / share))), default=None)
+            start = None if near is None else self._states[near]
+            self.errors[kind, share], self._states[kind, share] = _adjusted(self.window, camera, start)
+
+
+def _camera(focal_px: float, window: Window, kind: str) -> CameraModel:
+    """Return a lens whose pixels count from the axis, as those of windows do."""
+    width = round(2 * window.half_width_px)
+    plane = PinholeCamera(focal_px, focal_px * window.aspect, 0.0, 0.0, width, width)
+    return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
+
+
+def _adjusted(window: Window, camera: CameraModel, start: State | None) -> tuple[np.ndarray, State]:
+    """Return the reprojection errors, px of the picture, (n,) of all observations, and the adjusted state.
+
+    Errors are NaN where the lens sees the observation, or its corner, too far out, and `_OUTSIDE_PX` where it sees
+    nothing.
+    """
+    focal_px = camera.central.fx
+    corner, partner = np.nonzero(np.isfinite(window.seen).all(-1))
+    pixel = window.seen[corner, partner]
+    host, seen = _straight(camera, window.start), _straight(camera, pixel)
+    reach = math.tan(_WIDEST_RAD)
+    near = (np.linalg.norm(host, axis=1) <= reach)[corner] & (np.linalg.norm(seen, axis=1) <= reach)
+    errors = np.where(np.isfinite(host[corner] + seen).all(1), np.nan, _OUTSIDE_PX)
+    count = len(window.start)
+    problem = BundleProblem(
+        np.tile(np.eye(4), (window.seen.shape[1] + 1, 1, 1)),
+        Points(np.zeros(count, int), focal_px * np.nan_to_num(host), *_expected(window, host)),
+        Observations(corner[near], partner[near] + 1, focal_px * seen[near]),
+        Priors(scale=0.0),
+        np.zeros((0, 2), int),
+        focal_px,
+        least_sigma_px=_MIN_SIGMA_PX,
+    )
+    if start is not None:
+        problem = replace(problem, start=start._replace(lens=problem.tracked.lens))
+    state = adjust(problem, max_iterations=_FIRST if start is None else _NEXT).state
+    found = reproject(problem, state)
+    bent = np.linalg.solve(_slopes(camera, pixel[near]), found.error[..., None] / focal_px)[..., 0]
+    errors[near] = np.where(found.ahead, np.linalg.norm(bent, axis=1), _OUTSIDE_PX)
+    return errors, state
+
+
+def _expected(window: Window, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ln of the depth (n,) expected of a window's corners, in units of the median, and its deviation (n,)."""
+    count = len(host)
+    if window.log_distance is None:
+        return np.zeros(count), np.full(count, _LOG_DEPTH_SIGMA)
+    # Distance is what the estimator knows: depth along the axis depends on the lens.
+    log_depth = window.log_distance - 0.5 * np.log1p(np.nan_to_num(host**2).sum(1))
+    return log_depth - np.median(log_depth), np.full(count, _ESTIMATED_SIGMA)
+
+
+def _straight(camera: CameraModel, pixel: np.ndarray) -> np.ndarray:
+    """Return where the rays of pixels (n, 2) meet the plane z = 1."""
+    return camera.unproject(pixel)[:, :2]
+
+
+def _slopes(camera: CameraModel, pixel: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, 2, 2) of `_straight`."""
+    steps = [
+        (_straight(camera, pixel + step) - _straight(camera, pixel - step)) / (2 * _STEP_PX)
+        for step in _STEP_PX * np.eye(2)
+    ]
+    return np.nan_to_num(np.stack(steps, -1), nan=0.0) + 1e-9 * np.eye(2)
+
+
+def _costs(tried: list[_Tried]) -> dict[str, dict[float, float]]:
+    """Return the cost of every lens over all windows, by kind and focal length over width."""
+    costs: dict[str, dict[float, float]] = {kind: {} for kind in KINDS}
+    for one in tried:
+        sigma_px = one.sigma_px
+        for (kind, share), errors in one.errors.items():
+            found, count = errors[np.isfinite(errors)], len(errors)
+            mean = cauchy((found / sigma_px) ** 2, _CAUCHY)[0].mean() if len(found) >= _LEAST_SEEN * count else np.inf
+            costs[kind][share] = costs[kind].get(share, 0.0) + count * float(mean)
+    return costs
+
+
+def _judged(costs: dict[str, dict[float, float]], width_px: float, windows: int) -> LensTrial:
+    """Return the mean and the spread of the focal length from the costs of all lenses."""
+    fine = np.linspace(math.log(_COARSE[0]), math.log(_COARSE[-1]), _FINE)
+    lowest = min(cost for of_kind in costs.values() for cost in of_kind.values())
+    weight = {}
+    for kind, of_kind in costs.items():
+        shares = [share for share in sorted(of_kind) if math.isfinite(of_kind[share])]
+        cost = [of_kind[share] for share in shares]
+        # Costs that rise steeply where a lens does not see the picture's corners must not bend the rest.
+        curve = (
+            PchipInterpolator(np.log(shares), cost, extrapolate=False)(fine) if len(shares) > 1 else 0 * fine + np.inf
+        )
+        weight[kind] = np.exp(-np.nan_to_num(curve - lowest, nan=np.inf).clip(0) / _CORRELATED)
+    every = np.sum(list(weight.values()), axis=0)
+    every /= every.sum()
+    kind = max(weight, key=lambda name: float(weight[name].sum()))
+    own = weight[kind] / weight[kind].sum()
+    mean = float(own @ fine)
+    share = math.sqrt(float(every @ (fine - mean) ** 2))
+    certainty = float(weight[kind].sum() / sum(values.sum() for values in weight.values()))
+    end = _FINE // 20
+    focal_px, reason = width_px * math.exp(mean), ""
+    if every[:end].sum() + every[-end:].sum() > _MOST_AT_END:
+        reason = "focal lengths beyond those that were tried may fit as well"
+    elif share > MAX_SHARE or certainty < _LEAST_CERTAIN:
+        reason = f"several lenses fit about as well, best {kind}, fx uncertain by {share:.0%}"
+    return LensTrial(kind, focal_px, share, _fov_deg(kind, focal_px, width_px), certainty, windows, reason)
+
+
+def _fov_deg(kind: str, focal_px: float, width_px: float) -> float:
+    """Return the horizontal field of view of a lens, degrees."""
+    plane = PinholeCamera(focal_px, focal_px, 0.0, 0.0, 1, 1)
+    lens = FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
+    edge = lens.unproject(np.array([[width_px / 2, 0.0]]))[0, 0]
+    return 2 * math.degrees(math.atan(np.nan_to_num(edge, nan=np.inf)))
