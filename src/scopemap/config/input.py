@@ -26,7 +26,8 @@ class InputSettings(Settings):
     focal: Literal["auto", "assume", "flow"] = Field(
         "auto",
         description="focal length of an unknown camera, assume: by the assumed field of view; flow: from the motion "
-        "of the first frames; auto: Depth Pro's where it is in use, else flow where the motion constrains it",
+        "of the first frames; auto: Depth Pro's where it is in use, else flow, or a trial of "
+        "lenses, where one of these tells it",
     )
     stereo: Literal["auto", "none", "left-right", "top-bottom"] = Field(
         "auto",

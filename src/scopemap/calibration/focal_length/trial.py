@@ -44,6 +44,7 @@ _FIRST_FOCAL = 0.55
 _WIDEST_RAD = math.radians(86)  # farther out a straightened picture has no end
 _LEAST_SEEN = 0.6  # of the observations, within that angle
 _CORRELATED = 30.0
+_HOPELESS = 20.0  # times `_CORRELATED` above the lowest cost: between coarse focal lengths it may fall by some
 _CAUCHY = 2.0
 _OUTSIDE_PX = 50.0
 _LOG_DEPTH_SIGMA, _ESTIMATED_SIGMA = 1.0, 0.3  # of a depth that is not known, and of an estimated one
@@ -88,9 +89,12 @@ def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
             tried.append(one)
     if len(tried) < _MIN_WINDOWS:
         return None
-    for kind, of_kind in _costs(tried).items():
+    costs = _costs(tried)
+    lowest = min(min(of_kind.values()) for of_kind in costs.values())
+    for kind, of_kind in costs.items():
         best = min(of_kind, key=lambda share: of_kind[share])
-        for one in tried:
+        # The others have no share in the probability.
+        for one in tried if of_kind[best] - lowest < _HOPELESS * _CORRELATED else ():
             one.at(kind, best * _FINER)
     return _judged(_costs(tried), 2 * windows[0].half_width_px, len(tried))
 

@@ -1,0 +1,186 @@
+"""A trial of lenses: it finds kind and focal length where they can be known, and says so where they cannot."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from turning_clip import write_clip
+
+from scopemap.calibration.focal_length.estimate import FocalEstimate
+from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
+from scopemap.calibration.focal_length.windows import Window, windows_of
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.config import Config
+from scopemap.geometry.se3 import so3_exp
+from scopemap.io.opening import open_sequence
+from scopemap.report.verdict import verdict
+from scopemap.runner.run import reconstruct
+
+HALF_PX, POINTS = 160.0, 150
+FORWARD = {"rotation_deg": (0.0, 0.0, 0.0), "translation": (0.05, -0.03, 0.3)}
+TURNING = {"rotation_deg": (6.0, 4.0, 2.0), "translation": (0.25, -0.15, 0.1)}
+
+
+def _lens(kind: str, focal_px: float) -> PinholeCamera | FisheyeCamera:
+    plane = PinholeCamera(focal_px, focal_px, 0.0, 0.0, 320, 256)
+    return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
+
+
+def _window(
+    kind: str,
+    focal_px: float,
+    seed: int,
+    *,
+    rotation_deg: tuple[float, float, float],
+    translation: tuple[float, float, float],
+    noise_px: float = 0.1,
+    depth_noise: float = 0.2,
+) -> Window:
+    """Points before a camera that turns and moves on, seen in 4 partners; their distances are about known."""
+    rng, lens = np.random.default_rng(seed), _lens(kind, focal_px)
+    pixel = rng.uniform(-1, 1, (POINTS, 2)) * [0.95 * HALF_PX, 0.7 * HALF_PX]
+    rays = lens.unproject(pixel)
+    point = rays / np.linalg.norm(rays, axis=1, keepdims=True) * rng.uniform(0.6, 2.5, (POINTS, 1))
+    seen = []
+    for share in np.arange(1, 5) / 4:
+        moved = point @ so3_exp(np.radians(rotation_deg) * share).T - share * np.array(translation)
+        seen.append(lens.project(moved) + rng.normal(0, noise_px, (POINTS, 2)))
+    distance = np.linalg.norm(point, axis=1) * np.exp(rng.normal(0, depth_noise, POINTS))
+    return Window(pixel, np.stack(seen, 1), HALF_PX, log_distance=np.log(distance))
+
+
+def _tried(kind: str, focal_px: float, **motion: object) -> LensTrial | None:
+    return try_lenses([_window(kind, focal_px, seed, **motion) for seed in range(2)])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("kind", "focal_px", "motion"),
+    [
+        ("pinhole", 180.0, TURNING),
+        ("equidistant fisheye", 170.0, FORWARD),
+        ("orthographic fisheye", 190.0, FORWARD),
+    ],
+)
+def test_kind_and_focal_length_are_found(kind: str, focal_px: float, motion: dict) -> None:
+    found = _tried(kind, focal_px, **motion)
+    assert found is not None
+    assert (found.kind, found.reason, found.windows) == (kind, "", 2)
+    assert abs(math.log(found.focal_px / focal_px)) < max(2 * found.share, 0.02) < 0.15
+    edge = _lens(kind, found.focal_px).unproject(np.array([[HALF_PX, 0.0]]))[0, 0]
+    assert found.fov_deg == pytest.approx(2 * math.degrees(math.atan(edge)))
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"rotation_deg": (0.0, 0.0, 0.0), "translation": (0.1, 0.05, 0.0)},
+        {"rotation_deg": (0.0, 0.0, 0.0), "translation": (0.0, 0.0, 0.0)},
+    ],
+    ids=["sideways", "rest"],
+)
+def test_a_straight_lens_that_does_not_turn_is_not_known(motion: dict) -> None:
+    found = _tried("pinhole", 180.0, **motion)
+    assert found is not None
+    assert found.reason
+
+
+def test_tissue_that_deforms_tells_nothing() -> None:
+    assert _tried("pinhole", 180.0, noise_px=3.0, **TURNING) is None
+    assert try_lenses([]) is None
+
+
+def test_a_trial_repeats_itself() -> None:
+    window = _window("equidistant fisheye", 170.0, 5, **FORWARD)
+    assert try_lenses([window, window]) == try_lenses([window, window])
+
+
+# ---- in a run
+
+UNDETERMINED = FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 windows")
+FISHEYE = LensTrial("orthographic fisheye", 100.0, 0.03, 110.0, 0.99, 4)
+LIGHT = {"depth.backend": "shading", "networks.flow": "none", "fusion.enabled": False}
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    return write_clip(tmp_path / "clip", 100.0, 12, turn_deg=0.0)
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
+    """What the trial says, to be filled in; the motion tells nothing."""
+    said: list[LensTrial | None] = []
+    place = "scopemap.calibration.focal_length.estimate"
+    window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
+
+    def motion(*arguments: object) -> FocalEstimate:
+        arguments[2].append(window)  # type: ignore[attr-defined]
+        return UNDETERMINED
+
+    monkeypatch.setattr(f"{place}.focal_from_motion", motion)
+    monkeypatch.setattr(f"{place}.try_lenses", lambda _: said[0])
+    return said
+
+
+def test_a_run_sees_through_the_lens_that_was_found(clip: Path, tried: list, tmp_path: Path) -> None:
+    tried.append(FISHEYE)
+    result = reconstruct(open_sequence(clip), Config.load(settings=LIGHT), out=tmp_path / "out")
+    assert result.camera.fx == pytest.approx(100.0)
+    facts = result.provenance["camera"]
+    assert facts["source"].startswith(
+        "estimated: by trial of lenses in 4 windows, orthographic fisheye, fx 100 +- 3 px"
+    )
+    assert facts["focal_sigma_px"] == pytest.approx(3.0)
+    assert not any("camera is unknown" in warning for warning in result.provenance["warnings"])
+    lens = read_calibration(tmp_path / "out" / "source_camera.yaml", (200, 160)).camera
+    assert isinstance(lens, FisheyeCamera)
+    assert lens.distortion == pytest.approx(KINDS["orthographic fisheye"])
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (None, "fewer than two windows show a rigid scene"),
+        (dataclasses.replace(FISHEYE, reason="several lenses fit about as well"), "several lenses fit about as well"),
+    ],
+)
+def test_the_default_is_named_where_nothing_is_known(
+    clip: Path, tried: list, said: LensTrial | None, words: str
+) -> None:
+    tried.append(said)
+    result = reconstruct(open_sequence(clip), Config.load(settings=LIGHT))
+    (warning,) = [text for text in result.provenance["warnings"] if "camera is unknown" in text]
+    assert "assumed: horizontal field of view 70 deg" in warning
+    assert words in warning
+    assert words in result.provenance["camera"]["source"]
+    reasons = [reason.text for reason in verdict(result.kept()).reasons]
+    assert sum("lens is a guess" in text for text in reasons) == 1
+    assert not any("amera is unknown" in text for text in reasons)  # said once
+
+
+def test_a_stated_view_is_not_tried(clip: Path, tried: list) -> None:
+    result = reconstruct(open_sequence(clip, fov_deg=90.0), Config.load(settings=LIGHT))
+    assert not any("camera is unknown" in warning for warning in result.provenance["warnings"])
+    assert not tried
+
+
+def test_corners_have_distances_that_do_not_depend_on_the_lens(tmp_path: Path) -> None:
+    folder = write_clip(tmp_path / "turning", 100.0, 12)
+    narrow, wide = (open_sequence(folder, fov_deg=fov_deg) for fov_deg in (50.0, 100.0))
+    one, other = (next(windows_of(sequence, Config())) for sequence in (narrow, wide))
+    assert one.log_distance is not None
+    np.testing.assert_allclose(one.log_distance, other.log_distance, atol=1e-4)
+
+
+def test_a_fisheye_is_written_as_it_is(clip: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(clip).with_focal(100.0, "found", 2.0, KINDS["equidistant fisheye"])
+    assert sequence.camera.fx == pytest.approx(100.0)
+    write_calibration(sequence.rectifier.source, tmp_path / "lens.yaml")
+    assert open_sequence(clip, camera=tmp_path / "lens.yaml").rectifier.source == sequence.rectifier.source
