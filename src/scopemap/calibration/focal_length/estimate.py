@@ -27,8 +27,8 @@ from scopemap.io.sequence import Sequence
 FOV_RANGE_DEG = (30.0, 150.0)
 """Horizontal fields of view that endoscopes have."""
 
-MAX_SHARE = 0.1
-"""Standard deviation over the focal length above which an estimate is no better than the assumption."""
+MAX_SHARE = 0.05
+"""Standard deviation over the focal length above which an estimate from motion is not taken: two are 10 %."""
 
 _MIN_DISTORTION = 0.05  # smaller estimates are noise
 _ROTATION_ERROR_DEG = 0.4

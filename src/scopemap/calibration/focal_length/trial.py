@@ -54,7 +54,7 @@ _STEP_PX = 0.5
 _LEAST_CERTAIN = 0.95
 _MOST_AT_END = 0.02  # of the probability, within a twentieth of the range of either end
 _MIN_WINDOWS = 2
-_MAX_RESIDUAL = 0.001  # share of the width that the best lens may leave: tissue deforms where it is more
+_MAX_RESIDUAL = 0.0008  # share of the width that the best lens may leave: tissue deforms where it is more
 _FINE = 200
 
 
@@ -96,7 +96,7 @@ def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
         # The others have no share in the probability.
         for one in tried if of_kind[best] - lowest < _HOPELESS * _CORRELATED else ():
             one.at(kind, best * _FINER)
-    return _judged(_costs(tried), 2 * windows[0].half_width_px, len(tried))
+    return _judged([_costs([one]) for one in tried], 2 * windows[0].half_width_px)
 
 
 class _Tried:
@@ -199,9 +199,32 @@ def _costs(tried: list[_Tried]) -> dict[str, dict[float, float]]:
     return costs
 
 
-def _judged(costs: dict[str, dict[float, float]], width_px: float, windows: int) -> LensTrial:
-    """Return the mean and the spread of the focal length from the costs of all lenses."""
+def _judged(costs: list[dict[str, dict[float, float]]], width_px: float) -> LensTrial:
+    """Return the mean and the spread of the focal length from the costs of all lenses in each window."""
     fine = np.linspace(math.log(_COARSE[0]), math.log(_COARSE[-1]), _FINE)
+    total = {kind: {share: sum(one[kind][share] for one in costs) for share in costs[0][kind]} for kind in KINDS}
+    weight = _weights(total, fine)
+    every = np.sum(list(weight.values()), axis=0)
+    every /= every.sum()
+    kind = max(weight, key=lambda name: float(weight[name].sum()))
+    own = weight[kind] / weight[kind].sum()
+    mean = float(own @ fine)
+    # Windows that contradict each other share an error, such as tissue that deforms, which their costs do not show.
+    alone = [_weights({kind: one[kind]}, fine)[kind] for one in costs]
+    scatter = float(np.std([weights @ fine / weights.sum() for weights in alone], ddof=1)) / math.sqrt(len(costs))
+    share = math.hypot(math.sqrt(float(every @ (fine - mean) ** 2)), scatter)
+    certainty = float(weight[kind].sum() / sum(values.sum() for values in weight.values()))
+    end = _FINE // 20
+    focal_px, reason = width_px * math.exp(mean), ""
+    if every[:end].sum() + every[-end:].sum() > _MOST_AT_END:
+        reason = "focal lengths beyond those that were tried may fit as well"
+    elif share > MAX_SHARE or certainty < _LEAST_CERTAIN:
+        reason = f"several lenses fit about as well, best {kind}, fx uncertain by {share:.0%}"
+    return LensTrial(kind, focal_px, share, _fov_deg(kind, focal_px, width_px), certainty, len(costs), reason)
+
+
+def _weights(costs: dict[str, dict[float, float]], fine: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the probability of each kind at logarithms `fine` of the focal length over the width, up to one factor."""
     lowest = min(cost for of_kind in costs.values() for cost in of_kind.values())
     weight = {}
     for kind, of_kind in costs.items():
@@ -212,20 +235,7 @@ def _judged(costs: dict[str, dict[float, float]], width_px: float, windows: int)
             PchipInterpolator(np.log(shares), cost, extrapolate=False)(fine) if len(shares) > 1 else 0 * fine + np.inf
         )
         weight[kind] = np.exp(-np.nan_to_num(curve - lowest, nan=np.inf).clip(0) / _CORRELATED)
-    every = np.sum(list(weight.values()), axis=0)
-    every /= every.sum()
-    kind = max(weight, key=lambda name: float(weight[name].sum()))
-    own = weight[kind] / weight[kind].sum()
-    mean = float(own @ fine)
-    share = math.sqrt(float(every @ (fine - mean) ** 2))
-    certainty = float(weight[kind].sum() / sum(values.sum() for values in weight.values()))
-    end = _FINE // 20
-    focal_px, reason = width_px * math.exp(mean), ""
-    if every[:end].sum() + every[-end:].sum() > _MOST_AT_END:
-        reason = "focal lengths beyond those that were tried may fit as well"
-    elif share > MAX_SHARE or certainty < _LEAST_CERTAIN:
-        reason = f"several lenses fit about as well, best {kind}, fx uncertain by {share:.0%}"
-    return LensTrial(kind, focal_px, share, _fov_deg(kind, focal_px, width_px), certainty, windows, reason)
+    return weight
 
 
 def _fov_deg(kind: str, focal_px: float, width_px: float) -> float:
