@@ -7,6 +7,7 @@ it anew at every use.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -56,7 +57,7 @@ class Buffers:
     scale_mm: float
     kind: int
 
-    @property
+    @cached_property
     def rays(self) -> np.ndarray:
         """Unit rays (H, W, 3) float32 in camera axes."""
         return camera_rays(self.camera).astype(np.float32)
@@ -91,6 +92,14 @@ def thinned(buffers: Buffers, stride: int) -> Buffers:
     model, fx, fy, cx, cy, _, _ = buffers.camera
     camera = np.array([model, fx / stride, fy / stride, cx / stride, cy / stride, width, height], np.float32)
     return replace(buffers, camera=camera, **images)
+
+
+def cropped(buffers: Buffers, top: int, left: int, size: tuple[int, int]) -> Buffers:
+    """Return the part of a frame from a pixel on, of size (height, width), with the camera that sees just this."""
+    part = np.s_[top : top + size[0], left : left + size[1]]
+    camera = buffers.camera - np.array([0, 0, 0, left, top, 0, 0], np.float32)
+    camera[5:] = size[1], size[0]
+    return replace(buffers, camera=camera, **{name: getattr(buffers, name)[part] for name in _ARRAYS})
 
 
 def encode(buffers: Buffers) -> dict[str, np.ndarray]:

@@ -10,8 +10,18 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from scopemap.depth.scopenet.planes import PLANES
-from training.network import SPREAD_RANGE, TYPICAL_LOG_MM, TYPICAL_LOG_SPREAD, Block, Context, Merge, ScopeNet
+from scopemap.depth.scopenet.planes import INSTRUMENTS, PLANES
+from training.network import (
+    SPREAD_RANGE,
+    TYPICAL_LOG_MM,
+    TYPICAL_LOG_SPREAD,
+    Block,
+    Context,
+    InstrumentHead,
+    InstrumentMerge,
+    Merge,
+    ScopeNet,
+)
 
 OPSET, IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
 
@@ -19,17 +29,22 @@ OPSET, IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
 def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
     """Write the network as an ONNX graph: weights in float16 under the network's own names, `facts` as metadata.
 
-    Sides of the picture are multiples of `STRIDE`. Runtimes compute in float32, and fold the batch normalisations into
-    the convolutions when they load the graph.
+    Sides of the picture are multiples of `STRIDE`. Where the network has a head for instruments, the graph has a second
+    output, `INSTRUMENTS` (1, 1, H/2, W/2): the probability that a pixel shows one. Runtimes compute in float32, and
+    fold the batch normalisations into the convolutions when they load the graph.
     """
     graph = Graph(network)
     answer = graph.scopenet(network, "planes")
+    outputs = [helper.make_tensor_value_info(answer, TensorProto.FLOAT, (1, 2, "height", "width"))]
+    if network.instruments is not None:
+        half = (1, 1, "half height", "half width")
+        outputs.append(helper.make_tensor_value_info(INSTRUMENTS, TensorProto.FLOAT, half))
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             "scopenet",
             [helper.make_tensor_value_info("planes", TensorProto.FLOAT, (1, PLANES, "height", "width"))],
-            [helper.make_tensor_value_info(answer, TensorProto.FLOAT, (1, 2, "height", "width"))],
+            outputs,
             graph.tensors,
         ),
         opset_imports=[helper.make_opsetid("", OPSET)],
@@ -43,10 +58,11 @@ def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
 
 def read_network(file: Path) -> ScopeNet:
     """Return an exported network of the default widths, with its weights in float32, ready for use."""
-    network, state = ScopeNet(), {}
+    state = {}
     for tensor in onnx.load(file).graph.initializer:
         if "." in tensor.name:  # of a part; the others are constants of the graph
             state[tensor.name] = torch.from_numpy(numpy_helper.to_array(tensor).astype(np.float32))
+    network = ScopeNet(instruments=any(name.startswith("instruments.") for name in state))
     # The counters of training are not in the file.
     counters = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
     network.load_state_dict(counters | state)
@@ -69,6 +85,8 @@ class Graph:
             x = self._sequence(stage, x)
             scales.append(x)
         x = self._context(net.context, x)
+        if net.instruments is not None:
+            self._instruments(net.instruments, planes, [*scales[:-1], x])
         for merge, fine in zip(net.merges, reversed(scales[:-1]), strict=True):
             x = self._merge(merge, x, fine)
         x = self._enlarged(self._convolution(net.from_coarse, x))
@@ -83,6 +101,16 @@ class Graph:
             for free, bound in zip((-np.inf, np.inf), SPREAD_RANGE, strict=True)
         )
         return self._add("Min", self._add("Max", x, self._constant("low", low)), self._constant("high", high))
+
+    def _instruments(self, head: InstrumentHead, planes: str, scales: list[str]) -> None:
+        quarter = self._sequence(head.quarter, planes)
+        eighth = self._sequence(head.eighth, quarter)
+        half, second, third, fourth, coarsest = scales
+        x = self._part(head.middle, self._relu(self._convolution(head.start, coarsest)))
+        third, second = self._add("Concat", third, eighth, axis=1), self._add("Concat", second, quarter, axis=1)
+        for merge, fine in zip(head.merges, (fourth, third, second, half), strict=True):
+            x = self._merge(merge, x, fine)
+        self.nodes.append(helper.make_node("Sigmoid", [self._convolution(head.last, x)], [INSTRUMENTS]))
 
     def _sequence(self, parts: nn.Sequential, x: str) -> str:
         for part in parts:
@@ -113,7 +141,7 @@ class Graph:
         axes = self._constant("sides", np.array([2, 3]))
         return self._relu(self._add("Add", x, self._add("Unsqueeze", whole, axes)))
 
-    def _merge(self, part: Merge, coarse: str, fine: str) -> str:
+    def _merge(self, part: Merge | InstrumentMerge, coarse: str, fine: str) -> str:
         enlarged = self._enlarged(self._convolution(part.from_coarse, coarse))
         return self._part(part.block, self._relu(self._add("Add", enlarged, self._convolution(part.from_fine, fine))))
 

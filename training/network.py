@@ -18,6 +18,8 @@ from scopemap.depth.scopenet.planes import PLANES, STRIDE
 WIDTHS = (24, 48, 80, 128, 160)
 _BLOCKS = (1, 2, 2, 3, 2)
 _HEAD = 16
+INSTRUMENT_WIDTHS = (8, 16, 32, 48, 48)
+_SEEN = (24, 32)  # channels of what is seen of the planes at 1/4 and 1/8
 TYPICAL_LOG_MM = 3.4  # 30 mm: the network starts from there
 TYPICAL_LOG_SPREAD = -2.0
 SPREAD_RANGE = (-5.0, 1.0)
@@ -63,13 +65,64 @@ class Merge(nn.Module):
         return self.block(functional.relu(enlarged + self.from_fine(fine)))
 
 
+class InstrumentHead(nn.Module):
+    """From the encoder's features to where instruments are seen, at half the resolution: a small decoder of its own.
+
+    Depth is learnt to be blind to colour; so 4x4 patches of the planes themselves are read, too.
+    """
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS, own: tuple[int, ...] = INSTRUMENT_WIDTHS) -> None:
+        super().__init__()
+        self.quarter = nn.Sequential(nn.Conv2d(PLANES, _SEEN[0], 4, 4, bias=False), nn.BatchNorm2d(_SEEN[0]), nn.ReLU())
+        self.eighth = nn.Sequential(_convolution(*_SEEN, 2), nn.ReLU())
+        self.start = nn.Conv2d(widths[-1], own[-1], 1)
+        self.middle = Block(own[-1])
+        skips = (widths[0], widths[1] + _SEEN[0], widths[2] + _SEEN[1], widths[3])
+        self.merges = nn.ModuleList(
+            InstrumentMerge(coarse, skip, fine)
+            for (fine, coarse), skip in zip(reversed(list(pairwise(own))), reversed(skips), strict=True)
+        )
+        self.last = nn.Conv2d(own[0], 1, 3, padding=1)
+
+    def forward(self, planes: Tensor, scales: list[Tensor]) -> Tensor:
+        """Return logits (N, 1, H/2, W/2) from planes, and features at 1/2, 1/4, 1/8, 1/16, 1/32 (with its context)."""
+        quarter = self.quarter(planes)
+        eighth = self.eighth(quarter)
+        half, second, third, fourth, coarsest = scales
+        x = self.middle(functional.relu(self.start(coarsest)))
+        skips = (fourth, torch.cat([third, eighth], 1), torch.cat([second, quarter], 1), half)
+        for merge, fine in zip(self.merges, skips, strict=True):
+            x = merge(x, fine)
+        logits: Tensor = self.last(x)
+        return logits
+
+
+class InstrumentMerge(nn.Module):
+    """As `Merge`, with features of another width from the encoder, and with one convolution alone."""
+
+    def __init__(self, coarse: int, skip: int, fine: int) -> None:
+        super().__init__()
+        self.from_coarse, self.from_fine = nn.Conv2d(coarse, fine, 1), nn.Conv2d(skip, fine, 1)
+        self.block = nn.Sequential(_convolution(fine, fine), nn.ReLU())
+
+    def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        """Return features of the shape of `fine`, which is twice as high and wide as `coarse`."""
+        enlarged = functional.interpolate(self.from_coarse(coarse), scale_factor=2.0, mode="bilinear")
+        merged: Tensor = self.block(functional.relu(enlarged + self.from_fine(fine)))
+        return merged
+
+
 class ScopeNet(nn.Module):
     """The network.
 
     widths : channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution. blocks : residual blocks there.
+    instruments : whether it has a head for them, which reads the features of the depth's encoder and changes nothing
+        of it.
     """
 
-    def __init__(self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = _BLOCKS) -> None:
+    def __init__(
+        self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = _BLOCKS, *, instruments: bool = False
+    ) -> None:
         super().__init__()
         entries = [_convolution(a, b, 2) for a, b in pairwise((PLANES, *widths))]
         self.stages = nn.ModuleList(
@@ -83,6 +136,15 @@ class ScopeNet(nn.Module):
         self.head = nn.Conv2d(_HEAD, 2, 3, padding=1)
         for start in self.head.parameters():
             nn.init.zeros_(start)
+        self.instruments = InstrumentHead(widths) if instruments else None
+
+    def features(self, planes: Tensor) -> list[Tensor]:
+        """Return the encoder's features of planes (N, 8, H, W), sides multiples of `STRIDE`, from fine to coarse."""
+        x, scales = planes, []
+        for stage in self.stages:
+            x = stage(x)
+            scales.append(x)
+        return [*scales[:-1], self.context(x)]
 
     def forward(self, planes: Tensor) -> Tensor:
         """Return (N, 2, H, W) from planes (N, 8, H, W), any H and W.
@@ -90,12 +152,9 @@ class ScopeNet(nn.Module):
         Channel 0: ln of the distance along the ray, mm. Channel 1: ln of the Laplace scale of channel 0's error.
         """
         height, width = planes.shape[-2:]
-        x = functional.pad(planes, (0, -width % STRIDE, 0, -height % STRIDE))
-        full, scales = x, []
-        for stage in self.stages:
-            x = stage(x)
-            scales.append(x)
-        x = self.context(x)
+        full = functional.pad(planes, (0, -width % STRIDE, 0, -height % STRIDE))
+        scales = self.features(full)
+        x = scales[-1]
         for merge, fine in zip(self.merges, reversed(scales[:-1]), strict=True):
             x = merge(x, fine)
         x = functional.interpolate(self.from_coarse(x), scale_factor=2.0, mode="bilinear")

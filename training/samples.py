@@ -57,7 +57,7 @@ class Batch:
 
 def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = True) -> Sample:
     """Return a random picture of a scene; equal generators give equal samples. `strange` : see `take_picture`."""
-    rgb, field = take_picture(shade(buffers, draw_light(rng), _bounce(rng)), rng, strange=strange)
+    rgb, field = take_picture(shade(buffers, draw_light(rng), bounce_share(rng)), rng, strange=strange)
     valid = field & np.isfinite(buffers.log_distance)
     if rng.random() < _MASKED_SHARE:
         height, width = field.shape
@@ -70,15 +70,16 @@ def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = T
             images = (rgb, valid, rays, log_distance, tissue)
             rgb, valid, rays, log_distance, tissue = (np.flip(image, axis) for image in images)
             rays = rays * np.where(np.arange(3) == 1 - axis, np.float32(-1), np.float32(1))
-    return Sample(np.ascontiguousarray(rgb), valid, rays, _told(rays, rng), log_distance, tissue)
+    return Sample(np.ascontiguousarray(rgb), valid, rays, told_rays(rays, rng), log_distance, tissue)
 
 
-def _bounce(rng: np.random.Generator) -> float:
+def bounce_share(rng: np.random.Generator) -> float:
+    """Return a random share of light that comes from other walls, as `shade` takes it."""
     return rng.uniform(0, 0.6) if rng.random() < 0.6 else 0.0
 
 
-def _told(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """The rays as a user's calibration gives them: a little off, or not at all."""
+def told_rays(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Return rays (H, W, 3) as a user's calibration gives them: a little off, or None, not at all."""
     if rng.random() < _RAYS_UNKNOWN_SHARE:
         return None
     given = rays * np.array([1, 1, np.exp(rng.normal(0, _FIELD_OF_VIEW_ERROR))], np.float32)

@@ -41,7 +41,9 @@ class Training:
         torch.manual_seed(recipe.seed)
         self.network = ScopeNet().to(device, memory_format=torch.channels_last)
         if start is not None:
-            self.network.load_state_dict(read_network(start).state_dict())
+            # A head for instruments reads features that are about to change.
+            known = read_network(start).state_dict().items()
+            self.network.load_state_dict({k: v for k, v in known if not k.startswith("instruments.")})
         average = get_ema_multi_avg_fn(recipe.ema)
         self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)

@@ -44,6 +44,7 @@ class Frame:
     highlights : (H, W) bool, True where `valid` is False for a specular highlight alone; None: not looked for.
     nonrigidity : `REGIONS` float32, as `tracking.track.Track` has it; None: not measured.
     weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
+    instruments : (H, W) bool, where the depth network found some, which `valid` leaves out; None: not looked for.
     """
 
     index: int
@@ -58,6 +59,7 @@ class Frame:
     highlights: np.ndarray | None = None
     nonrigidity: np.ndarray | None = None
     weight: np.ndarray | None = None
+    instruments: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -69,6 +71,8 @@ class Frame:
             check_shape("Frame.depth_sigma_mm", self.depth_sigma_mm, size)
         if self.highlights is not None:
             check_shape("Frame.highlights", self.highlights, size)
+        if self.instruments is not None:
+            check_shape("Frame.instruments", self.instruments, size)
         if self.T_world_camera is not None:
             check_shape("Frame.T_world_camera", self.T_world_camera, (4, 4))
         if self.nonrigidity is not None:

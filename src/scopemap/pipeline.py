@@ -1,6 +1,6 @@
 """The pipeline: frames, in order, to poses, depth and a surface. No files, clocks or printing: see `runner/run.py`.
 
-    estimate    mask -> raw metric depth
+    estimate    mask -> raw metric depth, and instruments, which are left out of all that follows
     match       correspondence with the previous frame
     track       track against the keyframe (RTDL) -> refine depth with the motion known (MAPIS) -> new keyframe
                 -> smooth (WEMA)
@@ -32,7 +32,7 @@ from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
-from scopemap.masking.masker import Masker, StoredMasks
+from scopemap.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
@@ -147,10 +147,20 @@ class Pipeline:
         estimate = self.estimators.depth.estimate(shown)
         if usable and estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self._depth_faults.has_no_depth(frame.index)
+        fault, instruments = "", self._masker.instruments(estimate.instruments)
+        if instruments is not None:
+            # An instrument's depth is of no use, and what is behind it is not known.
+            unknown = np.where(instruments, np.float32(np.nan), np.float32(1))
+            sigma = None if estimate.sigma is None else estimate.sigma * unknown
+            estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
+            frame, small, shown = (without_instruments(seen, instruments) for seen in (frame, small, shown))
+            if usable and frame.valid.mean() < self.config.tracking.min_valid_share:
+                left = f"only {frame.valid.mean():.0%} of the image is usable"
+                fault = f"{left}: instruments cover {instruments.mean():.0%}"
         raw = self.estimators.anchor.metric(estimate, shown)
         small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
-        frame = _with_depth(frame, raw.depth_mm, raw.sigma_mm)
-        return PreprocessedFrame(frame, small, estimate.kind, None, self.estimators.anchor.just_fitted, raw.limit_note)
+        frame, fitted = _with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
+        return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:
         """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""

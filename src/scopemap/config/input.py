@@ -68,4 +68,9 @@ class MaskSettings(Settings):
         description="folder of masks, one image per frame, found by the number in its name: non-zero pixels are masked "
         "(instruments, overlays); empty: the data set's own where it has some; none: no masks from files",
     )
+    instruments: Literal["auto", "off", "files"] = Field(
+        "auto",
+        description="who tells where instruments are, auto: the masks from files, and in frames without one the depth "
+        "network where it can (scopenet); files: those alone; off: nobody, masks from files are not read either",
+    )
     advanced: MaskAdvanced = MaskAdvanced()

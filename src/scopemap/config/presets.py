@@ -45,6 +45,7 @@ _BEYOND_PAPER: dict[str, Any] = {
     "mask.field_of_view": False,
     "mask.highlights": False,
     "mask.files": "none",
+    "mask.instruments": "off",
     "mask.advanced.exposure": False,
     "depth.model": "LiheYoung/depth-anything-small-hf",
     "depth.max_depth_mm": 10000.0,

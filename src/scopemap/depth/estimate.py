@@ -25,17 +25,21 @@ class DepthEstimate:
     focal_px : focal length that the estimator found in the image, px of this frame's width, or None.
     sigma : (H, W) float32, one standard deviation of `values`, in their unit, NaN = unknown; None: not
         estimated.
+    instruments : (H, W) float32, 0..1, the probability that a pixel shows an instrument; None: not looked for.
     """
 
     values: np.ndarray
     kind: DepthKind
     focal_px: float | None = None
     sigma: np.ndarray | None = None
+    instruments: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         check_shape("DepthEstimate.values", self.values, (None, None))
         if self.sigma is not None:
             check_shape("DepthEstimate.sigma", self.sigma, np.shape(self.values))
+        if self.instruments is not None:
+            check_shape("DepthEstimate.instruments", self.instruments, np.shape(self.values))
 
 
 class DepthEstimator(Protocol):

@@ -11,7 +11,7 @@ import numpy as np
 
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import MaskSettings
-from scopemap.errors import InputError
+from scopemap.errors import InputError, SettingsError
 from scopemap.io.decoding import read_decoded
 from scopemap.masking.masker import disc
 
@@ -24,10 +24,15 @@ _NO_MASKS = "none"
 def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None = None) -> MaskFiles | None:
     """Return the masks that the settings name, where they name none the data set's own, None where there are none.
 
-    own : folder of the data set's masks, or None. Raises as `MaskFiles` does.
+    own : folder of the data set's masks, or None. Raises as `MaskFiles` does, and `SettingsError` where the settings
+    contradict each other or the input.
     """
-    folder = Path(settings.files) if settings.files else own
-    if folder is None or settings.files == _NO_MASKS:
+    folder = None if settings.files == _NO_MASKS else Path(settings.files) if settings.files else own
+    if settings.instruments == "off" and folder is not None and settings.files:
+        raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
+    if settings.instruments == "files" and folder is None:
+        raise SettingsError("mask.instruments=files, but there are no masks: name their folder in mask.files")
+    if folder is None or settings.instruments == "off":
         return None
     return MaskFiles(folder, rectifier, settings.advanced.files_grow_px)
 

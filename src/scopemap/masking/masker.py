@@ -24,6 +24,12 @@ BORDER_PX = 3
 # Width of the mean that leaves little of a sensor's noise.
 _CALM_WIDTH_PX = 5
 _MIN_FIELD_SHARE = 0.05
+# Instruments: a region counts where this share of the picture is likelier than `_SEED`, and reaches as far as pixels
+# are likelier than `_REACH`, or than `_HELD` near instruments of the frame before.
+_SEED, _REACH, _HELD = 0.5, 0.04, 0.02
+_LEAST_SHARE = 0.0004
+# How near that is, and how wide the blurred rim is, as shares of the picture's longer side.
+_NEAR_SHARE, _RIM_SHARE = 0.02, 0.008
 
 
 class FieldOfView:
@@ -93,6 +99,8 @@ class Masker:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
         self._overlays = OverlayFinder() if settings.overlays else None
+        self._from_file = False
+        self._instruments: np.ndarray | None = None
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.
@@ -113,12 +121,43 @@ class Masker:
             valid &= ~highlights
         overlays = None if self._overlays is None else self._overlays(frame.rgb, field)
         files = None if self._files is None else self._files.covered(frame.index)
+        self._from_file = files is not None
         for covered in (overlays, files):
             if covered is not None:
                 valid, highlights = valid & ~covered, highlights & ~covered
         if is_constant(frame.rgb):
             valid = np.zeros_like(valid)
         return replace(frame, valid=valid & field, highlights=highlights)
+
+    def instruments(self, probability: np.ndarray | None) -> np.ndarray | None:
+        """Return the instruments, (H, W) bool, of the frame that was masked last; None where nobody is to find them.
+
+        probability : (H, W), 0..1, of each pixel of it. They are widened by a rim, which is blurred, and held where
+        those of the frame before were.
+        """
+        if probability is None or self.settings.instruments != "auto" or self._from_file:
+            self._instruments = None
+            return None
+        side, before = max(probability.shape), self._instruments
+        least = np.full(probability.shape, _REACH, np.float32)
+        if before is not None and before.shape == probability.shape and before.any():
+            least[cv2.dilate(before.astype(np.uint8), disc(round(_NEAR_SHARE * side))) > 0] = _HELD
+        count, regions = cv2.connectedComponents((probability > least).astype(np.uint8))
+        seeds = np.bincount(regions[probability > _SEED], minlength=count)
+        kept = seeds >= _LEAST_SHARE * probability.size
+        kept[0] = False
+        self._instruments = kept[regions]
+        if not kept.any():
+            return self._instruments
+        return cv2.dilate(self._instruments.astype(np.uint8), disc(max(round(_RIM_SHARE * side), 1))) > 0
+
+
+def without_instruments(frame: Frame, instruments: np.ndarray) -> Frame:
+    """Return the frame with its instruments, (h, w) bool of any size, where no pixel is usable and no highlight is."""
+    size = frame.camera.width, frame.camera.height
+    found = cv2.resize(instruments.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    highlights = None if frame.highlights is None else frame.highlights & ~found
+    return replace(frame, valid=frame.valid & ~found, highlights=highlights, instruments=found)
 
 
 def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Small pictures of a run's frames, and what is measured on each frame, for its report.
 
-DIR/frames/  000012.jpg (the rectified frame)  000012_mask.png (white: usable)  measures.csv (one row per frame)
+DIR/frames/  000012.jpg (the rectified frame)  000012_mask.png (white: usable, grey: an instrument)
+            measures.csv (one row per frame)
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ _MOST = 64
 _MOST_MEASURES = 100_000
 _LONGEST_SIDE_PX = 320
 _QUALITY = 80
+_USABLE, _INSTRUMENT = 255, 90
 _COLUMNS = ("index", "sharpness", "ms")
 _MEASURE = np.dtype(list(zip(_COLUMNS, (np.int64, np.float64, np.float64), strict=True)))
 
@@ -52,17 +54,20 @@ class FramePictures:
 
     def observe(self, step: HasFrame) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""
-        self.put(step.frame.index, step.frame.rgb, step.frame.valid)
+        self.put(step.frame.index, step.frame.rgb, step.frame.valid, step.frame.instruments)
 
-    def put(self, index: int, rgb: np.ndarray, valid: np.ndarray) -> None:
-        """Measure a frame, its picture (H, W, 3) uint8 and usable pixels (H, W) bool, and keep it where it is due."""
+    def put(self, index: int, rgb: np.ndarray, valid: np.ndarray, instruments: np.ndarray | None = None) -> None:
+        """Measure a frame, its picture (H, W, 3) uint8, usable pixels, instruments (H, W) bool; keep some."""
         now = time.perf_counter()
         mask = valid.astype(np.uint8)
         laplacian = cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_16S)
         sharpness = float(cv2.meanStdDev(laplacian, mask=mask)[1][0, 0])
         if self._count % self._every == 0:
             small = _shrunk(rgb, cv2.INTER_AREA)
-            self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", _shrunk(mask, cv2.INTER_NEAREST)))
+            levels = mask * np.uint8(_USABLE)
+            if instruments is not None:
+                levels[instruments] = _INSTRUMENT
+            self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", _shrunk(levels, cv2.INTER_NEAREST)))
         waited_ms = 1000 * (now - self._before) if self._timed else np.nan
         self._measures.append(np.array([(index, sharpness, waited_ms)], _MEASURE))
         self._count += 1
@@ -128,4 +133,5 @@ def _shrunk(image: np.ndarray, interpolation: int) -> np.ndarray:
 def _encoded(ending: str, image: np.ndarray) -> bytes:
     if ending == ".jpg":
         return cv2.imencode(ending, image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    return cv2.imencode(ending, image * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
+    two_levels = not (image == _INSTRUMENT).any()
+    return cv2.imencode(ending, image, [cv2.IMWRITE_PNG_BILEVEL, int(two_levels)])[1].tobytes()

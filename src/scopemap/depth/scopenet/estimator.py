@@ -3,7 +3,8 @@
 The network is an ONNX graph (`training/export.py` writes it) and runs in ONNX Runtime on the CPU, in float32. It
 estimates ln of the distance along the ray and ln of the Laplace scale b of its error. Depth is distance times the z of
 the unit ray. A Laplace distribution has the standard deviation sqrt(2) b; of a logarithm it is, to first order, the
-relative one of distance, and so of depth.
+relative one of distance, and so of depth. A second output, which other networks of the class may lack, is the
+probability of an instrument, at half the size.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnxruntime
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.scopenet.planes import PLANES, STRIDE, input_planes
+from scopemap.depth.scopenet.planes import INSTRUMENTS, PLANES, STRIDE, input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
@@ -51,16 +53,16 @@ class ScopeNetDepth:
             self._origin = {"model": model or _AS_THEY_COME, f"sha256 {file.name}": weights.sha256_of(file)}
 
     def estimate(self, frame: Frame) -> DepthEstimate:
-        """Return depth, mm, of the frame's size, with its standard deviation, mm; every pixel has both.
+        """Return depth, mm, of the frame's size, with its standard deviation, mm, of every pixel; and instruments.
 
         The mask is an input plane; depth of masked pixels is extrapolated from their surroundings.
         """
         unit_rays = _unit_rays(frame.camera)
         planes = input_planes(frame.rgb, unit_rays if self._rays_known else None, frame.valid)
-        log_distance, log_spread = _answer(self._session, planes)
+        (log_distance, log_spread), instruments = _answer(self._session, planes)
         depth_mm = np.exp(log_distance) * unit_rays[..., 2]
         sigma_mm = depth_mm * np.float32(math.sqrt(2.0)) * np.exp(log_spread)
-        return DepthEstimate(depth_mm, "depth", sigma=sigma_mm)
+        return DepthEstimate(depth_mm, "depth", sigma=sigma_mm, instruments=instruments)
 
     def provenance(self) -> dict[str, str]:
         """Return the name, the weights with their hash, the runtime, and whether the rays were given."""
@@ -84,7 +86,7 @@ def _loaded(file: Path, threads: int, _: int) -> onnxruntime.InferenceSession:
     """Return a network, the same for runs that follow each other in one process, until its file changes."""
     try:
         session = open_network(file.read_bytes(), threads)
-        answer = _answer(session, np.zeros((PLANES, STRIDE, STRIDE), np.float32))
+        answer = _answer(session, np.zeros((PLANES, STRIDE, STRIDE), np.float32))[0]
     except Exception as error:  # the runtime raises a dozen kinds that share no other root
         reason = " ".join(str(error).split())
         raise WeightsError(f"cannot load ScopeNet from {file}: {reason}. Name another file in depth.model") from None
@@ -93,12 +95,20 @@ def _loaded(file: Path, threads: int, _: int) -> onnxruntime.InferenceSession:
     return session
 
 
-def _answer(session: onnxruntime.InferenceSession, planes: np.ndarray) -> np.ndarray:
-    """Return the network's (2, H, W) for planes (8, H, W) of any H and W."""
+def _answer(session: onnxruntime.InferenceSession, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the network's (2, H, W) for planes (8, H, W) of any H and W, and instruments (H, W) or None."""
     height, width = planes.shape[1:]
     padded = np.pad(planes, ((0, 0), (0, -height % STRIDE), (0, -width % STRIDE)))
-    answer: np.ndarray = session.run(None, {_INPUT: padded[None]})[0]
-    return answer[0, :, :height, :width]
+    answer, *others = session.run(None, {_INPUT: padded[None]})
+    depth: np.ndarray = answer[0, :, :height, :width]
+    if not _finds_instruments(session):
+        return depth, None
+    instruments = cv2.resize(others[0][0, 0], padded.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
+    return depth, np.asarray(instruments[:height, :width])
+
+
+def _finds_instruments(session: onnxruntime.InferenceSession) -> bool:
+    return INSTRUMENTS in [output.name for output in session.get_outputs()]
 
 
 def _missing(file: Path) -> str:

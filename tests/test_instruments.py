@@ -1,0 +1,282 @@
+"""Instruments: found by scopenet's second output, which leaves depth as it is, and left out of tracking and fusion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from chosen_settings import chosen
+from tiny_phantom import write_tiny
+
+from scopemap import open_sequence, reconstruct
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier
+from scopemap.config import Config, MaskSettings
+from scopemap.depth.estimate import DepthEstimate
+from scopemap.depth.scopenet import estimator as module
+from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
+from scopemap.errors import SettingsError
+from scopemap.estimators import create_estimators
+from scopemap.frame import Frame
+from scopemap.masking.mask_files import create_masks
+from scopemap.masking.masker import Masker, without_instruments
+from scopemap.pipeline import Pipeline, Step
+from scopemap.report.frame_pictures import FramePictures
+from training.export import export, read_network
+from training.network import ScopeNet
+
+HEIGHT, WIDTH = 70, 94
+CAMERA = PinholeCamera(60.0, 60.0, 47.0, 35.0, WIDTH, HEIGHT)
+SHIPPED = Path(module.__file__).parent / WEIGHTS_NAME
+
+
+def _frame(seed: int = 3) -> Frame:
+    rgb = np.random.default_rng(seed).integers(60, 160, (HEIGHT, WIDTH, 3), np.uint8)
+    return Frame(0, 0.0, rgb, CAMERA, np.ones((HEIGHT, WIDTH), bool))
+
+
+def _bar(level: float, rest: float = 0.0) -> np.ndarray:
+    """Probability of an instrument: columns 30 to 49 at `level`."""
+    found = np.full((HEIGHT, WIDTH), rest, np.float32)
+    found[:, 30:50] = level
+    return found
+
+
+# ---- the network
+
+
+@pytest.fixture(scope="module")
+def with_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(5)
+    network = ScopeNet(widths=(8, 8, 16, 16, 16), instruments=True).eval()
+    torch.nn.init.normal_(network.head.weight, 0.0, 0.05)
+    network.load_state_dict({name: value.half() for name, value in network.state_dict().items()})
+    folder = tmp_path_factory.mktemp("networks")
+    export(network, folder / "with.onnx", {})
+    torch.save(network.state_dict(), folder / "state.pt")
+    network.instruments = None
+    export(network, folder / "without.onnx", {})
+    return folder
+
+
+def test_the_head_changes_no_bit_of_depth(with_head: Path) -> None:
+    frame = _frame()
+    with_it, without = (ScopeNetDepth(str(with_head / f"{name}.onnx")).estimate(frame) for name in ("with", "without"))
+    assert without.instruments is None
+    assert with_it.instruments is not None
+    assert with_it.instruments.shape == (HEIGHT, WIDTH)
+    np.testing.assert_array_equal(with_it.values, without.values)
+    np.testing.assert_array_equal(with_it.sigma, without.sigma)
+
+
+def test_the_runtime_finds_instruments_as_torch_does(with_head: Path) -> None:
+    network = ScopeNet(widths=(8, 8, 16, 16, 16), instruments=True).eval()
+    network.load_state_dict(torch.load(with_head / "state.pt", weights_only=True))
+    planes = np.random.default_rng(1).normal(0, 0.3, (8, 96, 64)).astype(np.float32)
+    assert network.instruments is not None
+    with torch.no_grad():
+        given = torch.from_numpy(planes)[None]
+        told = torch.sigmoid(network.instruments(given, network.features(given)))[0, 0].numpy()
+    session = module.load_network(with_head / "with.onnx")
+    answer, instruments = session.run(None, {"planes": planes[None]})
+    assert instruments.shape == (1, 1, 48, 32)
+    assert np.ptp(told) > 1e-3
+    np.testing.assert_allclose(instruments[0, 0], told, atol=1e-5)
+    with torch.no_grad():
+        np.testing.assert_allclose(answer, network(torch.from_numpy(planes)[None]).numpy(), atol=1e-4)
+
+
+def test_the_package_s_depth_is_that_of_its_trunk_alone(tmp_path: Path) -> None:
+    network = read_network(SHIPPED)
+    assert network.instruments is not None
+    assert sum(part.numel() for part in network.instruments.parameters()) <= 200_000
+    network.instruments = None
+    export(network, tmp_path / "trunk.onnx", {})
+    frame = _frame()
+    shipped, alone = ScopeNetDepth().estimate(frame), ScopeNetDepth(str(tmp_path / "trunk.onnx")).estimate(frame)
+    np.testing.assert_array_equal(shipped.values, alone.values)
+    np.testing.assert_array_equal(shipped.sigma, alone.sigma)
+
+
+# ---- from probabilities to a mask
+
+
+def _masked(masker: Masker, probability: np.ndarray | None) -> np.ndarray | None:
+    masker(_frame())
+    return masker.instruments(probability)
+
+
+def test_a_likely_region_is_masked_with_a_rim_and_a_speck_is_not() -> None:
+    found = _masked(Masker(MaskSettings()), _bar(0.9))
+    assert found is not None
+    assert found[:, 30:50].all()
+    assert found[:, [29, 50]].all()
+    assert not found[:, :25].any()
+    assert not found[:, 55:].any()
+    speck = np.zeros((HEIGHT, WIDTH), np.float32)
+    speck[4, 4] = 1.0
+    unsure = _masked(Masker(MaskSettings()), np.maximum(speck, _bar(0.4)))
+    assert unsure is not None
+    assert not unsure.any()
+
+
+def test_what_was_an_instrument_a_frame_ago_is_held_longer() -> None:
+    weak = _bar(0.03)
+    weak[:5, 30:50] = 0.9
+    for before, held in ((None, False), (_bar(0.9), True)):
+        masker = Masker(MaskSettings())
+        if before is not None:
+            _masked(masker, before)
+        found = _masked(masker, weak)
+        assert found is not None
+        assert found[:5, 30:50].all()
+        assert found[20:, 30:50].all() == found[20:, 30:50].any() == held
+
+
+def test_nobody_looks_where_the_settings_or_the_network_do_not(tmp_path: Path) -> None:
+    assert _masked(Masker(MaskSettings()), None) is None
+    for way in ("off", "files"):
+        assert _masked(Masker(chosen(MaskSettings, instruments=way)), _bar(0.9)) is None
+
+    class Files:
+        warnings: list[str] = []  # noqa: RUF012
+
+        def covered(self, index: int) -> np.ndarray | None:
+            return np.zeros((HEIGHT, WIDTH), bool) if index == 0 else None
+
+        def provenance(self) -> dict[str, str]:
+            return {}
+
+    masker = Masker(MaskSettings(), Files())
+    assert _masked(masker, _bar(0.9)) is None, "frame 0 has a mask from a file"
+    masker(replace(_frame(), index=1))
+    found = masker.instruments(_bar(0.9))
+    assert found is not None
+    assert found.any()
+
+
+def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    same = Rectifier(CAMERA, CAMERA)
+    with pytest.raises(SettingsError, match=r"mask\.instruments=off contradicts mask\.files"):
+        create_masks(chosen(MaskSettings, instruments="off", files=str(tmp_path / "masks")), same)
+    with pytest.raises(SettingsError, match="there are no masks"):
+        create_masks(chosen(MaskSettings, instruments="files"), same)
+    assert create_masks(chosen(MaskSettings, instruments="off"), same, tmp_path / "masks") is None
+
+
+def test_a_mask_of_another_size_takes_usable_pixels_and_highlights() -> None:
+    frame = replace(_frame(), highlights=np.ones((HEIGHT, WIDTH), bool))
+    half = np.zeros((HEIGHT // 2, WIDTH // 2), bool)
+    half[:, :10] = True
+    seen = without_instruments(frame, half)
+    assert seen.highlights is not None
+    for image in (seen.valid, seen.highlights):
+        assert not image[:, :20].any()
+        assert image[:, 20:].all()
+
+
+# ---- in the pipeline
+
+
+class _WithInstruments:
+    """A depth estimator that finds instruments where it is told."""
+
+    name = "scopenet"
+
+    def __init__(self) -> None:
+        self.columns = slice(0, 0)
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        found = np.zeros(frame.valid.shape, np.float32)
+        found[:, self.columns] = 0.9
+        depth = np.full(frame.valid.shape, 40.0, np.float32)
+        return DepthEstimate(depth, "depth", sigma=0.1 * depth, instruments=found)
+
+    def provenance(self) -> dict[str, str]:
+        return {"depth": self.name}
+
+
+def test_instruments_have_no_depth_and_are_not_usable_and_a_covered_frame_says_so(tmp_path: Path) -> None:
+    sequence = open_sequence(write_tiny(tmp_path / "phantom"))
+    network = _WithInstruments()
+    for way in ("auto", "off"):
+        config = Config.load(settings={"mask.instruments": way})
+        pipeline = Pipeline(config, replace(create_estimators(config, sequence), depth=network))
+        first, second, third, *_ = sequence.frames()
+        network.columns = slice(0, 20)
+        step = pipeline.step(pipeline.preprocess(first))
+        bare = Masker(config.mask)(first)
+        if way == "off":
+            np.testing.assert_array_equal(step.frame.valid, bare.valid)
+            continue
+        assert not step.frame.valid[:, :20].any()
+        assert np.isnan(step.frame.depth_mm[:, :20]).all()
+        assert np.isnan(step.frame.depth_sigma_mm[:, :20]).all()
+        np.testing.assert_array_equal(step.frame.valid[:, 30:], bare.valid[:, 30:])
+        assert np.isfinite(step.frame.depth_mm[:, 30:]).all()
+        network.columns = slice(0, first.valid.shape[1])
+        covered = pipeline.step(pipeline.preprocess(second)).track
+        assert covered.status == "lost"
+        assert covered.reason == "only 0% of the image is usable: instruments cover 100%"
+        network.columns = slice(0, 0)
+        assert pipeline.step(pipeline.preprocess(third)).track.status != "lost"
+
+
+def test_a_killed_run_goes_on_with_the_instruments_of_the_frame_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All frames but the first show a bar that only a mask before it holds: forgotten, the rest would differ."""
+    real = ScopeNetDepth.estimate
+
+    def with_bar(self: ScopeNetDepth, frame: Frame) -> DepthEstimate:
+        found = np.zeros(frame.valid.shape, np.float32)
+        found[:, :12] = 0.03 if frame.index else 0.9
+        found[:3, :12] = 0.9
+        return replace(real(self, frame), instruments=found)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(step: Step) -> None:
+        if step.frame.index >= 4:
+            raise Killed
+
+    monkeypatch.setattr(ScopeNetDepth, "estimate", with_bar)
+    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
+    monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
+    folder = write_tiny(tmp_path / "phantom")
+    seen: dict[int, np.ndarray] = {}
+    reconstruct(
+        open_sequence(folder),
+        out=tmp_path / "whole",
+        observers=(lambda s: seen.update({s.frame.index: s.frame.valid}),),
+    )
+    assert not any(valid[30:, :12].any() for valid in seen.values())
+    with pytest.raises(Killed):
+        reconstruct(open_sequence(folder), out=tmp_path / "again", observers=(kill,))
+    resumed = reconstruct(open_sequence(folder), out=tmp_path / "again")
+    assert resumed.provenance["resumed_after_frame"] is not None
+    whole, again = (
+        {file.relative_to(out): file.read_bytes() for file in sorted(out.rglob("*")) if file.is_file()}
+        for out in (tmp_path / "whole", tmp_path / "again")
+    )
+    of_its_time = {Path("provenance.json"), Path("SHA256SUMS")}
+    assert whole.keys() == again.keys()
+    assert not [file for file in whole if whole[file] != again[file] and file not in of_its_time]
+
+
+def test_pictures_of_frames_show_instruments_grey(tmp_path: Path) -> None:
+    pictures, frame = FramePictures(), _frame()
+    instruments = _bar(1.0) > 0.5
+    pictures.put(0, frame.rgb, frame.valid & ~instruments, instruments)
+    pictures.put(1, frame.rgb, frame.valid)
+    pictures.save(tmp_path)
+    shown, bare = (cv2.imread(str(tmp_path / f"frames/00000{n}_mask.png"), cv2.IMREAD_GRAYSCALE) for n in (0, 1))
+    assert set(np.unique(shown[:, 30:50])) == {90}
+    assert set(np.unique(shown[:, 50:])) == {255}
+    assert set(np.unique(bare)) == {255}
