@@ -94,7 +94,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         kept = f"the estimate from the motion is uncertain: {described}"
     is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
     if not wanted and (is_unknown or bends):
-        tried = try_lenses(windows)
+        tried = _agreeing(try_lenses(windows), estimate, sequence, windows)
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
         if is_unknown:
@@ -113,6 +113,21 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     )
     source = f"estimated: from the motion of {min(sequence.count or MAX_FRAMES, MAX_FRAMES)} frames, {described}"
     return sequence.with_focal(estimate.focal_px, source, estimate.sigma_px), [distorted] * bends
+
+
+def _agreeing(
+    tried: LensTrial | None, motion: FocalEstimate, sequence: Sequence, windows: list[Window]
+) -> LensTrial | None:
+    """Return a trial's result; where it finds a pinhole that the motion contradicts, with the reason not to take it.
+
+    Both see the same turns, and only the trial relies on the estimated depth.
+    """
+    if tried is None or tried.reason or motion.reason or tried.kind != "pinhole":
+        return tried
+    scale = sequence.camera.width / (2 * windows[0].half_width_px)
+    if abs(math.log(scale * tried.focal_px / motion.focal_px)) <= motion.share:
+        return tried
+    return replace(tried, reason=f"its pinhole of {tried.fov_deg:.0f} deg is not that of the motion")
 
 
 def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> Sequence:
