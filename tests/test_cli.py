@@ -182,7 +182,7 @@ def test_a_lost_frame_is_told(scopemap: Say, tmp_path: Path) -> None:
     said = scopemap("run", folder, "--out", tmp_path / "out", "--depth", f"files:{folder}")
     assert said.code == 0
     assert "5 of 6 frames tracked" in said.out
-    assert re.search(r"^lost: frame 3, \w+", said.out, re.MULTILINE)
+    assert re.search(r"^lost: 0\.10 s \(1 frame\), too dark: go nearer", said.out, re.MULTILINE)
 
 
 # ---- video

@@ -237,7 +237,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(pieces)] if doubt]
     lost = result.losses
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
-    lines += [f"lost: {loss.when} ({loss.frames} frames), {loss.cause}: {loss.advice}" for loss in longest]
+    lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
         lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter stretches, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]

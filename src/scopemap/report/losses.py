@@ -27,6 +27,11 @@ class LostStretch:
         return ADVICE.get(self.cause, "")
 
     @property
+    def size(self) -> str:
+        """The number of frames in words."""
+        return "1 frame" if self.frames == 1 else f"{self.frames} frames"
+
+    @property
     def when(self) -> str:
         """The time in words."""
         return f"{self.begin_s:.2f} s" if self.first == self.last else f"{self.begin_s:.2f} to {self.end_s:.2f} s"
