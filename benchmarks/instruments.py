@@ -65,7 +65,7 @@ class Found:
 def measure(source: Path, model: str, truth: Path | None, pictures: Path | None) -> Found:
     """Mask the frames of a source as a run does, and compare with masks of the truth where there are some."""
     sequence = open_sequence(source)
-    masker, network = Masker(MaskSettings()), ScopeNetDepth(model, rays_known=sequence.calibrated)
+    masker, network = Masker(MaskSettings(instruments="auto")), ScopeNetDepth(model, rays_known=sequence.calibrated)
     files = None if truth is None else MaskFiles(truth, sequence.rectifier)
     found, drawn = Found([], []), []
     for frame in sequence.frames():

@@ -105,13 +105,16 @@ def test_the_package_s_depth_is_that_of_its_trunk_alone(tmp_path: Path) -> None:
 # ---- from probabilities to a mask
 
 
+LOOKED_FOR = chosen(MaskSettings, instruments="auto")
+
+
 def _masked(masker: Masker, probability: np.ndarray | None) -> np.ndarray | None:
     masker(_frame())
     return masker.instruments(probability)
 
 
 def test_a_likely_region_is_masked_with_a_rim_and_a_speck_is_not() -> None:
-    found = _masked(Masker(MaskSettings()), _bar(0.9))
+    found = _masked(Masker(LOOKED_FOR), _bar(0.9))
     assert found is not None
     assert found[:, 30:50].all()
     assert found[:, [29, 50]].all()
@@ -119,7 +122,7 @@ def test_a_likely_region_is_masked_with_a_rim_and_a_speck_is_not() -> None:
     assert not found[:, 55:].any()
     speck = np.zeros((HEIGHT, WIDTH), np.float32)
     speck[4, 4] = 1.0
-    unsure = _masked(Masker(MaskSettings()), np.maximum(speck, _bar(0.4)))
+    unsure = _masked(Masker(LOOKED_FOR), np.maximum(speck, _bar(0.4)))
     assert unsure is not None
     assert not unsure.any()
 
@@ -128,7 +131,7 @@ def test_what_was_an_instrument_a_frame_ago_is_held_longer() -> None:
     weak = _bar(0.03)
     weak[:5, 30:50] = 0.9
     for before, held in ((None, False), (_bar(0.9), True)):
-        masker = Masker(MaskSettings())
+        masker = Masker(LOOKED_FOR)
         if before is not None:
             _masked(masker, before)
         found = _masked(masker, weak)
@@ -138,7 +141,8 @@ def test_what_was_an_instrument_a_frame_ago_is_held_longer() -> None:
 
 
 def test_nobody_looks_where_the_settings_or_the_network_do_not(tmp_path: Path) -> None:
-    assert _masked(Masker(MaskSettings()), None) is None
+    assert _masked(Masker(LOOKED_FOR), None) is None
+    assert _masked(Masker(MaskSettings()), _bar(0.9)) is None
     for way in ("off", "files"):
         assert _masked(Masker(chosen(MaskSettings, instruments=way)), _bar(0.9)) is None
 
@@ -151,7 +155,7 @@ def test_nobody_looks_where_the_settings_or_the_network_do_not(tmp_path: Path) -
         def provenance(self) -> dict[str, str]:
             return {}
 
-    masker = Masker(MaskSettings(), Files())
+    masker = Masker(LOOKED_FOR, Files())
     assert _masked(masker, _bar(0.9)) is None, "frame 0 has a mask from a file"
     masker(replace(_frame(), index=1))
     found = masker.instruments(_bar(0.9))
@@ -164,8 +168,7 @@ def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None
     same = Rectifier(CAMERA, CAMERA)
     with pytest.raises(SettingsError, match=r"mask\.instruments=off contradicts mask\.files"):
         create_masks(chosen(MaskSettings, instruments="off", files=str(tmp_path / "masks")), same)
-    with pytest.raises(SettingsError, match="there are no masks"):
-        create_masks(chosen(MaskSettings, instruments="files"), same)
+    assert create_masks(chosen(MaskSettings, instruments="files"), same) is None
     assert create_masks(chosen(MaskSettings, instruments="off"), same, tmp_path / "masks") is None
 
 
@@ -251,15 +254,17 @@ def test_a_killed_run_goes_on_with_the_instruments_of_the_frame_before(
     monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
     folder = write_tiny(tmp_path / "phantom")
     seen: dict[int, np.ndarray] = {}
+    looked_for = Config.load(settings={"mask.instruments": "auto"})
     reconstruct(
         open_sequence(folder),
+        looked_for,
         out=tmp_path / "whole",
         observers=(lambda s: seen.update({s.frame.index: s.frame.valid}),),
     )
     assert not any(valid[30:, :12].any() for valid in seen.values())
     with pytest.raises(Killed):
-        reconstruct(open_sequence(folder), out=tmp_path / "again", observers=(kill,))
-    resumed = reconstruct(open_sequence(folder), out=tmp_path / "again")
+        reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again", observers=(kill,))
+    resumed = reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again")
     assert resumed.provenance["resumed_after_frame"] is not None
     whole, again = (
         {file.relative_to(out): file.read_bytes() for file in sorted(out.rglob("*")) if file.is_file()}

@@ -69,8 +69,9 @@ class MaskSettings(Settings):
         "(instruments, overlays); empty: the data set's own where it has some; none: no masks from files",
     )
     instruments: Literal["auto", "off", "files"] = Field(
-        "auto",
-        description="who tells where instruments are, auto: the masks from files, and in frames without one the depth "
-        "network where it can (scopenet); files: those alone; off: nobody, masks from files are not read either",
+        "files",
+        description="who tells where instruments are, files: masks from files, where there are some; auto: in frames "
+        "without one the depth network, where it can (scopenet), which misses some and takes pale tissue for others; "
+        "off: nobody, masks from files are not read either",
     )
     advanced: MaskAdvanced = MaskAdvanced()

@@ -30,8 +30,6 @@ def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None 
     folder = None if settings.files == _NO_MASKS else Path(settings.files) if settings.files else own
     if settings.instruments == "off" and folder is not None and settings.files:
         raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
-    if settings.instruments == "files" and folder is None:
-        raise SettingsError("mask.instruments=files, but there are no masks: name their folder in mask.files")
     if folder is None or settings.instruments == "off":
         return None
     return MaskFiles(folder, rectifier, settings.advanced.files_grow_px)
