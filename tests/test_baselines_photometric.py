@@ -84,7 +84,7 @@ def test_two_scales_and_grey_values_alone() -> None:
     # A part that our tracker gets later must not slip in by its default.
     for group in (SETTINGS.advanced, SETTINGS.paper):
         assert set(type(group).model_fields) == group.model_fields_set
-    assert set(TrackingSettings.model_fields) - SETTINGS.model_fields_set == {"min_valid_share"}
+    assert set(TrackingSettings.model_fields) - SETTINGS.model_fields_set == {"min_valid_share", "camera_at_rest"}
 
 
 def test_it_has_no_verdict_on_its_result_but_an_empty_image_is_lost() -> None:

@@ -218,7 +218,10 @@ def figures(network: ScopeNet, scenes: Store, layers: LayerStore, recipe: Recipe
             for n in range(recipe.pictures):
                 sample = pictures.draw((seed, n), size, stride)
                 probability = 1 / (1 + np.exp(-cv2.resize(_logits(network, sample), size[::-1])))
-                mask, truth = Masker(MaskSettings()).instruments(probability), sample.instruments > 0.5
+                mask, truth = (
+                    Masker(MaskSettings(instruments="auto")).instruments(probability),
+                    sample.instruments > 0.5,
+                )
                 assert mask is not None
                 if truth.any():
                     shared, whole = np.count_nonzero(mask & truth), np.count_nonzero(mask | truth)
