@@ -94,11 +94,13 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         kept = f"the estimate from the motion is uncertain: {described}"
     is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
     if not wanted and (is_unknown or bends):
-        tried = _agreeing(try_lenses(windows), estimate, sequence, windows)
+        # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
+        adjusts = config.mapping.method == "full"
+        tried = _agreeing(try_lenses(windows), estimate, sequence, windows) if adjusts else None
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
         if is_unknown:
-            kept += "; " + _undecided(tried)
+            kept += "; " + _undecided(tried) if adjusts else ""
             default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
             sequence.source.warnings.append(
                 f"{default}; a calibration (--camera) or the field of view (--fov) mends it"
