@@ -28,7 +28,13 @@ from scopemap.tracking.track import Track
 
 def _record(number: int) -> FrameRecord:
     T = plane_scene.pose(at_mm=(float(number), 1.0, 2.0))
-    seen = {"usable": 0.9, "sharpness": 0.8, "motion": 0.01, "nonrigidity": np.full(REGIONS, number, np.float32)}
+    seen = {
+        "usable": 0.9,
+        "sharpness": 0.8,
+        "motion": 0.01,
+        "quality": 0.7,
+        "nonrigidity": np.full(REGIONS, number, np.float32),
+    }
     track = Track(
         number, "ok", f"reason {number} \u00e4", T, number // 10, 0.1, 0.5, 0.25, float("nan"), number, 2, **seen
     )

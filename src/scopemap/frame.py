@@ -44,6 +44,7 @@ class Frame:
     highlights : (H, W) bool, True where `valid` is False for a specular highlight alone; None: not looked for.
     nonrigidity : `REGIONS` float32, as `tracking.track.Track` has it; None: not measured.
     weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
+    quality : what the picture is worth beside those of recent frames, 0..1, as `PictureQuality` has it.
     instruments : (H, W) bool, where the depth network found some, which `valid` leaves out; None: not looked for.
     """
 
@@ -60,6 +61,7 @@ class Frame:
     nonrigidity: np.ndarray | None = None
     weight: np.ndarray | None = None
     instruments: np.ndarray | None = None
+    quality: float = 1.0
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

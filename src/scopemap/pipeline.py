@@ -34,6 +34,7 @@ from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
+from scopemap.tracking.sharpness import PictureQuality
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.tracking.tracker import Tracker
@@ -93,7 +94,7 @@ class Pipeline:
     """
 
     STATES: ClassVar = {
-        "preprocess": ("_masker", "estimators", "_depth_faults"),
+        "preprocess": ("_masker", "_quality", "estimators", "_depth_faults"),
         "match": ("_matcher", "_flow_faults"),
         "track": ("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame", "_tracking_faults"),
     }
@@ -110,7 +111,7 @@ class Pipeline:
         # An empty store counts as false.
         store = FrameStore() if store is None else store
         self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method == "full")
-        self._masker = Masker(config.mask, estimators.masks)
+        self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._tracker = tracker or (estimators.tracker or self._own_tracker)()
         self._mapis = Mapis(config.mapis)
@@ -140,6 +141,7 @@ class Pipeline:
     def _estimate(self, frame: Frame) -> PreprocessedFrame:
         self._depth_faults.frames += 1
         frame = self._masker(frame)
+        frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
         # A frame that the tracker refuses must not fix the scale of depth.
         usable = frame.valid.mean() >= self.config.tracking.min_valid_share
         small = frame.downscaled(depth_downscale(self.config.depth, max(frame.valid.shape)))
@@ -182,7 +184,8 @@ class Pipeline:
             step = self._track(preprocessed)
         except Exception as error:
             step = self._lost(preprocessed, self._tracking_faults.noted(preprocessed.frame.index, error))
-        step = replace(step, track=replace(step.track, motion=_motion(preprocessed.correspondence)))
+        motion, quality = _motion(preprocessed.correspondence), preprocessed.frame.quality
+        step = replace(step, track=replace(step.track, motion=motion, quality=quality))
         self.mapper.observe(step.track)
         self._last_track = step.track
         return step

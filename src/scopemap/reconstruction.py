@@ -55,7 +55,7 @@ _SHOWN_FACES = 100_000
 _COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
-    *("depth_scale", "warped_share", "usable", "sharpness", "motion", "cause"),
+    *("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality", "cause"),
     *("moving_share", "moving_x", "moving_y"),
 ]
 
@@ -91,13 +91,14 @@ class FrameRecord:
         """Return the columns of frames.csv as text."""
         track = self.track
         numbers = (track.residual, track.inlier_share, track.correlation, track.overlap)
+        seen = (track.usable, track.sharpness, track.motion, track.quality)
         number = "" if self.map is None else str(self.map)
         return [
             *(str(self.index), f"{self.time_s:.6f}", self.name, track.status, track.reason),
             *(number, str(track.keyframe)),
             *("" if np.isnan(number) else f"{number:.5g}" for number in numbers),
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
-            *("" if np.isnan(seen) else f"{seen:.4g}" for seen in (track.usable, track.sharpness, track.motion)),
+            *("" if np.isnan(value) else f"{value:.4g}" for value in seen),
             self.cause,
             *("" if np.isnan(number) else f"{number:.3f}" for number in track.moving),
         ]

@@ -64,7 +64,9 @@ class FusionAdvanced(Settings):
     """Constants of fusion."""
 
     weighted: bool = Field(
-        True, description="weight pixels by incidence, distance and uncertainty, voxels behind a surface less; False: 1"
+        True,
+        description="weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface "
+        "less; False: 1",
     )
     min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
     depth_sigma_share: float = Field(

@@ -39,6 +39,7 @@ _ENTRY = np.dtype(
         ("sizes", np.int64, (5,)),
         ("median_depth_mm", np.float64),
         ("nonrigidity", np.float32, REGIONS),
+        ("quality", np.float64),
     ]
 )
 """Small data of a frame, the number of its camera, and its images: offset in the file, sizes in bytes (0: none)."""
@@ -142,6 +143,7 @@ class FrameStore:
         entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, self._end
         entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), _median_depth_mm(frame)
         entry["sizes"][0, : len(parts)] = [len(part) for part in parts]
+        entry["quality"] = frame.quality
         entry["nonrigidity"] = np.nan if frame.nonrigidity is None else frame.nonrigidity
         if frame.T_world_camera is not None:
             entry["has_pose"], entry["T_world_camera"] = True, frame.T_world_camera
@@ -255,6 +257,7 @@ class FrameStore:
             depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
             highlights=_bits(highlights, shape),
             nonrigidity=entry["nonrigidity"].copy(),
+            quality=float(entry["quality"]),
         )
 
 

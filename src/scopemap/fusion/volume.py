@@ -103,8 +103,9 @@ class TsdfVolume:
     def integrate(self, frame: Frame) -> None:
         """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
-        Pixels whose depth is less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less. Small
-        highlights within the picture weigh a tenth, in the colour of what is around them, unless weights are off.
+        Unless weights are off, frames count by what their pictures are worth (`frame.quality`), pixels whose depth is
+        less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less, and small highlights within the
+        picture weigh a tenth, in the colour of what is around them.
 
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
@@ -127,7 +128,7 @@ class TsdfVolume:
         surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
         weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
-        weight = weight if advanced.weighted else (weight > 0).astype(np.float32)
+        weight = weight * np.float32(frame.quality) if advanced.weighted else (weight > 0).astype(np.float32)
         surface = surface._replace(weight=weight if frame.weight is None else weight * frame.weight)
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)

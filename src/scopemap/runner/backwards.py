@@ -81,8 +81,9 @@ def _tracked_from(pipeline: Pipeline, start: Track, earlier: list[Track]) -> Ite
         if not (tracker.needs_keyframe() and tracker.insert_keyframe(tracked, measured=False)):
             tracker.remember(tracked)
         overlap += before.status != "lost"
-        track = replace(track, T_world_camera=start.T_world_camera @ track.T_world_camera)
-        yield before, replace(track, reason=BACKWARDS, keyframe=start.index, map=start.map, motion=before.motion)
+        track = replace(track, T_world_camera=start.T_world_camera @ track.T_world_camera, motion=before.motion)
+        found = replace(track, reason=BACKWARDS, keyframe=start.index, map=start.map, quality=before.quality)
+        yield before, found
 
 
 def _agree(motions: list[np.ndarray], depth_mm: float) -> bool:

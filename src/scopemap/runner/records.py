@@ -15,13 +15,13 @@ from scopemap.tracking.track import Status, Track
 
 _OF_TRACK = (
     *("keyframe", "iterations", "map", "residual", "inlier_share", "correlation", "overlap"),
-    *("usable", "sharpness", "motion"),
+    *("usable", "sharpness", "motion", "quality"),
 )
 _RECORD = np.dtype(
     [
         *((name, np.int64) for name in ("index", "keyframe", "iterations", "map", "text")),
         *((name, np.float64) for name in ("time_s", "residual", "inlier_share", "correlation", "overlap")),
-        *((name, np.float64) for name in ("depth_scale", "warped_share", "usable", "sharpness", "motion")),
+        *((name, np.float64) for name in ("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality")),
         ("nonrigidity", np.float32, REGIONS),
         *((name, np.float64, (4, 4)) for name in ("T_tracked", "T_world_camera")),
         ("has_pose", np.int64),
@@ -104,6 +104,7 @@ def _record(row: np.void, texts: bytes) -> FrameRecord:
         float(row["usable"]),
         float(row["sharpness"]),
         float(row["motion"]),
+        float(row["quality"]),
         row["nonrigidity"].copy(),
     )
     pose = row["T_world_camera"] if row["has_pose"] else None

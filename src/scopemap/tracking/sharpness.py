@@ -1,4 +1,4 @@
-"""Sharpness of a frame against the recent frames: blur, smoke and fluid on the lens reduce it."""
+"""Sharpness of a frame against the recent frames, and what its picture is worth: blur, smoke and fluid reduce both."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import numpy as np
 
 _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
 _FRAMES = 30
+# What its picture is worth is measured in a small copy, against the upper quartile of so many frames: unlike their
+# median, it is still that of clear ones where fluid stays for seconds.
+_SMALL_PX, _NEIGHBOURS, _CLEAR_PERCENTILE = 320, 100, 75
+_LEAST_QUALITY = 0.01
 
 
 class SharpnessMonitor:
@@ -26,6 +30,40 @@ class SharpnessMonitor:
         usual = float(np.median(self._recent)) if self._recent else value
         self._recent.append(value)
         return value / usual if usual > 0 else 1.0
+
+
+class PictureQuality:
+    """What the pictures of frames, in order, are worth beside those of the last 100.
+
+    The product of three shares, each 1 at most, of the upper quartile of these frames: sharpness; usable pixels, which
+    are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_NEIGHBOURS)
+
+    def __call__(self, rgb: np.ndarray, valid: np.ndarray) -> float:
+        """Return the quality, 0.01..1, of an image (H, W, 3) uint8 with valid pixels (H, W) bool."""
+        share = float(valid.mean())
+        if share == 0:
+            return _LEAST_QUALITY
+        height, width = valid.shape
+        factor = min(1.0, _SMALL_PX / max(height, width))
+        size = max(1, round(factor * width)), max(1, round(factor * height))
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        found = sharpness(rgb, valid), share, _saturation(rgb, valid)
+        self._recent.append(found)
+        clear = np.percentile(self._recent, _CLEAR_PERCENTILE, axis=0)
+        shares = np.minimum(found / np.maximum(clear, 1e-9), 1.0)
+        return max(float(shares.prod()), _LEAST_QUALITY)
+
+
+def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
+    """Return the mean saturation of the colours, 0..1, over valid pixels."""
+    seen = rgb[valid].astype(np.float32)
+    brightest = seen.max(1, initial=1.0)
+    return float(((brightest - seen.min(1, initial=255.0)) / brightest).mean()) if len(seen) else 0.0
 
 
 def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:

@@ -36,7 +36,7 @@ class Track:
     inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
     iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
     usable : share of the image that shows tissue. sharpness : that of the image over the usual one. motion : median
-        optical flow since the frame before, share of the width. NaN where they are not known.
+        optical flow since the frame before, share of the width. quality : see `Frame`. NaN where they are not known.
     nonrigidity : `REGIONS` float32, by how many standard deviations the tissue in each region of the picture moves
         against the rigid scene, NaN where too few corners are matched; None: not measured.
     """
@@ -55,6 +55,7 @@ class Track:
     usable: float = float("nan")
     sharpness: float = float("nan")
     motion: float = float("nan")
+    quality: float = float("nan")
     nonrigidity: np.ndarray | None = None
 
     @property

@@ -30,6 +30,7 @@ _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them t
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
 _SEEN_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
+_CLEAR, _PATIENCE = 0.8, 3  # of the best quality since the keyframe: below it the next one waits so many frames more
 _DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 
@@ -61,6 +62,7 @@ class Tracker:
         self._frames_lost = self._sharp_frames_lost = 0
         self._agreement: list[float] = []
         self._is_unsharp = False
+        self._quality = self._best_quality = 0.0
         self._coverage = 1.0
         self._passed = PassedKeyframes()
         self._is_seen_again = False
@@ -70,6 +72,7 @@ class Tracker:
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
         self._frames_since_keyframe += 1
+        self._quality, self._best_quality = frame.quality, max(frame.quality, self._best_quality)
         usable = float(frame.valid.mean())
         if usable < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
@@ -132,7 +135,8 @@ class Tracker:
 
     def _is_due(self, agreement: list[float]) -> bool:
         """Whether a frame with this agreement, [] where it is not known, should become a keyframe."""
-        is_old = self._frames_since_keyframe >= self.settings.keyframe_every
+        patience = _PATIENCE if self._quality < _CLEAR * self._best_quality else 0
+        is_old = self._frames_since_keyframe >= self.settings.keyframe_every + patience
         least = self.settings.advanced.min_keyframe_agreement
         fits_worse = bool(agreement and self._agreement) and agreement[-1] < least * self._agreement[0]
         return is_old or fits_worse or self._coverage < _KEYFRAME_COVERAGE
@@ -153,7 +157,7 @@ class Tracker:
         self._use_keyframe(keyframe)
         self._relocaliser.add(keyframe)
         self._passed.add(frame)
-        self._frames_since_keyframe = 0
+        self._frames_since_keyframe, self._best_quality = 0, 0.0
         return True
 
     def _seen_again(self, frame: Frame, alignment: Alignment) -> Alignment:
