@@ -31,8 +31,8 @@ OPTIONS = {
     "models pull": "--json --quiet",
     "models verify": "--json --quiet",
 }
-JSON_KEYS = ["input", "dataset", "frames", "tracked", "lost", "in_other_maps", "skipped", "camera", "scale"]
-JSON_KEYS += ["estimators", "notes", "warnings", "seconds", "versions", "machine", "surface"]
+JSON_KEYS = ["input", "dataset", "frames", "tracked", "lost", "rotation_only", "in_other_maps", "skipped", "camera"]
+JSON_KEYS += ["scale", "estimators", "notes", "warnings", "seconds", "versions", "machine", "surface"]
 JSON_KEYS += ["interrupted_at_frame", "resumed_after_frame", "input_content"]
 JSON_KEYS += ["out", "preset", "mesh_faces"]
 

@@ -28,7 +28,7 @@ from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, Fr
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
-COLUMNS += " depth_scale warped_share usable sharpness motion quality cause"
+COLUMNS += " depth_scale warped_share usable sharpness motion quality cause orientation"
 COLUMNS += " moving_share moving_x moving_y"
 LOST = 6
 STORED = 1.6e-4  # relative error of depth in the frame store

@@ -34,6 +34,7 @@ from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
+from scopemap.tracking.relocalisation import RotationFollower
 from scopemap.tracking.sharpness import PictureQuality
 from scopemap.tracking.smoothing import create_smoother
 from scopemap.tracking.track import FrameTracker, Track, motion_between
@@ -96,7 +97,16 @@ class Pipeline:
     STATES: ClassVar = {
         "preprocess": ("_masker", "_quality", "estimators", "_depth_faults"),
         "match": ("_matcher", "_flow_faults"),
-        "track": ("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame", "_tracking_faults"),
+        "track": (
+            "_tracker",
+            "_mapis",
+            "_smooth",
+            "mapper",
+            "_last_track",
+            "_last_frame",
+            "_tracking_faults",
+            "_rotation",
+        ),
     }
     """The attributes that each stage changes, by its name; those of `fuse` are in `fusion`."""
 
@@ -119,6 +129,7 @@ class Pipeline:
         at_rest = {"method": "none"} if config.tracking.camera_at_rest else {}  # there is nothing to adjust
         mapping = config.mapping.model_copy(update=at_rest)
         self.mapper = Mapper(mapping, estimators.keyframe_flow, store.table, estimators.features)
+        self._rotation = RotationFollower()
         self._last_track: Track | None = None
         self._last_frame: tuple[Frame, Track] | None = None
         self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
@@ -185,7 +196,10 @@ class Pipeline:
         except Exception as error:
             step = self._lost(preprocessed, self._tracking_faults.noted(preprocessed.frame.index, error))
         motion, quality = _motion(preprocessed.correspondence), preprocessed.frame.quality
-        step = replace(step, track=replace(step.track, motion=motion, quality=quality))
+        track = replace(step.track, motion=motion, quality=quality)
+        if isinstance(self._tracker, Tracker):
+            track = self._rotation.follow(track, preprocessed.small, preprocessed.correspondence)
+        step = replace(step, track=track)
         self.mapper.observe(step.track)
         self._last_track = step.track
         return step
@@ -195,6 +209,8 @@ class Pipeline:
         track, last = self._tracker.track(preprocessed.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
+        if np.isfinite(track.depth_ratio):
+            self._mapis.rescale(track.depth_ratio)
         refined = refined or self._refine(preprocessed, motion_between(last, track))
         frame = _with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
         frame = replace(frame, nonrigidity=track.nonrigidity)

@@ -14,7 +14,7 @@ import json
 import math
 from base64 import b64encode
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
@@ -31,17 +32,15 @@ from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.decoding import read_decoded, write_encoded
 from scopemap.io.frame_choice import SkippedFrame
-from scopemap.mapping.submaps import Submap
 from scopemap.pipeline import Step
-from scopemap.report.kept_run import LOST, KeptMap, KeptRun
+from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
 from scopemap.report.losses import LostStretch, losses
 from scopemap.report.page_data import shown_meshes
 from scopemap.report.summary_picture import summary_picture
 from scopemap.report.verdict import verdict
 from scopemap.tracking.track import Track
-from scopemap.trajectory.causes import causes_of_loss
-from scopemap.trajectory.trajectory import OTHER_MAP, SKIPPED, TRACKED, Trajectory, write_tum
+from scopemap.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, TRACKED, Trajectory, write_tum
 
 DEPTH_SCALE_MM = 0.01
 """The finest unit of depth/*.png; the largest depth is then 655 mm."""
@@ -55,7 +54,7 @@ _SHOWN_FACES = 100_000
 _COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
-    *("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality", "cause"),
+    *("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality", "cause", "orientation"),
     *("moving_share", "moving_x", "moving_y"),
 ]
 
@@ -67,7 +66,8 @@ class FrameRecord:
     T_world_camera : (4, 4), or None where the frame has no pose in this submap: `track.status` is then "lost" or
         "other-map". depth_scale : MAPIS' factor of its depth, times the back end's.
     map : number of the submap it was tracked in, 0 for the result and N for `maps/N`; None where it is lost, in a
-        submap too small to be saved, or not sorted yet. cause : why it is lost, by `causes_of_loss`.
+        submap too small to be saved, or not sorted yet. cause : why it is lost, by `causes_of_loss`. orientation :
+        (3, 3) rotation to the world of a frame that is lost but for it: `track.status` is then "rotation-only".
     """
 
     index: int
@@ -79,6 +79,17 @@ class FrameRecord:
     warped_share: float
     map: int | None = None
     cause: str = ""
+    orientation: np.ndarray | None = None
+
+    @property
+    def pose(self) -> np.ndarray:
+        """T_world_camera (4, 4), NaN where it is not known: all of it, or the position alone."""
+        if self.T_world_camera is not None:
+            return self.T_world_camera
+        T = np.full((4, 4), np.nan)
+        if self.orientation is not None:
+            T[:3, :3] = self.orientation
+        return T
 
     @classmethod
     def of(cls, step: Step) -> FrameRecord:
@@ -100,8 +111,13 @@ class FrameRecord:
             *(str(track.iterations), f"{self.depth_scale:.5g}", f"{self.warped_share:.3f}"),
             *("" if np.isnan(value) else f"{value:.4g}" for value in seen),
             self.cause,
+            "" if self.orientation is None else _quaternion(self.orientation),
             *("" if np.isnan(number) else f"{number:.3f}" for number in track.moving),
         ]
+
+
+def _quaternion(R: np.ndarray) -> str:
+    return " ".join(f"{number:.6f}" for number in Rotation.from_matrix(R).as_quat(canonical=True))
 
 
 def _skipped_row(frame: SkippedFrame) -> list[str]:
@@ -110,38 +126,14 @@ def _skipped_row(frame: SkippedFrame) -> list[str]:
     return known + [""] * (len(_COLUMNS) - len(known))
 
 
-def records_of(number: int, submaps: list[Submap], records: list[FrameRecord]) -> list[FrameRecord]:
-    """Return the records of the submap with this number, with corrected poses and scales.
-
-    Submap 0 is the result: its records are those of all frames, lost ones and those of other submaps included. Any
-    other has the records of its own frames.
-    """
-    submap = submaps[number]
-    map_of = {index: number for number, submap in enumerate(submaps) for index in submap.frames}
-    out, maps = list[FrameRecord](), set[int]()
-    for record in records:
-        track, found_in = record.track, map_of.get(record.index)
-        if found_in == number:
-            if track.status == "initial" and maps:
-                reason = track.reason if track.map in maps else "first frame of a merged map"
-                record = replace(record, track=replace(track, status="ok", reason=reason))
-            out.append(replace(_corrected(submap, record), map=number))
-            maps.add(track.map)
-        elif number == 0 and record.T_world_camera is not None:
-            where = "a submap too small to be saved" if found_in is None else f"maps/{found_in}"
-            track = replace(track, status=OTHER_MAP, reason=f"tracked in {where}")
-            out.append(replace(record, track=track, T_world_camera=None, map=found_in))
-        elif number == 0:
-            out.append(record)
-    causes = causes_of_loss([record.track for record in out])
-    return [replace(record, cause=cause) if cause else record for record, cause in zip(out, causes, strict=True)]
-
-
 def frame_counts(records: list[FrameRecord]) -> dict[str, int]:
-    """Return how many frames there are, are tracked in this submap, lost, and tracked in another submap."""
+    """Return how many frames there are, are tracked in this submap, lost, of these with a rotation, and tracked in
+    another submap.
+    """
     status: Counter[str] = Counter(record.track.status for record in records)
     tracked = sum(status[name] for name in TRACKED)
-    return {"frames": len(records), "tracked": tracked, "lost": status["lost"], "in_other_maps": status[OTHER_MAP]}
+    lost = {"lost": status["lost"] + status[ROTATION_ONLY], "rotation_only": status[ROTATION_ONLY]}
+    return {"frames": len(records), "tracked": tracked} | lost | {"in_other_maps": status[OTHER_MAP]}
 
 
 def warnings_of_frames(records: list[FrameRecord], interrupted_at: int | None) -> list[str]:
@@ -163,14 +155,6 @@ def scale_words(scale: dict[str, Any]) -> str:
     if scale["known"]:
         return f"scale: {scale['source']}"
     return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"
-
-
-def _corrected(submap: Submap, record: FrameRecord) -> FrameRecord:
-    if submap.correction is None or record.T_world_camera is None:
-        return record
-    pose = submap.correction.pose(record.index, record.T_world_camera)
-    scale = record.depth_scale * submap.correction.depth_factor(record.index)
-    return replace(record, T_world_camera=pose, depth_scale=scale)
 
 
 @dataclass(frozen=True)
@@ -217,7 +201,7 @@ class Reconstruction:
         for result in (self, *self.others):
             known = result.trajectory.rows(result.trajectory.tracked)
             maps.append(KeptMap(known.indices, known.T_world_camera, result.mesh))
-        outside = {"lost": LOST, OTHER_MAP: OTHER_PLACE}
+        outside = {"lost": LOST, ROTATION_ONLY: ROTATED, OTHER_MAP: OTHER_PLACE}
         # A submap is the result of its own report, whatever its number.
         tracked = [record.T_world_camera is not None for record in self.records]
         elsewhere = [record.map or outside.get(record.track.status, 0) for record in self.records]
@@ -233,18 +217,18 @@ class Reconstruction:
     @property
     def trajectory(self) -> Trajectory:
         """The poses with their status; NaN where a frame is lost or in another submap."""
-        records, unknown = self.records, np.full((4, 4), np.nan)
+        records = self.records
         return Trajectory(
             np.array([record.index for record in records], dtype=np.int64),
             np.array([record.time_s for record in records]),
-            np.stack([unknown if record.T_world_camera is None else record.T_world_camera for record in records]),
+            np.stack([record.pose for record in records]),
             np.array([record.track.status for record in records]),
         )
 
     @property
     def lost(self) -> list[FrameRecord]:
         """The records of the frames that could not be tracked; those of other submaps are not among them."""
-        return [record for record in self.records if record.track.status == "lost"]
+        return [record for record in self.records if record.track.status in ("lost", ROTATION_ONLY)]
 
     def save(self, folder: Path) -> None:
         """Write everything but the depth maps, which a `DepthWriter` writes frame by frame.

@@ -107,6 +107,10 @@ class Mapis:
         """Let the next frame start without a previous depth; the last scale is kept."""
         self._carried = None
 
+    def rescale(self, scale: float) -> None:
+        """Let the next frame start with a scale that is known."""
+        self._carried, self._scale = None, scale
+
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.advanced.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")

@@ -18,10 +18,11 @@ from scopemap.io.decoding import read_decoded
 from scopemap.report.frame_pictures import picture_file, pictured_frames, read_measures
 from scopemap.trajectory.formats.folders import submap_folders
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import SKIPPED, Trajectory
+from scopemap.trajectory.trajectory import ROTATION_ONLY, SKIPPED, Trajectory
 
-LOST, OTHER_MAP, NOT_USED = -1, -2, -3
-"""Where a frame is if in no map that was kept: lost; in a map too short to be kept; skipped before tracking."""
+LOST, OTHER_MAP, NOT_USED, ROTATED = -1, -2, -3, -4
+"""Where a frame is if in no map that was kept: lost; in a map too short to be kept; skipped before tracking; lost but
+for its rotation."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class KeptRun:
     folder : of the run; None in memory, where no pictures and depth are.
     provenance : its provenance.json. config : the text of its config.toml.
     rows : frames.csv, one per frame, skipped ones too. maps : the result first, then maps/1, maps/2, ...
-    place : (N,) int64, for each row the number of its map in `maps`, or `LOST`, `OTHER_MAP` or `NOT_USED`.
+    place : (N,) int64, for each row the number of its map in `maps`, or `LOST`, `ROTATED`, `OTHER_MAP` or `NOT_USED`.
     """
 
     folder: Path | None
@@ -141,4 +142,6 @@ def _outside(row: Mapping[str, str]) -> int:
     """Return where a frame is that no kept map holds."""
     if row["status"] == SKIPPED:
         return NOT_USED
+    if row["status"] == ROTATION_ONLY:
+        return ROTATED
     return LOST if row["status"] == "lost" and "another" not in row["reason"] else OTHER_MAP

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from itertools import groupby
 
-from scopemap.report.kept_run import LOST, NOT_USED, KeptRun
+from scopemap.report.kept_run import LOST, NOT_USED, ROTATED, KeptRun
 from scopemap.trajectory.causes import ADVICE, NOT_FOUND_AGAIN
 
 
@@ -41,7 +41,7 @@ def losses(run: KeptRun) -> list[LostStretch]:
     """Return the stretches of lost frames of a run, in order; frames that were not used do not end one."""
     used = [row for row in range(len(run.rows)) if run.place[row] != NOT_USED]
     found = []
-    for is_lost, group in groupby(used, lambda row: run.place[row] == LOST):
+    for is_lost, group in groupby(used, lambda row: run.place[row] in (LOST, ROTATED)):
         rows = list(group)
         if is_lost:
             begin_s, end_s = (float(run.rows[row]["time_s"]) for row in (rows[0], rows[-1]))

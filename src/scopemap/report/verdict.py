@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
+from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, ROTATED, KeptRun
 from scopemap.report.losses import in_words, losses
 from scopemap.report.pieces import doubt_words, pieces_in_time
 
@@ -131,7 +131,8 @@ def _of_frames(run: KeptRun) -> Reason:
 
 def _of_maps(run: KeptRun) -> list[Reason]:
     other = int(np.sum((run.place > 0) | (run.place == OTHER_MAP)))
-    lost = int(np.sum(run.place == LOST))
+    rotated = int(np.sum(run.place == ROTATED))
+    lost = rotated + int(np.sum(run.place == LOST))
     found = []
     if other:
         kept = len(run.maps) - 1
@@ -142,7 +143,8 @@ def _of_maps(run: KeptRun) -> list[Reason]:
     if doubt:
         found.append(Reason("note", f"Most doubtful of the pieces is {doubt}."))
     if lost:
-        words = f"In {lost} frames the camera could not be followed at all. {in_words(losses(run))}"
+        how = f" but for its rotation in {rotated}" if rotated else " at all"
+        words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(run))}"
         found.append(Reason("note", words.rstrip()))
     return found
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import replace
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import cast
 
@@ -10,8 +11,11 @@ import numpy as np
 
 from scopemap.errors import InputError
 from scopemap.frame import REGIONS, RowTable
+from scopemap.mapping.submaps import Submap
 from scopemap.reconstruction import FrameRecord
-from scopemap.tracking.track import Status, Track
+from scopemap.tracking.track import WALL, Status, Track
+from scopemap.trajectory.causes import causes_of_loss
+from scopemap.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
 
 _OF_TRACK = (
     *("keyframe", "iterations", "map", "residual", "inlier_share", "correlation", "overlap"),
@@ -23,6 +27,7 @@ _RECORD = np.dtype(
         *((name, np.float64) for name in ("time_s", "residual", "inlier_share", "correlation", "overlap")),
         *((name, np.float64) for name in ("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality")),
         ("nonrigidity", np.float32, REGIONS),
+        ("rotation", np.float64, (3, 3)),
         *((name, np.float64, (4, 4)) for name in ("T_tracked", "T_world_camera")),
         ("has_pose", np.int64),
         ("sizes", np.int64, (3,)),
@@ -55,6 +60,7 @@ class FrameRecords:
         row["depth_scale"], row["warped_share"] = record.depth_scale, record.warped_share
         row["T_tracked"] = track.T_world_camera
         row["nonrigidity"] = np.nan if track.nonrigidity is None else track.nonrigidity
+        row["rotation"] = np.nan if track.rotation is None else track.rotation
         if record.T_world_camera is not None:
             row["has_pose"], row["T_world_camera"] = True, record.T_world_camera
         # A file's name may hold bytes that are no UTF-8.
@@ -106,7 +112,67 @@ def _record(row: np.void, texts: bytes) -> FrameRecord:
         float(row["motion"]),
         float(row["quality"]),
         row["nonrigidity"].copy(),
+        rotation=None if np.isnan(row["rotation"]).any() else row["rotation"].copy(),
     )
     pose = row["T_world_camera"] if row["has_pose"] else None
     scale, share = float(row["depth_scale"]), float(row["warped_share"])
     return FrameRecord(track.index, float(row["time_s"]), name, track, pose, scale, share)
+
+
+def records_of(number: int, submaps: list[Submap], records: list[FrameRecord]) -> list[FrameRecord]:
+    """Return the records of the submap with this number, with corrected poses and scales.
+
+    Submap 0 is the result: its records are those of all frames, lost ones and those of other submaps included. Any
+    other has the records of its own frames.
+    """
+    submap = submaps[number]
+    map_of = {index: number for number, submap in enumerate(submaps) for index in submap.frames}
+    out, maps = list[FrameRecord](), set[int]()
+    for record in records:
+        track, found_in = record.track, map_of.get(record.index)
+        if found_in == number:
+            if track.status == "initial" and maps:
+                reason = track.reason if track.map in maps else "first frame of a merged map"
+                record = replace(record, track=replace(track, status="ok", reason=reason))
+            out.append(replace(_corrected(submap, record), map=number))
+            maps.add(track.map)
+        elif number == 0 and record.T_world_camera is not None:
+            where = "a submap too small to be saved" if found_in is None else f"maps/{found_in}"
+            track = replace(track, status=OTHER_MAP, reason=f"tracked in {where}")
+            out.append(replace(record, track=track, T_world_camera=None, map=found_in))
+        elif number == 0:
+            out.append(record)
+    causes = causes_of_loss([record.track for record in out])
+    return _with_rotations([replace(record, cause=cause) for record, cause in zip(out, causes, strict=True)])
+
+
+def _with_rotations(records: list[FrameRecord]) -> list[FrameRecord]:
+    """Return the records of a submap, in order, where lost ones whose rotation was followed from it have it, so marked.
+
+    Only where a wall filled the picture: elsewhere it may be fluid or an instrument that was followed. The rotation is
+    relative to the last frame that was tracked, and turns with that.
+    """
+    out, T_world_last = list[FrameRecord](), None
+    for is_lost, stretch in groupby(records, lambda record: record.track.status == "lost"):
+        group = list(stretch)
+        if not is_lost:
+            T_world_last = group[-1].T_world_camera
+        elif T_world_last is not None and any(WALL in record.track.reason for record in group):
+            group = [_rotated(record, T_world_last) for record in group]
+        out += group
+    return out
+
+
+def _rotated(record: FrameRecord, T_world_last: np.ndarray) -> FrameRecord:
+    if record.track.rotation is None:
+        return record
+    orientation = T_world_last[:3, :3] @ record.track.rotation
+    return replace(record, track=replace(record.track, status=ROTATION_ONLY), orientation=orientation)
+
+
+def _corrected(submap: Submap, record: FrameRecord) -> FrameRecord:
+    if submap.correction is None or record.T_world_camera is None:
+        return record
+    pose = submap.correction.pose(record.index, record.T_world_camera)
+    scale = record.depth_scale * submap.correction.depth_factor(record.index)
+    return replace(record, T_world_camera=pose, depth_scale=scale)

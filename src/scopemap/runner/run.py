@@ -37,7 +37,6 @@ from scopemap.reconstruction import (
     DepthWriter,
     FrameRecord,
     Reconstruction,
-    records_of,
     warnings_of_frames,
 )
 from scopemap.runner.backwards import track_backwards
@@ -46,7 +45,7 @@ from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import Progress, prepare
 from scopemap.runner.provenance import Limits, motion_notes, provenance_of, refuse_own_input
-from scopemap.runner.records import FrameRecords, check_tracked
+from scopemap.runner.records import FrameRecords, check_tracked, records_of
 from scopemap.tracking.track import FrameTracker, Track
 
 Observer = Callable[[Step], bool | None]

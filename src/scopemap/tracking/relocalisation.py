@@ -1,4 +1,4 @@
-"""Keyframes that are known: a lost camera is found again in them by features, PnP and alignment from there."""
+"""What becomes of a lost camera: features find it again in known keyframes; until then its rotation is followed."""
 
 from __future__ import annotations
 
@@ -8,16 +8,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import TrackingSettings
+from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.flow.corners import Correspondences2D3D
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.features import FeatureDetector, Features, RelativePose, relative_pose_pnp
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
+from scopemap.tracking.features import FeatureDetector, Features, RelativePose, points_at, relative_pose_pnp
+from scopemap.tracking.reprojection import pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment
+from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
 _PASSED_KEYFRAMES = 64
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of a passed keyframe's view, at most, and over that of the current one
+_WALL_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
+_EVERY_PX, _RANGE = 4, (5, 95)
+# Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
+_FLOW_EVERY_PX, _FOLLOWED_COVERAGE, _FOLLOWED_ERROR = 8, 0.25, 0.01
+_DEPTH_SIGMA = 0.2  # relative standard deviation of the wall's shape
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
 
 
@@ -37,6 +47,36 @@ class Keyframe:
     depth_mm: float
     measured: bool
     map: int
+
+
+def is_wall(frame: Frame, keyframe: Keyframe) -> bool:
+    """Whether a frame shows nothing but one near wall, by its predicted depth: it hardly varies beside the keyframe's.
+
+    How near the wall is depth networks do not tell; where depth is measured it is no reason to be lost.
+    """
+    own, usual = _log_depth_range(frame), _log_depth_range(keyframe.frame)
+    return not keyframe.measured and own < _WALL_RANGE * usual
+
+
+def _log_depth_range(frame: Frame) -> float:
+    some_mm = np.asarray(frame.depth_mm)[::_EVERY_PX, ::_EVERY_PX][frame.valid[::_EVERY_PX, ::_EVERY_PX]]
+    some_mm = some_mm[some_mm > 0]
+    return float(np.ptp(np.log(np.percentile(some_mm, _RANGE)))) if some_mm.size else float("nan")
+
+
+def depth_ratio(keyframe: Keyframe, frame: Frame, T_world_camera: np.ndarray) -> float:
+    """Return the median of a keyframe's depth, seen from a frame's pose, over the frame's own; NaN without overlap."""
+    some = slice(_EVERY_PX // 2, None, _EVERY_PX)
+    points = keyframe.frame.camera.rays[some, some] * np.asarray(keyframe.frame.depth_mm)[some, some, None]
+    points = points[keyframe.frame.valid[some, some]].astype(np.float64)
+    seen = transform(inverse(T_world_camera) @ keyframe.T_world_camera, points)
+    seen = seen[seen[:, 2] > 0]
+    pixels, size = frame.camera.project(seen), (frame.camera.width, frame.camera.height)
+    inside = ((pixels >= 0) & (pixels < size)).all(1)
+    usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
+    own_mm = points_at(pixels[inside], usable_mm, frame.camera)[:, 2]
+    ratio = seen[inside, 2] / own_mm
+    return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else float("nan")
 
 
 class PassedKeyframes:
@@ -69,6 +109,56 @@ class PassedKeyframes:
             return None
         limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
         return nearest if distance(nearest.T_world_camera) <= limit else None
+
+
+class RotationFollower:
+    """Follows the rotation of a lost camera from frame to frame, where a wall fills the picture: its position is held.
+
+    Near a wall translation moves the picture as much as rotation does, so that a rotation alone does not explain the
+    flow. The wall's predicted depth has a shape, but no scale: PnP of the last frame's points gives the rotation, and a
+    translation of which nothing is kept. Where flow matches little, or does not fit, the rotation is lost, too.
+    """
+
+    def __init__(self) -> None:
+        self._depth_mm: np.ndarray | None = None
+        self._rotation: np.ndarray | None = None
+
+    def follow(self, track: Track, frame: Frame, correspondence: DenseCorrespondence | None) -> Track:
+        """Return the track of each frame, in order, with its rotation where it is lost and followed.
+
+        frame : of the size of the correspondence with the frame before, with raw depth.
+        """
+        before_mm, self._depth_mm = self._depth_mm, np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
+        if track.status != "lost":
+            self._rotation = np.eye(3)
+            return track
+        step = None
+        if before_mm is not None and correspondence is not None and self._rotation is not None:
+            step = rotation_by_flow(before_mm, frame.camera, correspondence)
+        self._rotation = None if step is None or self._rotation is None else self._rotation @ step.T
+        return replace(track, rotation=self._rotation)
+
+
+def rotation_by_flow(
+    depth_mm: np.ndarray, camera: PinholeCamera, correspondence: DenseCorrespondence
+) -> np.ndarray | None:
+    """Return R_current_previous (3, 3) by flow and the previous frame's depth; None where they do not support one.
+
+    depth_mm : (H, W), any scale, NaN = unknown or not usable.
+    """
+    some = slice(_FLOW_EVERY_PX // 2, None, _FLOW_EVERY_PX)
+    height, width = depth_mm.shape
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)[some, some].reshape(-1, 2).astype(float)
+    previous = pixels + correspondence.to_previous[some, some].reshape(-1, 2)
+    points_mm = points_at(previous, depth_mm, camera)
+    matched = correspondence.consistent[some, some].ravel() & np.isfinite(points_mm).all(1)
+    found = Correspondences2D3D(points_mm[matched], pixels[matched], float(matched.mean()), 0)
+    T = None
+    if found.coverage >= _FOLLOWED_COVERAGE:
+        T = pose_from_correspondences(found, camera, np.eye(4), _DEPTH_SIGMA)
+    if T is None or reprojection_error_px(found, camera, T) > _FOLLOWED_ERROR * width:
+        return None
+    return T[:3, :3]
 
 
 class Relocaliser:

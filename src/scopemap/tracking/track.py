@@ -10,9 +10,14 @@ import numpy as np
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 
-Status = Literal["initial", "ok", "lost", "other-map"]
+Status = Literal["initial", "ok", "lost", "other-map", "rotation-only"]
 
 TOO_DARK, TOO_BRIGHT = ", it is too dark", ", it is overexposed"
+_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
+WALL = "the wall fills the picture"
+"""In the reason of a lost frame that shows nothing but one near wall."""
+UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
+"""Reason of a lost frame after such ones."""
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
@@ -28,13 +33,18 @@ class Track:
     ----------
     index : number of the frame.
     status : "initial" for the frame that fixes the world of its map, "ok", or "lost". Trackers do not give
-        "other-map": in the records of a result it marks frames that were tracked in another submap.
+        "other-map" and "rotation-only": in the records of a result these mark frames that were tracked in another
+        submap, and lost ones whose rotation was followed.
     reason : one phrase; for a lost frame, what was wrong.
     T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose.
     keyframe : number of the frame it was aligned to.
     residual : robust standard deviation of the photometric residual, NaN if there was none.
     inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
     iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
+    depth_ratio : where features found the camera again after a wall, the keyframe's depth over the frame's own; NaN
+        elsewhere.
+    rotation : (3, 3) of a lost frame whose rotation alone was followed, from its camera to that of the last tracked
+        frame; None: it is not known.
     usable : share of the image that shows tissue. sharpness : that of the image over the usual one. motion : median
         optical flow since the frame before, share of the width. quality : see `Frame`. NaN where they are not known.
     nonrigidity : `REGIONS` float32, by how many standard deviations the tissue in each region of the picture moves
@@ -57,6 +67,8 @@ class Track:
     motion: float = float("nan")
     quality: float = float("nan")
     nonrigidity: np.ndarray | None = None
+    depth_ratio: float = float("nan")
+    rotation: np.ndarray | None = None
 
     @property
     def moving(self) -> tuple[float, float, float]:
@@ -72,6 +84,12 @@ class Track:
             return share, np.nan, np.nan
         y, x = (np.argwhere(moves).mean(0) + 0.5) / moves.shape
         return share, float(x), float(y)
+
+
+def exposure_words(frame: Frame) -> str:
+    """Return in words that most of an image is dark or overexposed; "" where it is neither."""
+    low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
+    return TOO_DARK if middle < _DARK_LEVEL else TOO_BRIGHT if low > _BRIGHT_LEVEL else ""
 
 
 class FrameTracker(Protocol):

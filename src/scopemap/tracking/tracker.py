@@ -14,12 +14,12 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
 from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes, Relocaliser
+from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes, Relocaliser, depth_ratio, is_wall
 from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
-from scopemap.tracking.track import RELOCALISED, TOO_BRIGHT, TOO_DARK, Status, Track
+from scopemap.tracking.track import RELOCALISED, UNCONFIRMED, WALL, Status, Track, exposure_words
 
 _MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and more
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
@@ -31,7 +31,6 @@ _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
 _SEEN_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
 _CLEAR, _PATIENCE = 0.8, 3  # of the best quality since the keyframe: below it the next one waits so many frames more
-_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 
 
@@ -61,7 +60,7 @@ class Tracker:
         self._frames_since_keyframe = 0
         self._frames_lost = self._sharp_frames_lost = 0
         self._agreement: list[float] = []
-        self._is_unsharp = False
+        self._is_unsharp = self._met_wall = False
         self._quality = self._best_quality = 0.0
         self._coverage = 1.0
         self._passed = PassedKeyframes()
@@ -77,7 +76,7 @@ class Tracker:
         if usable < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
             return replace(
-                self._lost(frame, f"only {usable:.0%} of the image is usable{_exposure(frame)}"), usable=usable
+                self._lost(frame, f"only {usable:.0%} of the image is usable{exposure_words(frame)}"), usable=usable
             )
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
@@ -102,6 +101,10 @@ class Tracker:
         obscured = self._is_obscured(sharpness, alignment)
         rejected, reason = self._reject_reason(self._keyframe, alignment), ""
         failed, is_weak = obscured or bool(rejected), self._coverage < _WEAK_COVERAGE
+        if failed and is_wall(frame, self._keyframe):
+            self._met_wall, unsharp, rejected = True, f"{WALL}, {unsharp}", rejected and f"{WALL}, {rejected}"
+        elif self._met_wall and not failed and self.settings.relocalisation_keyframes:
+            failed, rejected = True, UNCONFIRMED
         if failed or is_weak or self._frames_lost:
             found = self._found(frame, pyramid, sharpness, failed=failed)
             if found is not None and (failed or found[1].agreement > alignment.agreement):
@@ -113,7 +116,8 @@ class Tracker:
             return self._lost(frame, unsharp, alignment)
         if rejected:
             self._sharp_frames_lost += 1
-            if self._sharp_frames_lost > self.settings.new_map_after > 0 and not self._is_unsharp:
+            after = self.settings.new_map_after * (2 if self._met_wall else 1)
+            if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
                 return self._new_map(frame)
             return self._lost(frame, f"rejected: {rejected}", alignment)
         return self._accept(frame, self._keyframe, alignment, reason)
@@ -337,13 +341,15 @@ class Tracker:
             # The last pose is in another world.
             self._enter_map(keyframe.map)
             self._T_world_last = T_world_camera
+        ratio = depth_ratio(keyframe, frame, T_world_camera) if self._met_wall else float("nan")
+        self._met_wall = False
         T_step = inverse(self._T_world_last) @ T_world_camera
         # After lost frames the step is that of several: its share of one.
         self._T_step = mean_near(np.eye(4), [T_step], [1 / (1 + self._frames_lost)])
         self._T_world_last, self._frames_lost, self._sharp_frames_lost = T_world_camera, 0, 0
         self._frames_of_map[self._map] += 1
         self._agreement.append(alignment.agreement)
-        return _track_of(frame.index, "ok", reason, T_world_camera, keyframe, alignment)
+        return replace(_track_of(frame.index, "ok", reason, T_world_camera, keyframe, alignment), depth_ratio=ratio)
 
     def _lost(self, frame: Frame, reason: str, alignment: Alignment | None = None) -> Track:
         self._frames_lost += 1
@@ -356,7 +362,7 @@ class Tracker:
         """Begin a new map with this frame; its relative pose to the other maps is unknown."""
         self._enter_map(self._map_count)
         self._map_count += 1
-        self._keyframe, self._T_world_last, self._T_step = None, np.eye(4), np.eye(4)
+        self._keyframe, self._T_world_last, self._T_step, self._met_wall = None, np.eye(4), np.eye(4), False
         self._frames_lost = self._sharp_frames_lost = 0
         return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._map)
 
@@ -364,12 +370,6 @@ class Tracker:
         self._passed.clear()
         self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
-
-
-def _exposure(frame: Frame) -> str:
-    """Return in words that most of an image is dark or overexposed."""
-    low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
-    return TOO_DARK if middle < _DARK_LEVEL else TOO_BRIGHT if low > _BRIGHT_LEVEL else ""
 
 
 def _T_world_camera(keyframe: Keyframe, alignment: Alignment) -> np.ndarray:

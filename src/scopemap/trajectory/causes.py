@@ -9,7 +9,7 @@ FAST_MOTION = 0.03
 """Median flow between two frames, share of the width, beyond which a frame is lost for its motion."""
 
 NOT_FOUND_AGAIN = "not found again"
-_UNSHARP, _NO_TEXTURE = "usual sharpness", "hardly any texture"
+_UNSHARP, _NO_TEXTURE, _WALL = "usual sharpness", "hardly any texture", "the wall fills the picture"
 
 ADVICE = {
     "fast motion": "turn and withdraw more slowly, and record all frames: none left out, as many a second as possible",
@@ -18,6 +18,7 @@ ADVICE = {
     "too dark": "go nearer, or turn the light up",
     "overexposed": "withdraw from the wall until it is no longer white",
     "view covered": "withdraw from the wall, or take out of the view what covers it",
+    "contact with the wall": "withdraw from the wall, until the lumen or a fold is in view again",
     "no texture": "keep folds or vessels in view; near a bare wall there is nothing to follow",
     "view changed": "hold the camera still while tissue or instruments move, or the wall fills the picture",
     NOT_FOUND_AGAIN: "go back to where the camera was before the loss, and look from a similar angle",
@@ -57,6 +58,8 @@ def causes_of_loss(frames: Sequence[TrackedFrame]) -> list[str]:
 def _cause(reason: str, is_fast: bool, before: str) -> str:
     if "of the image is usable" in reason:
         return next((word for word in ("too dark", "overexposed") if word in reason), "view covered")
+    if _WALL in reason:
+        return "contact with the wall"
     if _UNSHARP in reason:
         return "motion blur" if is_fast else "smoke, fluid or out of focus"
     if _NO_TEXTURE in reason:

@@ -14,8 +14,10 @@ from scopemap.errors import check_shape
 Unit = Literal["mm", "m"]
 OTHER_MAP: Final = "other-map"
 """Status of a frame that was tracked, in another submap than the one asked about: it has no pose in this one."""
+ROTATION_ONLY: Final = "rotation-only"
+"""Status of a frame that is lost but for its rotation, since a wall fills the picture: it has no position."""
 TRACKED = ("initial", "ok")
-STATUSES = (*TRACKED, "lost", OTHER_MAP)
+STATUSES = (*TRACKED, "lost", OTHER_MAP, ROTATION_ONLY)
 SKIPPED = "skipped"
 """Status in frames.csv of a frame that a run left out; such a frame is in no trajectory."""
 ASSUMED_FRAMES_PER_S = 30.0
@@ -27,8 +29,10 @@ class Trajectory:
     """Camera poses over time; frames without a pose stay in it.
 
     indices : (N,) int64 frame numbers, ascending. times_s : (N,) float64, s; index / 30 where the file gave none.
-    T_world_camera : (N, 4, 4) float64 camera-to-world, mm, OpenCV axes; NaN where the frame is not tracked.
-    status : (N,) of str: "initial", "ok", "lost", or "other-map" for a frame that is tracked in another submap.
+    T_world_camera : (N, 4, 4) float64 camera-to-world, mm, OpenCV axes; NaN where the frame is not tracked, but for
+        the rotation where that was followed.
+    status : (N,) of str: "initial", "ok", "lost", "other-map" for a frame that is tracked in another submap, or
+        "rotation-only" for one that is lost but for its rotation.
     has_indices : False where the file gave only times; `indices` then are row numbers and match nothing.
     source : what was read, and the convention and unit that were stated or assumed; empty where nothing was read.
     others : the other submaps, each in a world and a scale of its own.

@@ -1,9 +1,9 @@
 // Curves over the frames, linked with the slider, and the strip that shows where the camera was lost.
 
-const LOST = -1, OTHER_MAP = -2, NOT_USED = -3;
+const LOST = -1, OTHER_MAP = -2, NOT_USED = -3, ROTATED = -4;
 const LINE_COLOURS = { light: ["#1c5fb0", "#c2410c", "#157347"], dark: ["#7db4ff", "#ff9d66", "#58d093"] };
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const kindOf = (place) => (place === 0 ? "in" : place > 0 || place === OTHER_MAP ? "other" : place === LOST ? "lost" : "skipped");
+const kindOf = (place) => (place === 0 ? "in" : place > 0 || place === OTHER_MAP ? "other" : place === LOST ? "lost" : place === ROTATED ? "rotated" : "skipped");
 
 // Return [first, last, kind] of each stretch of frames of one kind.
 function stretches(places) {
@@ -26,7 +26,7 @@ function sharpCanvas(canvas) {
 
 function drawStrip(canvas, run) {
   const { context, width, height } = sharpCanvas(canvas), count = Math.max(run.places.length, 1);
-  const colours = { in: style("--in"), other: style("--other"), lost: style("--lost"), skipped: style("--line") };
+  const colours = { in: style("--in"), other: style("--other"), lost: style("--lost"), rotated: style("--rotated"), skipped: style("--line") };
   for (const [first, last, kind] of stretches(run.places)) {
     context.fillStyle = colours[kind];
     context.fillRect((first / count) * width, 0, Math.max(1, ((last + 1 - first) / count) * width), height);
@@ -118,7 +118,7 @@ class Curve {
     context.globalAlpha = 0.2;
     for (const [first, last, kind] of stretches(this.run.places)) {
       if (kind === "in") continue;
-      context.fillStyle = style(kind === "lost" ? "--lost" : kind === "other" ? "--other" : "--soft");
+      context.fillStyle = style(kind === "lost" ? "--lost" : kind === "rotated" ? "--rotated" : kind === "other" ? "--other" : "--soft");
       context.fillRect(x(first) - 0.5, 0, Math.max(1, x(last) - x(first) + 1), height);
     }
     context.globalAlpha = 1;

@@ -11,11 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scopemap.errors import InputError, reporting
 from scopemap.trajectory.formats.poses import rigid, stamped
 from scopemap.trajectory.formats.text import read_numbers, tum_poses
-from scopemap.trajectory.trajectory import MM_PER_UNIT, SKIPPED, STATUSES, TRACKED, Trajectory, Unit
+from scopemap.trajectory.trajectory import MM_PER_UNIT, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory, Unit
 
 _SAME_TIME_S = 2e-3
 
@@ -63,7 +64,12 @@ def _read_run_submap(folder: Path) -> Trajectory:
     poses, words = tum_poses(table, "mm")
     T = np.full((len(indices), 4, 4), np.nan)
     T[tracked] = poses
-    return replace(stamped(T, indices, times_s, f"run of scopemap, camera-to-world, {words}"), status=status)
+    found = replace(stamped(T, indices, times_s, f"run of scopemap, camera-to-world, {words}"), status=status)
+    for place in np.flatnonzero(status == ROTATION_ONLY):
+        with reporting(f"cannot read {path}: the orientation of frame {indices[place]} is no quaternion"):
+            quaternion = [float(number) for number in rows[place]["orientation"].split()]
+            found.T_world_camera[place, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return found
 
 
 def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:
