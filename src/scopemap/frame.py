@@ -46,6 +46,8 @@ class Frame:
     weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
     quality : what the picture is worth beside those of recent frames, 0..1, as `PictureQuality` has it.
     instruments : (H, W) bool, where the depth network found some, which `valid` leaves out; None: not looked for.
+    depth_scale : factor of the estimated depth by which it agrees with the frames before, as `depth.mapis` finds it; 1
+    where the estimator knows no scale, as of disparity.
     """
 
     index: int
@@ -62,6 +64,7 @@ class Frame:
     weight: np.ndarray | None = None
     instruments: np.ndarray | None = None
     quality: float = 1.0
+    depth_scale: float = 1.0
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

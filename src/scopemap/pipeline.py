@@ -214,6 +214,8 @@ class Pipeline:
         refined = refined or self._refine(preprocessed, motion_between(last, track))
         frame = _with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
         frame = replace(frame, nonrigidity=track.nonrigidity)
+        if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
+            frame = replace(frame, depth_scale=refined.scale)
         self._add_last_keyframe(track)
         track = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":

@@ -24,12 +24,12 @@ from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
     depth_disagreement,
     depth_grid,
-    fit_depth_correction,
+    fit_depth_corrections,
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
-from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
+from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
 from scopemap.tracking.features import FeatureDetector
@@ -82,8 +82,8 @@ class Backend:
     """Takes keyframes one by one, and returns the correction of all frames.
 
     Feature tracks and loop closures are computed in a thread of their own; no other thread may use `flow` meanwhile.
-    Loop closures between maps merge them. A pose graph spreads all loop closures over the keyframes before bundle
-    adjustment. table : where observations are kept until then.
+    Loop closures between maps merge them. The scale's drift is removed, and a pose graph spreads all loop closures over
+    the keyframes, before bundle adjustment. table : where observations are kept until then.
     """
 
     def __init__(
@@ -96,6 +96,8 @@ class Backend:
         self.settings = settings.advanced
         self._frames: list[int] = []
         self._tracked: list[TrackedPose] = []
+        self._log_scales: list[float] = []
+        self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
         self._tracks = FeatureTracks(settings, flow, table)
         self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
@@ -129,6 +131,7 @@ class Backend:
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
         self._tracked.append(tracked)
+        self._log_scales.append(math.log(keyframe.depth_scale))
         grid = depth_grid(keyframe.depth_mm, keyframe.valid)
         self._depths_mm.append(grid.ravel())
         self._grid_shape = grid.shape
@@ -186,7 +189,12 @@ class Backend:
         self._close_loops_between_maps()
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
-        found = alone = self._adjusted(worlds, map_number)
+        # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
+        for share in (1.0, 0.0) if any(self._log_scales) else (0.0,):
+            self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
+            found = alone = self._adjusted(worlds, map_number)
+            if not alone.correction.refused:
+                break
         others = [*self._merged(map_number, allowed)][1:]
         # All maps at once if they fit; else one by one, because a single one may not fit.
         for some in (others, *([number] for number in others if len(others) > 1)):
@@ -221,10 +229,15 @@ class Backend:
         points, _ = self._tracks.collected(np.flatnonzero(np.array(map_of) == map_number))
         if len(set(map_of)) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
-        T_world_camera = np.stack([pose.T_world_camera for pose in self._tracked])
-        found = map(Loop.of_row, self._loops.read())
-        loops = [loop for loop in found if map_of[loop.past] in allowed and map_of[loop.new] in allowed]
-        return merge_maps(T_world_camera, map_of, loops, map_number, _median_depth_mm(points))
+        chosen = [k for k, number in enumerate(map_of) if number in {map_number, *allowed}]
+        some = [map_of[k] for k in chosen]
+        loops = self._loops_among(chosen, -self._path.drift[chosen])
+        return merge_maps(self._path.T_world_camera[chosen], some, loops, map_number, _median_depth_mm(points))
+
+    def _loops_among(self, chosen: list[int], log_unit: np.ndarray) -> list[Loop]:
+        """Return the loops between these keyframes, numbered by their place; log_unit as `Loop.among` takes it."""
+        among, found = set(chosen), map(Loop.of_row, self._loops.read())
+        return [loop.among(chosen, log_unit) for loop in found if {loop.past, loop.new} <= among]
 
     def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> _Adjusted:
         """Return the bundle adjustment of all keyframes of maps with these Sim(3) to the common world."""
@@ -248,13 +261,12 @@ class Backend:
 
         graph = problem.tracked if problem.start is None else problem.start
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
-        index = np.array([self._frames[k] for k in chosen])
-        correction = _no_correction(index, found, refused)
+        correction = _no_correction(np.array(self._frames)[chosen], found, refused)
         if not refused:
-            correction = _correction(index, problem, found, loops, fields)
+            correction = replace(self._correction(chosen, worlds, found), loops=loops, depth_fields=fields)
         elif len(worlds) > 1 and problem.start is not None:
-            by_graph = _correction(index, problem, replace(found, state=graph), len(accepted), ())
-            correction = replace(by_graph, sigma_px=found.sigma_px, refused=refused)
+            by_graph = self._correction(chosen, worlds, replace(found, state=graph))
+            correction = replace(by_graph, loops=len(accepted), sigma_px=found.sigma_px, refused=refused)
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
         main_px, support = within[list(worlds).index(main)], _support(accepted, map_of, main)
@@ -265,8 +277,9 @@ class Backend:
     ) -> tuple[BundleProblem, np.ndarray]:
         """Return the bundle adjustment of chosen keyframes, from the pose graph, and that's accepted loops (A, 2)."""
         settings, own = self.settings, [self._tracked[k] for k in chosen]
-        T_world_camera = np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
-        log_unit = np.log([worlds[pose.map].scale for pose in own])
+        T_own, unit = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in own]
+        T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(unit, T_own, strict=True)])
+        log_unit = np.log([S.scale for S in unit]) - self._path.drift[chosen]
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         rotation_rad = math.radians(settings.rotation_sigma_deg)
@@ -281,8 +294,7 @@ class Backend:
             camera.fx,
             correlated=settings.correlated_observations,
         )
-        among, found = set(chosen), map(Loop.of_row, self._loops.read())
-        loops = [loop.among(chosen, log_unit) for loop in found if {loop.past, loop.new} <= among]
+        loops = self._loops_among(chosen, log_unit)
         if not loops:
             return problem, np.zeros((0, 2), int)
         graph = optimise_pose_graph(T_world_camera, pairs, loops, _median_depth_mm(points))
@@ -290,19 +302,39 @@ class Backend:
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted
 
+    def _as_tracked(self, chosen: list[int], worlds: Mapping[int, Similarity]) -> np.ndarray:
+        """Return the poses (C, 4, 4) of chosen keyframes as tracked, in the common world."""
+        own = [self._tracked[k] for k in chosen]
+        return np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
+
+    def _correction(
+        self, chosen: list[int], worlds: Mapping[int, Similarity], found: BundleSolution
+    ) -> FrameCorrection:
+        """Return the correction by a solution of chosen keyframes."""
+        state, index = found.state, np.array(self._frames)[chosen]
+        T_world_world = inverse(state.T_camera_world) @ inverse(self._as_tracked(chosen, worlds))
+        depth_mm = float(np.exp(np.median(state.log_depth))) if len(state.log_depth) else 1.0
+        log_scale = state.log_scale - self._path.drift[chosen]
+        return FrameCorrection(index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
+
     def _judged(
         self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
     ) -> tuple[str, tuple[DepthCorrectionField, ...]]:
         """Return why a solution is refused, "" where it is not, and its depth correction fields."""
         if refused := contradiction(problem.points, found, self.settings):
             return f"the scene is not rigid or the focal length is wrong: {refused}", ()
-        fields = self._depth_fields(problem.points, found) if self.settings.depth_step_sigma > 0 else ()
-        return self._depth_contradiction(chosen, problem, found, fields, worlds), fields
+        fields: tuple[DepthCorrectionField, ...] = ()
+        if (step_sigma := self.settings.depth_step_sigma) > 0:
+            assert self._camera is not None
+            points, drift = problem.points, self._path.drift[chosen]
+            as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
+            error = (_depth_change(points, found), found.log_depth_sigma)
+            fields = fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
+        return self._depth_contradiction(chosen, found, fields, worlds), fields
 
     def _depth_contradiction(
         self,
         chosen: list[int],
-        problem: BundleProblem,
         found: BundleSolution,
         fields: tuple[DepthCorrectionField, ...],
         worlds: Mapping[int, Similarity],
@@ -311,30 +343,18 @@ class Backend:
         assert self._camera is not None
         grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
         before = [np.float32(worlds[self._tracked[k].map].scale) * grids[k] for k in chosen]
-        after = [np.exp(scale) * grid for scale, grid in zip(found.state.log_scale, before, strict=True)]
+        log_scale = found.state.log_scale - self._path.drift[chosen]
+        after = [np.exp(scale) * grid for scale, grid in zip(log_scale, before, strict=True)]
         if fields:
             factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
             after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
-        both = ((problem.T_camera_world, before), (found.state.T_camera_world, after))
+        both = ((self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after))
         gaps = self.settings.keyframe_gaps
-        tracked, adjusted = (depth_disagreement(self._camera, inverse(T), grids, gaps) for T, grids in both)
+        tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
                 return f"depths of keyframes would disagree by {100 * now:.0f} %, as tracked by {100 * was:.0f} %"
         return ""
-
-    def _depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
-        """Fit the depth correction field of each keyframe to its adjusted points."""
-        camera, fields = self._camera, []
-        assert camera is not None
-        error = _depth_change(points, found)
-        pixels = points.pixel * [1.0, camera.fy / camera.fx] + [camera.cx, camera.cy]
-        position = (pixels + 0.5) / [camera.width, camera.height]
-        for k in range(len(found.state.T_camera_world)):
-            own = slice(*np.searchsorted(points.host, (k, k + 1)))
-            data = (position[own], points.log_depth[own], error[own], found.log_depth_sigma[own])
-            fields.append(fit_depth_correction(*data, self.settings.depth_step_sigma))
-        return tuple(fields)
 
 
 def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
@@ -346,26 +366,6 @@ def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
         own = map_of[ends] == number
         least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
     return min(least, default=0)
-
-
-def _correction(
-    index: np.ndarray,
-    problem: BundleProblem,
-    found: BundleSolution,
-    loops: int,
-    fields: tuple[DepthCorrectionField, ...],
-) -> FrameCorrection:
-    """Return the correction by a solution of the keyframes with these numbers of frames, (K,)."""
-    points, state = problem.points, found.state
-    return FrameCorrection(
-        index,
-        inverse(state.T_camera_world) @ problem.T_camera_world,
-        state.log_scale,
-        found.sigma_px,
-        loops=loops,
-        depth_fields=fields,
-        depth_mm=_median_depth_mm(points) if len(points.log_depth) else 1.0,
-    )
 
 
 def _no_correction(index: np.ndarray, found: BundleSolution, refused: str) -> FrameCorrection:

@@ -21,6 +21,7 @@ from scipy import sparse
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.mapping.reprojection import Points
 
 ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
 MAX_LOG_FACTOR = 0.7
@@ -91,6 +92,21 @@ def fit_depth_correction(
         residual = at @ values - target
         weight = 1 / (variance + (residual / _CAUCHY) ** 2)
     return DepthCorrectionField(np.clip(values, -MAX_LOG_FACTOR, MAX_LOG_FACTOR).reshape(_SHAPE), nearest, farthest)
+
+
+def fit_depth_corrections(
+    camera: PinholeCamera, points: Points, count: int, error: np.ndarray, sigma: np.ndarray, step_sigma: float
+) -> tuple[DepthCorrectionField, ...]:
+    """Return the correction field of each of `count` keyframes, which are the hosts of points.
+
+    error, sigma : (P,), as for `fit_depth_correction`. Points have the depth as estimated.
+    """
+    pixels = points.pixel * [1.0, camera.fy / camera.fx] + [camera.cx, camera.cy]
+    position, fields = (pixels + 0.5) / [camera.width, camera.height], []
+    for k in range(count):
+        own = slice(*np.searchsorted(points.host, (k, k + 1)))
+        fields.append(fit_depth_correction(position[own], points.log_depth[own], error[own], sigma[own], step_sigma))
+    return tuple(fields)
 
 
 def depth_grid(depth_mm: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -9,6 +9,11 @@ millimetres of i's depth and the ratio exp(r_ij) of their depth scales:
 
 Edges are the tracked motions (r = 0) and the loop closures. Cauchy's loss makes false loops and tracking failures
 outliers. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
+
+Loop closures tell drift of the scale where the camera comes back. Along new places the network tells it: each frame's
+depth takes its scale from the one before (`depth/mapis.py`), whose errors add up, while the network's own scale is
+noisy from frame to frame but does not drift. ln of the chained scale over the network's is the drift plus that noise;
+the drift changes slowly, and is its smooth part (Whittaker, "On a new method of graduation", 1923).
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.sparse import lil_matrix
+from scipy.sparse import identity, lil_matrix
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from scopemap.geometry.se3 import inverse, se3
@@ -35,6 +41,16 @@ _MAX_EVALUATIONS = 20
 _MAX_LOOP_ERROR = 3.0  # root mean square, in standard deviations, of an accepted loop
 # A loop whose error as tracked exceeds this share of path length plus depth cannot be drift.
 _MAX_DRIFT_SHARE = 0.5
+# Standard deviations, ln: of the network's scale at a keyframe, many of which err alike, of the drift from one keyframe
+# to the next, and of the change of that drift.
+_NETWORK_SIGMA, _DRIFT_SIGMA, _CHANGE_SIGMA = 0.2, 0.05, 0.002
+
+
+class PathWithoutDrift(NamedTuple):
+    """Keyframes without the drift of their scale: ln of the drift (K,), and T_world_camera (K, 4, 4), by map."""
+
+    drift: np.ndarray
+    T_world_camera: np.ndarray
 
 
 class PoseGraph(NamedTuple):
@@ -56,6 +72,35 @@ class _Edges(NamedTuple):
     T: np.ndarray  # T_i_j
     log_ratio: np.ndarray
     sigma: np.ndarray  # (E, 7)
+
+
+def path_without_drift(tracked: Sequence[TrackedPose], log_scale: np.ndarray) -> PathWithoutDrift:
+    """Return the path without the drift of the scale along each map, whose first keyframe keeps pose and scale.
+
+    log_scale : (K,) ln of the factor by which each keyframe's estimated depth was scaled, `Frame.depth_scale`. The
+    translation from each keyframe to the next, and its depth, are divided by the drift there.
+    """
+    T, map_of = np.stack([pose.T_world_camera for pose in tracked]), np.array([pose.map for pose in tracked])
+    drift = np.zeros(len(T))
+    for number in set(map_of.tolist()):
+        own = np.flatnonzero(map_of == number)
+        drift[own] = _scale_drift(log_scale[own])
+        factor = np.exp(-(drift[own[1:]] + drift[own[:-1]]) / 2)
+        steps_mm = factor[:, None] * np.diff(T[own, :3, 3], axis=0)
+        T[own[1:], :3, 3] = T[own[0], :3, 3] + np.cumsum(steps_mm, axis=0)
+    return PathWithoutDrift(drift, T)
+
+
+def _scale_drift(log_scale: np.ndarray) -> np.ndarray:
+    """Return the most probable drift (K,), 0 at first: Whittaker's smoothing, by first and second differences."""
+    count = len(log_scale)
+    differences, normal = identity(count, format="csc"), identity(count, format="csc") / _NETWORK_SIGMA**2
+    for sigma in (_DRIFT_SIGMA, _CHANGE_SIGMA):
+        if differences.shape[0] > 1:
+            differences = differences[1:] - differences[:-1]
+            normal += differences.T @ differences / sigma**2
+    drift: np.ndarray = spsolve(normal.tocsc(), log_scale / _NETWORK_SIGMA**2)
+    return drift - drift[0]
 
 
 def tracked_pairs(frames: Sequence[int], tracked: Sequence[TrackedPose]) -> np.ndarray:
