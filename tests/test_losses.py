@@ -1,4 +1,4 @@
-"""Why frames are lost: the cause of each, stretches of them, and the advice."""
+"""Why frames are lost: the cause of each, segments of them, and the advice."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def run_of(causes: list[str | int]) -> KeptRun:
     return KeptRun(None, rows, [], np.array([cause if isinstance(cause, int) else LOST for cause in causes]))
 
 
-def test_stretches_have_the_cause_that_began_them() -> None:
+def test_segments_have_the_cause_that_began_them() -> None:
     again = "not found again"
     run = run_of([0, "fast motion", NOT_USED, again, again, 0, "too dark", OTHER_MAP, again, 0])
     found = losses(run)

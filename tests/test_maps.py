@@ -35,7 +35,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.phantom.spec import PhantomSpec
 from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
-from scopemap.report.pieces import pieces_in_time
+from scopemap.report.submap_summaries import submaps_in_time
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import RELOCALISED, Track
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -132,8 +132,8 @@ def test_the_summary_has_the_maps_in_order_of_time(result: Reconstruction) -> No
     assert line.index("maps/1 with") < line.index("the result with")
     assert f"maps/1 with {FIRST} frames (0 to {FIRST - 1}, " in line
     doubtful = next(line for line in summary_lines(result) if line.startswith("most doubtful map"))
-    pieces = {piece.name: piece.inlier_share for piece in pieces_in_time(result.kept())}
-    assert doubtful.startswith(f"most doubtful map: {min(pieces, key=lambda name: pieces[name])}, frames ")
+    submaps = {submap.name: submap.inlier_share for submap in submaps_in_time(result.kept())}
+    assert doubtful.startswith(f"most doubtful map: {min(submaps, key=lambda name: submaps[name])}, frames ")
 
 
 def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: Path, tmp_path: Path) -> None:

@@ -155,7 +155,7 @@ def test_a_lost_frame_says_so(browser: Any, report: Path) -> None:
     assert opened.page.locator("#rendered").get_attribute("aria-label") == "camera lost"
 
 
-def test_a_frame_without_a_picture_shows_one_of_its_own_piece(browser: Any, tmp_path: Path) -> None:
+def test_a_frame_without_a_picture_shows_one_of_its_own_submap(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     for index in (IN_RESULT, *range(IN_RESULT - 2, IN_RESULT)):
         picture_file(folder, index).unlink()  # then the nearest to the last of the result is of a lost frame
@@ -165,17 +165,17 @@ def test_a_frame_without_a_picture_shows_one_of_its_own_piece(browser: Any, tmp_
     assert opened.page.locator("#rendered").get_attribute("aria-label") != "camera lost"
 
 
-def test_another_piece_is_shown_by_its_frames_and_by_its_button(browser: Any, report: Path) -> None:
+def test_another_submap_is_shown_by_its_frames_and_by_its_button(browser: Any, report: Path) -> None:
     opened = Opened(browser, report)
-    pictures = [opened.picture(f"#piece-list button:nth-child({k}) canvas") for k in (1, 2)]
+    pictures = [opened.picture(f"#submap-list button:nth-child({k}) canvas") for k in (1, 2)]
     assert all(off(picture, LIGHT_GROUND).mean() > 0.1 for picture in pictures)
     opened.slide(FRAMES - 1)
-    assert opened.text("#piece").startswith("Piece 1")
-    assert opened.page.locator("#piece-list button").nth(1).get_attribute("aria-pressed") == "true"
-    opened.page.locator("#piece-list button").first.click()
+    assert opened.text("#submap").startswith("Submap 1")
+    assert opened.page.locator("#submap-list button").nth(1).get_attribute("aria-pressed") == "true"
+    opened.page.locator("#submap-list button").first.click()
     opened.wait("shown", "0")
-    assert opened.text("#piece") == "The result"
-    opened.page.locator("#piece-list button").nth(1).click()
+    assert opened.text("#submap") == "The result"
+    opened.page.locator("#submap-list button").nth(1).click()
     opened.wait("shown", str(FRAMES - IN_FIRST_MAP))
 
 

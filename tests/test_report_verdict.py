@@ -13,8 +13,8 @@ from drawn_run import GOOD_SURFACE, tube
 
 from scopemap.report import verdict as rules
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptMap, KeptRun
-from scopemap.report.pieces import doubt_words, most_doubtful, pieces_in_time
-from scopemap.report.verdict import longest_stretch, scale_is_known, verdict
+from scopemap.report.submap_summaries import doubt_words, most_doubtful, submaps_in_time
+from scopemap.report.verdict import longest_segment, scale_is_known, verdict
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
@@ -120,36 +120,36 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
 
 def test_lost_frames_and_other_maps_are_told_apart() -> None:
     texts = " ".join(reason.text for reason in verdict(run_of([0] * 90 + [LOST] * 4 + [OTHER_MAP] * 6)).reasons)
-    assert "6 more frames form pieces of their own" in texts
+    assert "6 more frames form submaps of their own" in texts
     assert "In 4 frames the camera could not be followed" in texts
     assert "Longest gap: 10 frames" in texts
 
 
-def run_of_pieces(*pieces: tuple[int, int, float]) -> KeptRun:
-    """A run of pieces: number of the map, its frames, and their inlier share; in the order of the frames."""
-    place = [number for number, frames, _ in pieces for _ in range(frames)]
-    shares = [share for _, frames, share in pieces for _ in range(frames)]
+def run_of_submaps(*submaps: tuple[int, int, float]) -> KeptRun:
+    """A run of submaps: number of the map, its frames, and their inlier share; in the order of the frames."""
+    place = [number for number, frames, _ in submaps for _ in range(frames)]
+    shares = [share for _, frames, share in submaps for _ in range(frames)]
     run = run_of(place)
     rows = [row | {"inlier_share": f"{share}"} for row, share in zip(run.rows, shares, strict=True)]
     return replace(run, rows=rows, maps=run.maps * (max(place) + 1))
 
 
-def test_pieces_are_in_order_of_time_and_the_worst_is_named() -> None:
-    run = run_of_pieces((2, 20, 0.7), (0, 50, 0.9), (1, 30, 0.55))
-    pieces = pieces_in_time(run)
-    assert [(piece.name, piece.first, piece.last) for piece in pieces] == [
+def test_submaps_are_in_order_of_time_and_the_worst_is_named() -> None:
+    run = run_of_submaps((2, 20, 0.7), (0, 50, 0.9), (1, 30, 0.55))
+    submaps = submaps_in_time(run)
+    assert [(submap.name, submap.first, submap.last) for submap in submaps] == [
         ("maps/2", 0, 19),
         ("the result", 20, 69),
         ("maps/1", 70, 99),
     ]
     texts = [reason.text for reason in verdict(run).reasons]
-    assert "Most doubtful of the pieces is maps/1, frames 70 to 99, with 55% inliers against 70% to 90%." in texts
-    assert most_doubtful(pieces) is pieces[2]
+    assert "Most doubtful of the submaps is maps/1, frames 70 to 99, with 55% inliers against 70% to 90%." in texts
+    assert most_doubtful(submaps) is submaps[2]
 
 
-def test_one_piece_is_not_compared() -> None:
-    assert doubt_words(pieces_in_time(run_of_pieces((0, 50, 0.2)))) == ""
-    assert doubt_words(pieces_in_time(run_of_pieces((0, 50, 0.2), (1, 20, float("nan"))))) == ""
+def test_one_submap_is_not_compared() -> None:
+    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2)))) == ""
+    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2), (1, 20, float("nan"))))) == ""
     assert "doubtful" not in " ".join(reason.text for reason in verdict(run_of([0] * 50)).reasons)
 
 
@@ -166,10 +166,10 @@ def test_scale_is_known_where_it_is_measured_or_anchored() -> None:
     assert "scale known" in verdict(run_of([0] * 50, estimators={"anchor": "measured depth"})).sentence
 
 
-def test_the_longest_stretch() -> None:
-    assert longest_stretch(np.array([1, 1, 0, 1, 1, 1, 0], bool)) == 3
-    assert longest_stretch(np.zeros(4, bool)) == 0
-    assert longest_stretch(np.zeros(0, bool)) == 0
+def test_the_longest_segment() -> None:
+    assert longest_segment(np.array([1, 1, 0, 1, 1, 1, 0], bool)) == 3
+    assert longest_segment(np.zeros(4, bool)) == 0
+    assert longest_segment(np.zeros(0, bool)) == 0
 
 
 def test_the_document_states_the_thresholds() -> None:

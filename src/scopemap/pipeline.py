@@ -340,14 +340,14 @@ class _Faults:
 
 def _warnings(stages: tuple[_Faults, ...]) -> list[str]:
     """Return in words what the stages could not process."""
-    failed, blind, said = sum(faults.failed for faults in stages), sum(faults.without_depth for faults in stages), []
+    failed, blind, found = sum(faults.failed for faults in stages), sum(faults.without_depth for faults in stages), []
     if failed:
         first = "frame {}, {}".format(*min(faults.first for faults in stages if faults.failed))
-        said.append(f"{failed} frame(s) could not be processed whole (first: {first})")
+        found.append(f"{failed} frame(s) could not be processed whole (first: {first})")
     if blind:
         first_blind = next(faults.first_without_depth for faults in stages if faults.without_depth)
-        said.append(f"{blind} frame(s) got no depth from the network (first: frame {first_blind})")
-    return said
+        found.append(f"{blind} frame(s) got no depth from the network (first: frame {first_blind})")
+    return found
 
 
 def _with_depth(frame: Frame, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> Frame:

@@ -35,7 +35,7 @@ from scopemap.io.frame_choice import SkippedFrame
 from scopemap.pipeline import Step
 from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
-from scopemap.report.losses import LostStretch, losses
+from scopemap.report.losses import LostSegment, losses
 from scopemap.report.page_data import shown_meshes
 from scopemap.report.summary_picture import summary_picture
 from scopemap.report.verdict import verdict
@@ -210,8 +210,8 @@ class Reconstruction:
         return KeptRun(None, rows, maps, places.astype(np.int64), self.provenance)
 
     @property
-    def losses(self) -> list[LostStretch]:
-        """The stretches of lost frames, with their causes."""
+    def losses(self) -> list[LostSegment]:
+        """The segments of lost frames, with their causes."""
         return losses(self.kept())
 
     @property

@@ -123,10 +123,10 @@ def batch(
 
         with _lines(silent=quiet or as_json) as show:
 
-            def told(row: BatchRow, left: int) -> None:
+            def shown(row: BatchRow, left: int) -> None:
                 show(row.folder, _row_line(row), left, row.status == "started")
 
-            rows = run_batch(videos, out, limits, engine=run, overwrite=overwrite, part=of_part, told=told)
+            rows = run_batch(videos, out, limits, engine=run, overwrite=overwrite, part=of_part, on_change=shown)
     if as_json:
         print_json([asdict(row) for row in rows])
     elif not quiet:
@@ -234,10 +234,10 @@ def _forecast(videos: list[Video], out: Path, limits: Any, engine: Engine, *, as
 
     with _lines(silent=quiet or as_json) as show:
 
-        def told(one: Forecast, left: int) -> None:
+        def shown(one: Forecast, left: int) -> None:
             show(one.name, _forecast_line(one), left, False)
 
-        found = forecast(videos, out, limits, told, engine)
+        found = forecast(videos, out, limits, shown, engine)
     if as_json:
         print_json([asdict(one) for one in found])
     elif not quiet:

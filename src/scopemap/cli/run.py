@@ -28,7 +28,7 @@ from scopemap.cli.progress import run_progress
 if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.reconstruction import Reconstruction
-    from scopemap.report.pieces import Piece
+    from scopemap.report.submap_summaries import SubmapSummary
 
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
@@ -216,7 +216,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
     from scopemap.reconstruction import scale_words
-    from scopemap.report.pieces import doubt_words, pieces_in_time
+    from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
     facts, known = result.provenance, result.provenance["scale"]["known"]
     unit = " mm" if known else " (scale unknown)"
@@ -232,14 +232,14 @@ def summary_lines(result: Reconstruction) -> list[str]:
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
-        pieces = pieces_in_time(result.kept())
-        lines.append(f"maps in order of time: {', '.join(_map_words(piece) for piece in pieces)}")
-        lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(pieces)] if doubt]
+        submaps = submaps_in_time(result.kept())
+        lines.append(f"maps in order of time: {', '.join(_map_words(submap) for submap in submaps)}")
+        lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(submaps)] if doubt]
     lost = result.losses
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
     lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
-        lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter stretches, see frames.csv")
+        lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter segments, see frames.csv")
     return lines + [f"note: {note}" for note in facts["notes"]]
 
 
@@ -270,9 +270,9 @@ def _counted(facts: dict[str, Any]) -> str:
     return ", ".join(parts + [f"{facts[key]} {words}" for key, words in others if facts[key]])
 
 
-def _map_words(piece: Piece) -> str:
-    facts = ", ".join(filter(None, (f"{piece.first} to {piece.last}", piece.inliers)))
-    return f"{piece.name} with {piece.frames} frames ({facts})"
+def _map_words(submap: SubmapSummary) -> str:
+    facts = ", ".join(filter(None, (f"{submap.first} to {submap.last}", submap.inliers)))
+    return f"{submap.name} with {submap.frames} frames ({facts})"
 
 
 def _surface(figures: dict[str, float]) -> str:

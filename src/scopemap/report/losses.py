@@ -1,4 +1,4 @@
-"""The stretches of a video in which the camera was lost: when, why, and what the one who films can do about it."""
+"""The segments of a video in which the camera was lost: when, why, and what the one who films can do about it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scopemap.trajectory.causes import ADVICE, NOT_FOUND_AGAIN
 
 
 @dataclass(frozen=True)
-class LostStretch:
+class LostSegment:
     """Successive frames that are lost: the rows and times of the first and the last, s, their number, and the cause."""
 
     first: int
@@ -37,19 +37,19 @@ class LostStretch:
         return f"{self.begin_s:.2f} s" if self.first == self.last else f"{self.begin_s:.2f} to {self.end_s:.2f} s"
 
 
-def losses(run: KeptRun) -> list[LostStretch]:
-    """Return the stretches of lost frames of a run, in order; frames that were not used do not end one."""
+def losses(run: KeptRun) -> list[LostSegment]:
+    """Return the segments of lost frames of a run, in order; frames that were not used do not end one."""
     used = [row for row in range(len(run.rows)) if run.place[row] != NOT_USED]
     found = []
     for is_lost, group in groupby(used, lambda row: run.place[row] in (LOST, ROTATED)):
         rows = list(group)
         if is_lost:
             begin_s, end_s = (float(run.rows[row]["time_s"]) for row in (rows[0], rows[-1]))
-            found.append(LostStretch(rows[0], rows[-1], begin_s, end_s, len(rows), _main_cause(run, rows)))
+            found.append(LostSegment(rows[0], rows[-1], begin_s, end_s, len(rows), _main_cause(run, rows)))
     return found
 
 
-def in_words(found: list[LostStretch]) -> str:
+def in_words(found: list[LostSegment]) -> str:
     """Return what most of the lost frames were lost by, with the advice; "" where nothing is known of it."""
     frames: Counter[str] = Counter()
     for loss in found:

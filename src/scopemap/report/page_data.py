@@ -18,8 +18,8 @@ from scopemap.io.datasets.reference import read_reference
 from scopemap.report.frame_pictures import mask_of
 from scopemap.report.kept_run import NOT_USED, KeptRun
 from scopemap.report.losses import losses
-from scopemap.report.pieces import most_doubtful, pieces_in_time
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
+from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.report.verdict import scale_is_known, scale_source, verdict
 from scopemap.trajectory.trajectory import Trajectory
 
@@ -178,9 +178,9 @@ def _maps(
     run: KeptRun, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
 ) -> list[dict[str, Any]]:
     """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers."""
-    found, pieces = [], pieces_in_time(run)
-    turn, worst = {piece.number: k for k, piece in enumerate(pieces)}, most_doubtful(pieces)
-    inliers = {piece.number: piece.inliers + ", most doubtful" * (piece is worst) for piece in pieces}
+    found, submaps = [], submaps_in_time(run)
+    turn, worst = {submap.number: k for k, submap in enumerate(submaps)}, most_doubtful(submaps)
+    inliers = {submap.number: submap.inliers + ", most doubtful" * (submap is worst) for submap in submaps}
     for number, (kept, mesh) in enumerate(zip(run.maps, meshes, strict=False)):
         pose_of = dict(zip(kept.indices.tolist(), kept.T_world_camera, strict=True))
         looking = [p for p in pictures if run.place[p.row] == number and p.depth_mm is not None]

@@ -1,5 +1,5 @@
 """The picture of summary.png: a run on one sheet: the verdict, frames, their depth, the surface with the path, and
-the pieces side by side where there are several.
+the submaps side by side where there are several.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scopemap.report.mesh_figures import (
     outside_views,
     view_from_behind,
 )
-from scopemap.report.pieces import Piece, most_doubtful, pieces_in_time
+from scopemap.report.submap_summaries import SubmapSummary, most_doubtful, submaps_in_time
 from scopemap.report.verdict import Verdict, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
@@ -118,24 +118,24 @@ def _mesh_row(run: KeptRun, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
 
 
 def _piece_rows(run: KeptRun, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
-    """Return the pieces of a run that has several, in order of time, in rows: each from outside with its path."""
-    pieces = pieces_in_time(run)
-    if len(pieces) < 2:
+    """Return the submaps of a run that has several, in order of time, in rows: each from outside with its path."""
+    submaps = submaps_in_time(run)
+    if len(submaps) < 2:
         return []
-    worst, shown = most_doubtful(pieces), {}
-    for piece in pieces:
-        if piece.number < len(meshes) and len(meshes[piece.number].faces):
-            poses = run.maps[piece.number].T_world_camera
-            view = outside_views(meshes[piece.number], poses[0], poses[:, :3, 3])["from outside"]
-            picture = mesh_picture(_opened(meshes[piece.number], view), view, smooth=False)
+    worst, shown = most_doubtful(submaps), {}
+    for submap in submaps:
+        if submap.number < len(meshes) and len(meshes[submap.number].faces):
+            poses = run.maps[submap.number].T_world_camera
+            view = outside_views(meshes[submap.number], poses[0], poses[:, :3, 3])["from outside"]
+            picture = mesh_picture(_opened(meshes[submap.number], view), view, smooth=False)
             draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR, thickness_px=2)
-            shown[_piece_title(piece, is_worst=piece is worst)] = _fitted(cropped(picture))
+            shown[_submap_title(submap, is_worst=submap is worst)] = _fitted(cropped(picture))
     titles = list(shown)
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
 
 
-def _piece_title(piece: Piece, *, is_worst: bool) -> str:
-    facts = [f"{piece.name}: frames {piece.first} to {piece.last}", piece.inliers, "most doubtful" * is_worst]
+def _submap_title(submap: SubmapSummary, *, is_worst: bool) -> str:
+    facts = [f"{submap.name}: frames {submap.first} to {submap.last}", submap.inliers, "most doubtful" * is_worst]
     return ", ".join(filter(None, facts))
 
 

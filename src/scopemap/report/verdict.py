@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, ROTATED, KeptRun
 from scopemap.report.losses import in_words, losses
-from scopemap.report.pieces import doubt_words, pieces_in_time
+from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
 Level = Literal["good", "doubtful", "bad", "note"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
@@ -90,7 +90,7 @@ def scale_source(provenance: dict[str, Any]) -> str:
     return str(scale["source"])
 
 
-def longest_stretch(outside: np.ndarray) -> int:
+def longest_segment(outside: np.ndarray) -> int:
     """Return the length of the longest run of True in (N,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(np.int8), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
@@ -122,7 +122,7 @@ def _of_frames(run: KeptRun) -> Reason:
     share = inside / max(used, 1)
     if inside < LEAST_FRAMES:
         return Reason("bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
-    lost_in_a_row = longest_stretch(run.place[run.place != NOT_USED] != 0)
+    lost_in_a_row = longest_segment(run.place[run.place != NOT_USED] != 0)
     longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
     until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
     text = f"{_percent(share)} of the frames{until} are in the result ({inside} of {used}).{longest}"
@@ -136,12 +136,12 @@ def _of_maps(run: KeptRun) -> list[Reason]:
     found = []
     if other:
         kept = len(run.maps) - 1
-        shown = f"; {kept} {'piece is' if kept == 1 else 'pieces are'} shown below" if kept else ""
-        text = f"After losses {other} more frames form pieces of their own: where they belong is unknown{shown}."
+        shown = f"; {kept} {'submap is' if kept == 1 else 'submaps are'} shown below" if kept else ""
+        text = f"After losses {other} more frames form submaps of their own: where they belong is unknown{shown}."
         found.append(Reason("note", text))
-    doubt = doubt_words(pieces_in_time(run))
+    doubt = doubt_words(submaps_in_time(run))
     if doubt:
-        found.append(Reason("note", f"Most doubtful of the pieces is {doubt}."))
+        found.append(Reason("note", f"Most doubtful of the submaps is {doubt}."))
     if lost:
         how = f" but for its rotation in {rotated}" if rotated else " at all"
         words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(run))}"

@@ -128,13 +128,13 @@ def run_batch(
     engine: Engine = run_in_processes,
     overwrite: bool = False,
     part: tuple[int, int] = (1, 1),
-    told: Callable[[BatchRow, int], None] = lambda row, left: None,
+    on_change: Callable[[BatchRow, int], None] = lambda row, left: None,
 ) -> list[BatchRow]:
     """Run videos and return a row for each; one whose folder holds its result already is not run again.
 
-    engine : what runs them. part : (k, n): of n parts only the k-th. told : called with the row of a video that begins
-    or ends, and how many are left. Writes batch.csv and index.html of all videos, and with a part a table of its own,
-    too. Raises `InputError` where `out` cannot be written, and what the engine does.
+    engine : what runs them. part : (k, n): of n parts only the k-th. on_change : called with the row of a video that
+    begins or ends, and how many are left. Writes batch.csv and index.html of all videos, and with a part a table of its
+    own, too. Raises `InputError` where `out` cannot be written, and what the engine does.
     """
     with reporting(f"cannot write a batch to {out}"):
         for folder in (RECORDS, LOGS):
@@ -145,12 +145,12 @@ def run_batch(
     left, written_s = len(due), time.monotonic()
     for row in rows.values():
         if row.status == "failed":
-            told(row, left)
+            on_change(row, left)
 
     def put(row: BatchRow) -> None:
         rows[row.folder] = row
         _write_record(row, out)
-        told(row, left)
+        on_change(row, left)
 
     def begin(number: int) -> None:
         put(replace(rows[due[number].name], status="started"))
@@ -211,16 +211,16 @@ def _row_before(video: Video, out: Path, *, overwrite: bool) -> BatchRow:
 def _row_after(row: BatchRow, outcome: Outcome, out: Path) -> BatchRow:
     """Return the row of a video whose process has ended it."""
     log = out / LOGS / f"{row.folder}.txt"
-    told = ""
+    where = ""
     if log.is_file():
         if log.stat().st_size:
-            told = f"; see {LOGS}/{log.name}"
+            where = f"; see {LOGS}/{log.name}"
         else:
             log.unlink()
     seconds = round(row.seconds + outcome.seconds, 3)
     if outcome.fault:
         tries = f" ({outcome.attempts} attempts)" if outcome.attempts > 1 else ""
-        return replace(row, status="failed", reason=outcome.fault + tries + told, seconds=seconds)
+        return replace(row, status="failed", reason=outcome.fault + tries + where, seconds=seconds)
     return replace(row, status="done", reason="", seconds=seconds, **outcome.value)
 
 

@@ -120,7 +120,7 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
         "depth files": folder if kind == "files" else "",
     }
     facts = {
-        # What is too large to be told by its content is told by its place.
+        # What is too large to be recognised by its content is recognised by its place.
         "input": content if "sha256" in content else content | {"path": str(sequence.path.resolve())},
         "frames": str(sequence.selection),
         "camera": f"{sequence.rectifier.source} at {sequence.camera.width}x{sequence.camera.height}",

@@ -51,12 +51,12 @@ def forecast(
     videos: Sequence[Video],
     out: Path,
     limits: ProcessLimits,
-    told: Callable[[Forecast, int], None] = lambda one, left: None,
+    on_change: Callable[[Forecast, int], None] = lambda one, left: None,
     engine: Engine = run_in_processes,
 ) -> list[Forecast]:
     """Return the forecast of each video; what is written meanwhile is removed.
 
-    engine : what runs their first seconds. told : called with each as it is found, and how many are left. Raises
+    engine : what runs their first seconds. on_change : called with each as it is found, and how many are left. Raises
     `InputError` where `out` cannot be written, and what the engine does.
     """
     is_new, found = not out.exists(), dict[int, Forecast]()
@@ -70,7 +70,7 @@ def forecast(
             video.forget_fetched(folder)
             known = outcome.value or {}
             found[number] = Forecast(video.name, outcome.fault, input_bytes=_bytes(video.path), **known)
-            told(found[number], len(videos) - len(found))
+            on_change(found[number], len(videos) - len(found))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         if is_new:

@@ -207,6 +207,6 @@ def _check_reached(address: str | None) -> None:
 
 def _cause_of_death(error: Exception) -> str:
     """Return what Ray says of an actor that died, in one line."""
-    said = " ".join(line.strip() for line in str(error).splitlines() if line and not line.startswith("\t"))
-    detail = re.search(r"exit detail: (.+?)\. (End of file|Some)", said)
-    return f"its process on Ray died: {(detail[1] if detail else said)[:200]}"
+    message = " ".join(line.strip() for line in str(error).splitlines() if line and not line.startswith("\t"))
+    detail = re.search(r"exit detail: (.+?)\. (End of file|Some)", message)
+    return f"its process on Ray died: {(detail[1] if detail else message)[:200]}"

@@ -153,8 +153,8 @@ def _with_rotations(records: list[FrameRecord]) -> list[FrameRecord]:
     relative to the last frame that was tracked, and turns with that.
     """
     out, T_world_last = list[FrameRecord](), None
-    for is_lost, stretch in groupby(records, lambda record: record.track.status == "lost"):
-        group = list(stretch)
+    for is_lost, segment in groupby(records, lambda record: record.track.status == "lost"):
+        group = list(segment)
         if not is_lost:
             T_world_last = group[-1].T_world_camera
         elif T_world_last is not None and any(WALL in record.track.reason for record in group):

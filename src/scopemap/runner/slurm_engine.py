@@ -102,8 +102,8 @@ def _outcome(job: Any, before: Outcome) -> tuple[Outcome, bool]:
         attempts, seconds = before.attempts + found.attempts, before.seconds + found.seconds
         return replace(found, attempts=attempts, seconds=seconds), False
     lines = [line.strip() for line in str(job.stderr() or "").splitlines() if line.strip()]
-    said = f"its job ended without a result ({job.state})" + (f": {lines[-1][:300]}" if lines else "")
-    return Outcome(None, said, before.seconds, before.attempts + 1), True
+    fault = f"its job ended without a result ({job.state})" + (f": {lines[-1][:300]}" if lines else "")
+    return Outcome(None, fault, before.seconds, before.attempts + 1), True
 
 
 def _cancel(jobs: list[Any]) -> None:

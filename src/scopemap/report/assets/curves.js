@@ -5,8 +5,8 @@ const LINE_COLOURS = { light: ["#1c5fb0", "#c2410c", "#157347"], dark: ["#7db4ff
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const kindOf = (place) => (place === 0 ? "in" : place > 0 || place === OTHER_MAP ? "other" : place === LOST ? "lost" : place === ROTATED ? "rotated" : "skipped");
 
-// Return [first, last, kind] of each stretch of frames of one kind.
-function stretches(places) {
+// Return [first, last, kind] of each segment of frames of one kind.
+function segments(places) {
   const found = [];
   for (let i = 0; i < places.length; i++) {
     const kind = kindOf(places[i]), last = found[found.length - 1];
@@ -27,7 +27,7 @@ function sharpCanvas(canvas) {
 function drawStrip(canvas, run) {
   const { context, width, height } = sharpCanvas(canvas), count = Math.max(run.places.length, 1);
   const colours = { in: style("--in"), other: style("--other"), lost: style("--lost"), rotated: style("--rotated"), skipped: style("--line") };
-  for (const [first, last, kind] of stretches(run.places)) {
+  for (const [first, last, kind] of segments(run.places)) {
     context.fillStyle = colours[kind];
     context.fillRect((first / count) * width, 0, Math.max(1, ((last + 1 - first) / count) * width), height);
   }
@@ -116,7 +116,7 @@ class Curve {
     const colours = LINE_COLOURS[document.documentElement.dataset.theme === "dark" ? "dark" : "light"];
     const x = (i) => 34 + (count > 1 ? (i / (count - 1)) * (width - 40) : 0);
     context.globalAlpha = 0.2;
-    for (const [first, last, kind] of stretches(this.run.places)) {
+    for (const [first, last, kind] of segments(this.run.places)) {
       if (kind === "in") continue;
       context.fillStyle = style(kind === "lost" ? "--lost" : kind === "rotated" ? "--rotated" : kind === "other" ? "--other" : "--soft");
       context.fillRect(x(first) - 0.5, 0, Math.max(1, x(last) - x(first) + 1), height);

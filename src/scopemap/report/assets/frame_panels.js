@@ -48,7 +48,7 @@ class FramePanels {
     this.lens = { width: this.size[0], height: this.size[1], fx: c.fx * sx, fy: c.fy * sy, cx: (c.cx + 0.5) * sx - 0.5, cy: (c.cy + 0.5) * sy - 0.5 };
   }
 
-  // Return the picture that is nearest in time, or null; one in another piece, or lost, counts as far.
+  // Return the picture that is nearest in time, or null; one in another submap, or lost, counts as far.
   nearest(row) {
     const { places, pictures, spacing } = this.run;
     const far = (picture) => Math.abs(picture.row - row) + (places[picture.row] === places[row] ? 0 : spacing);

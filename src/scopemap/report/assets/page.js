@@ -121,8 +121,8 @@ async function setRow(next) {
 function showMap(number) {
   shown = number;
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
-  put("piece", run.maps.length > 1 ? (number ? `Piece ${number}: where it lies is unknown` : "The result") : "");
-  document.querySelectorAll("#piece-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
+  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: where it lies is unknown` : "The result") : "");
+  document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
 
@@ -136,17 +136,17 @@ function writeLegend() {
   box.append(words[0], bar, words[1]);
 }
 
-function writePieces() {
-  element("pieces").hidden = run.maps.length < 2;
+function writeSubmaps() {
+  element("submaps").hidden = run.maps.length < 2;
   const buttons = run.maps.map((map, number) => {
     const button = document.createElement("button"), canvas = document.createElement("canvas"), first = run.places.indexOf(number);
     const note = document.createElement("small");
     button.type = "button";
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", number ? `Surface of piece ${number}` : "Surface of the result");
+    canvas.setAttribute("aria-label", number ? `Surface of submap ${number}` : "Surface of the result");
     note.textContent = [`${map.frames} frames, from ${run.times[Math.max(first, 0)].toFixed(1)} s on`, map.inliers].filter(Boolean).join(", ");
-    button.append(canvas, number ? `Piece ${number} (maps/${number})` : "The result", note);
+    button.append(canvas, number ? `Submap ${number} (maps/${number})` : "The result", note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
       const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius));
@@ -154,12 +154,12 @@ function writePieces() {
     }
     return button;
   });
-  element("piece-list").replaceChildren(...buttons.sort((one, other) => run.maps[one.dataset.map].turn - run.maps[other.dataset.map].turn));
+  element("submap-list").replaceChildren(...buttons.sort((one, other) => run.maps[one.dataset.map].turn - run.maps[other.dataset.map].turn));
 }
 
 const MOST_LOSSES = 12;
 
-// The longest stretches, in the order of the video.
+// The longest segments, in the order of the video.
 function writeLosses() {
   const all = run.losses, shortest = all.map((loss) => loss.frames).sort((a, b) => b - a)[MOST_LOSSES - 1] || 0;
   const kept = all.filter((loss) => loss.frames >= shortest).slice(0, MOST_LOSSES), left = all.length - kept.length;
@@ -185,7 +185,7 @@ function open(number) {
   put("name", run.name);
   writeVerdict(run);
   writeDetails(run);
-  writePieces();
+  writeSubmaps();
   writeLosses();
   element("truth-key").hidden = !run.truth;
   const [near, far] = run.depth_range, unit = run.scale_known ? " mm" : "";

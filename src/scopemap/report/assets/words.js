@@ -60,8 +60,8 @@ function writeDetails(run) {
 function statusOf(run, row) {
   const place = run.places[row], reason = run.reasons[run.reasonOf[row]];
   if (place === 0) return "in the result";
-  if (place > 0) return `in piece ${place} (maps/${place}), not in the result`;
-  if (place === OTHER_MAP) return "followed, but in a piece too short to be kept";
+  if (place > 0) return `in submap ${place} (maps/${place}), not in the result`;
+  if (place === OTHER_MAP) return "followed, but in a submap too short to be kept";
   if (place === ROTATED) return `camera lost but for its rotation: ${reason || "no reason was kept"}`;
   return place === NOT_USED ? `not used: ${reason || "left out"}` : `camera lost: ${reason || "no reason was kept"}`;
 }

@@ -10,7 +10,7 @@ from scopemap.report.kept_run import KeptRun
 
 
 @dataclass(frozen=True)
-class Piece:
+class SubmapSummary:
     """A map of a run.
 
     number : of the map, 0 for the result and N for `maps/N`. frames : how many it has. first, last : numbers of its
@@ -35,7 +35,7 @@ class Piece:
         return "" if np.isnan(self.inlier_share) else f"{self.inlier_share:.0%} inliers"
 
 
-def pieces_in_time(run: KeptRun) -> list[Piece]:
+def submaps_in_time(run: KeptRun) -> list[SubmapSummary]:
     """Return the maps of a run in the order of their first frames."""
     shares, found = run.column("inlier_share"), []
     for number in range(len(run.maps)):
@@ -43,22 +43,22 @@ def pieces_in_time(run: KeptRun) -> list[Piece]:
         if inside.any():
             indices, known = run.indices[inside], shares[inside & np.isfinite(shares)]
             share = float(np.median(known)) if len(known) else float("nan")
-            found.append(Piece(number, len(indices), int(indices.min()), int(indices.max()), share))
-    return sorted(found, key=lambda piece: piece.first)
+            found.append(SubmapSummary(number, len(indices), int(indices.min()), int(indices.max()), share))
+    return sorted(found, key=lambda submap: submap.first)
 
 
-def most_doubtful(pieces: list[Piece]) -> Piece | None:
-    """Return the piece of the lowest inlier share, None where fewer than two are known."""
-    known = [piece for piece in pieces if not np.isnan(piece.inlier_share)]
-    return min(known, key=lambda piece: piece.inlier_share) if len(known) > 1 else None
+def most_doubtful(submaps: list[SubmapSummary]) -> SubmapSummary | None:
+    """Return the submap of the lowest inlier share, None where fewer than two are known."""
+    known = [submap for submap in submaps if not np.isnan(submap.inlier_share)]
+    return min(known, key=lambda submap: submap.inlier_share) if len(known) > 1 else None
 
 
-def doubt_words(pieces: list[Piece]) -> str:
-    """Return which piece is the most doubtful and why, one phrase; "" where that cannot be told."""
-    worst = most_doubtful(pieces)
+def doubt_words(submaps: list[SubmapSummary]) -> str:
+    """Return which submap is the most doubtful and why, one phrase; "" where that is unknown."""
+    worst = most_doubtful(submaps)
     if worst is None:
         return ""
-    others = [piece.inlier_share for piece in pieces if piece is not worst and not np.isnan(piece.inlier_share)]
+    others = [submap.inlier_share for submap in submaps if submap is not worst and not np.isnan(submap.inlier_share)]
     rest = f"{min(others):.0%}" + (f" to {max(others):.0%}" if len(others) > 1 else "")
     where = f"{worst.name}, frames {worst.first} to {worst.last}"
     return f"{where}, with {worst.inlier_share:.0%} inliers against {rest}"
