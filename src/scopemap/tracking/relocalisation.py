@@ -54,8 +54,9 @@ def is_wall(frame: Frame, keyframe: Keyframe) -> bool:
 
     How near the wall is depth networks do not tell; where depth is measured it is no reason to be lost.
     """
-    own, usual = _log_depth_range(frame), _log_depth_range(keyframe.frame)
-    return not keyframe.measured and own < _WALL_RANGE * usual
+    if keyframe.measured or frame.depth_mm is None:
+        return False
+    return _log_depth_range(frame) < _WALL_RANGE * _log_depth_range(keyframe.frame)
 
 
 def _log_depth_range(frame: Frame) -> float:
