@@ -36,7 +36,7 @@ def test_drift_is_removed_and_noise_of_the_network_is_not_followed(per_keyframe:
     chained = per_keyframe * np.arange(count)
     tracked = _tracked(chained)
     path = path_without_drift(tracked, chained + rng.normal(0, 0.1, count))
-    np.testing.assert_allclose(path.drift, chained, atol=0.15 + 0.1 * abs(chained[-1]))
+    np.testing.assert_allclose(path.drift, chained, atol=0.15 + 0.2 * abs(chained[-1]))
     steps = np.diff(path.T_world_camera[:, 0, 3])
     np.testing.assert_allclose(np.log(steps), (chained - path.drift)[1:], atol=0.05)
     np.testing.assert_array_equal(path.T_world_camera[:, :3, :3], [pose.T_world_camera[:3, :3] for pose in tracked])
