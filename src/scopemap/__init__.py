@@ -16,6 +16,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # The stages have threads of their own. OpenBLAS's would compete with them (a run took 1.3 times the time), and
 # sum in another order: results would depend on their number. Read when numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# ONNX Runtime's builds send telemetry unless this is set before it is imported; nothing may leave the machine.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
 
 def _may_write(folder: Path) -> bool:
