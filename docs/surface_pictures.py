@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scopemap.benchmark.result import read_provenance
-from scopemap.benchmark.truth import open_truth
+from scopemap.actions.inputs import open_truth
 from scopemap.config import Config
 from scopemap.fusion.agreement import compare_with_frame
 from scopemap.reconstruction import DepthReader
 from scopemap.report.mesh_figures import draw_surface
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.result import read_provenance
 
 MOST_BYTES = 200_000
 

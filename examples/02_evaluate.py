@@ -14,8 +14,8 @@ from pathlib import Path
 
 from scopemap import open_sequence, read_trajectory, reconstruct
 from scopemap.evaluation.poses import evaluate_poses
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 
 def main(run: Path, truth: Path) -> None:

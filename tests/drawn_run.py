@@ -111,5 +111,5 @@ def _record(index: int, number: int) -> FrameRecord:
     pose = pose_of(index) if place == number else None
     status = "lost" if place is None else "other-map" if place != number else "initial" if index == 0 else "ok"
     reason = "too blurred" if place is None else f"tracked in maps/{place}" if place != number else ""
-    track = Track(index, status, reason, pose_of(index), 0, 0.5, 0.8 - 0.01 * index, 0.9, 0.9, 3)  # type: ignore[arg-type]
+    track = Track(index, status, reason, pose_of(index), 0, 0.5, 0.8 - 0.01 * index, 0.9, 0.9, 3)  # type: ignore[arg - type]
     return FrameRecord(index, index / 25, "", track, pose, 1 + 0.01 * index, 0.5, place)

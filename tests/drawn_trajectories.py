@@ -17,8 +17,8 @@ from foreign_layouts import (
 )
 from sample_trajectories import as_trajectory, write_c3vd, write_run
 
-from scopemap.benchmark.plan import shipped_plans
 from scopemap.config import Config
+from scopemap_bench.plan import shipped_plans
 
 
 def write_trajectories(folder: Path) -> None:
@@ -40,9 +40,9 @@ def write_trajectories(folder: Path) -> None:
 
 def write_settings(folder: Path) -> None:
     """Write the settings of two presets, and a plan that comes with the package."""
-    import scopemap.benchmark
+    import scopemap_bench
 
-    plan = Path(scopemap.benchmark.__file__).parent / "plans" / f"{shipped_plans()[0]}.toml"
+    plan = Path(scopemap_bench.__file__).parent / "plans" / f"{shipped_plans()[0]}.toml"
     plain = 'preset = "realtime"\n[tracking]\nkeyframe_every = 4\n[fusion]\nvoxel_mm = 0.5\n'
     texts = {"default.toml": Config().toml(), "some.toml": plain, "plan.toml": plan.read_text(encoding="utf-8")}
     write_files(folder, texts)

@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 import pytest
 
-from scopemap.cli import main
+from scopemap.cli.app import main
 
 
 def call(*arguments: object) -> int:

@@ -10,11 +10,11 @@ from front_door import call
 from test_batch import QUICK, _files, _rows
 from tiny_phantom import write_tiny
 
-from benchmarks.batch import CAMERA, write_videos
 from scopemap.cli.batch import videos_of
 from scopemap.errors import InputError
 from scopemap.io.addresses import RemoteFile, is_address, remote_files
 from scopemap.io.inputs import named_inputs
+from scopemap_bench.scripts.batch import CAMERA, write_videos
 
 
 @pytest.fixture

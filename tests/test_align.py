@@ -134,7 +134,7 @@ def test_the_first_frames_alone_decide_the_fit_and_all_are_moved(seed: int, mode
     np.testing.assert_array_equal(similarity.t, alone.t)
     np.testing.assert_array_equal(aligned, alone.transform_poses(estimated))
     everywhere = align_trajectories(estimated, reference, mode, first=len(estimated) + 7)[0]  # type: ignore[arg-type]
-    np.testing.assert_array_equal(everywhere, align_trajectories(estimated, reference, mode)[0])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(everywhere, align_trajectories(estimated, reference, mode)[0])  # type: ignore[arg - type]
 
 
 def test_what_cannot_be_fitted_is_refused() -> None:

@@ -4,7 +4,7 @@ Here is what needs the whole way, or no reader of its own. Elsewhere: files cut 
 numbers missing, twice or out of order, poses of NaN and left-handed, depth of 8 bit, in every data set's layout
 (test_planted_faults); what means harm (test_hostile_input); names without numbers (test_datasets); options (test_cli);
 an earlier run, and what else lies in an output folder (test_reconstruction, test_refusals); any damage at random
-(benchmarks/fuzz.py).
+(scopemap_bench/scripts/fuzz.py).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from tiny_phantom import FRAMES, write_tiny
 
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError, ScopemapError
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.datasets.survey import survey
 
 Capture = pytest.CaptureFixture[str]
 LONG = "a folder with spaces, äöü 中文 and a long name " + "x" * 40

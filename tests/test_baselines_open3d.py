@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
-from scopemap.benchmark.methods import open3d_odometry
-from scopemap.benchmark.methods.open3d_odometry import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.errors import SettingsError
@@ -24,6 +22,8 @@ from scopemap.io.opening import open_sequence
 from scopemap.runner.run import reconstruct
 from scopemap.tracking.track import FrameTracker, Track
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.methods import open3d_odometry
+from scopemap_bench.methods.open3d_odometry import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
 
 COLOUR, CLOUDS = list(RGBD_METHODS), list(ICP_METHODS)
 PLAIN = {

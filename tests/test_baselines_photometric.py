@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from tiny_phantom import FRAMES, true_poses, with_true_depth, write_tiny
 
-from scopemap.benchmark.methods.endo_depth_and_motion import SETTINGS, create_endo_depth_and_motion
-from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, TrackingSettings
 from scopemap.errors import AlignmentError
@@ -23,6 +21,8 @@ from scopemap.runner.run import reconstruct
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.methods.endo_depth_and_motion import SETTINGS, create_endo_depth_and_motion
+from scopemap_bench.methods.standing_still import StandingStill
 
 PLAIN = {
     **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},

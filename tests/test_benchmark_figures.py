@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from scopemap.report.benchmark_figures import (
+from scopemap.report.canvas import ESTIMATE_COLOUR
+from scopemap_bench.pictures import (
     BAR_COLOUR,
     draw_ate,
     draw_displacement_bars,
@@ -18,7 +19,6 @@ from scopemap.report.benchmark_figures import (
     draw_frames_until_loss,
     draw_matched_points,
 )
-from scopemap.report.canvas import ESTIMATE_COLOUR
 
 NAN = float("nan")
 

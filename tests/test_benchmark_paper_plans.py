@@ -13,13 +13,13 @@ from front_door import call
 from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
-from scopemap.benchmark import runner
-from scopemap.benchmark.entry import Entry
-from scopemap.benchmark.figures import FinishedRun, write_results
-from scopemap.benchmark.plan import Plan, found_sequences, read_plan
-from scopemap.benchmark.result import RunResult
-from scopemap.benchmark.runner import run_entry, run_plan
-from scopemap.benchmark.tables import published_rows
+from scopemap_bench import runner
+from scopemap_bench.entry import Entry
+from scopemap_bench.figures import FinishedRun, write_results
+from scopemap_bench.plan import Plan, found_sequences, read_plan
+from scopemap_bench.result import RunResult
+from scopemap_bench.runner import run_entry, run_plan
+from scopemap_bench.tables import published_rows
 
 OURS = ("scopemap", "scopemap, paper's depth", "paper's preset", "MDE (per-frame Depth Pro)")
 BASELINES = ("EDAM", "Park", "SB", "Po2Pl", "Po2Po")

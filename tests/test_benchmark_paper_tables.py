@@ -75,7 +75,7 @@ def measured(table: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_every_column_of_the_paper_is_measured(name: str, folder: Path) -> None:
-    file = resources.files("scopemap.benchmark") / "published" / f"{PUBLISHED[name]}.csv"
+    file = resources.files("scopemap_bench") / "published" / f"{PUBLISHED[name]}.csv"
     columns = file.read_text().splitlines()[0].split(",")
     row = measured(folder / "rad" / "tables" / f"{name}.csv")
     assert all(row[ours] for column in columns for ours in COLUMNS[column])

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from sample_trajectories import write_c3vd
 
-from scopemap.benchmark.entry import Entry, entries_of
-from scopemap.benchmark.methods.method import create_method
-from scopemap.benchmark.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
-from scopemap.benchmark.runner import run_plan
 from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.entry import Entry, entries_of
+from scopemap_bench.methods.method import create_method
+from scopemap_bench.plan import Plan, found_sequences, read_plan, shipped_plans, spec_of
+from scopemap_bench.runner import run_plan
 
 SMALL = """
 title = "small"

@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from scopemap.benchmark import runner
-from scopemap.benchmark.entry import Entry
-from scopemap.benchmark.plan import Plan, read_plan
-from scopemap.benchmark.result import RunResult
-from scopemap.benchmark.runner import Benchmark, run_plan
 from scopemap.errors import InputError
+from scopemap_bench import runner
+from scopemap_bench.entry import Entry
+from scopemap_bench.plan import Plan, read_plan
+from scopemap_bench.result import RunResult
+from scopemap_bench.runner import Benchmark, run_plan
 
 PLAN = """
 title = "tiny"
@@ -54,7 +54,7 @@ import json, os, sys, time
 from pathlib import Path
 
 def wait(folder):
-    from scopemap.benchmark.runner import end_with_parent
+    from scopemap_bench.runner import end_with_parent
     end_with_parent()
     Path(folder, "draft").write_text(str(os.getpid()))
     Path(folder, "draft").rename(Path(folder, "pid"))
@@ -173,7 +173,7 @@ def test_killed_half_way_it_continues_and_no_worker_stays(
     out.mkdir()
     (out / "colon.txt").write_text("")
     start = (
-        "import sys; from pathlib import Path; from scopemap.benchmark import runner, plan; "
+        "import sys; from pathlib import Path; from scopemap_bench import runner, plan; "
         "command = lambda file, code: [sys.executable, '-c', code, str(file), runner.Entry.load(file).key]; "
         f"runner.worker_command = lambda file: command(file, {work!r}); "
         f"runner.run_plan(plan.read_plan({str(tmp_path / 'plan.toml')!r}), Path({str(out)!r}), data=Path({str(out)!r}))"

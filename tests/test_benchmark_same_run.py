@@ -9,9 +9,9 @@ from front_door import call
 from small_networks import saved, small_depth_anything, use_weights, write_weights
 from tiny_phantom import write_tiny
 
-from scopemap.benchmark.entry import Entry
-from scopemap.benchmark.plan import MethodPlan, ProtocolPlan, SequencePlan
-from scopemap.benchmark.runner import run_entry
+from scopemap_bench.entry import Entry
+from scopemap_bench.plan import MethodPlan, ProtocolPlan, SequencePlan
+from scopemap_bench.runner import run_entry
 
 FRAMES = 6
 # Without weights for them: flow by DIS, and structural similarity.

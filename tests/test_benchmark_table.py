@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.benchmark.table import Figure, Table, escape_markdown
+from scopemap_bench.table import Figure, Table, escape_markdown
 
 NAN = float("nan")
 ROWS = pd.DataFrame(

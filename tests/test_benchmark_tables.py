@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 from sample_trajectories import as_trajectory, vector_a
 
-from scopemap.benchmark.result import RunResult
-from scopemap.benchmark.summary import summarise
-from scopemap.benchmark.table import Table
-from scopemap.benchmark.tables import PublishedTable, benchmark_tables, published_rows, read_table, write_tables
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.evaluation.consistency import ConsistencyMeter
-from scopemap.evaluation.depth import mean_depth_report, scale_jitter
-from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import match, pose_report
-from scopemap.evaluation.surface import compare_surfaces, distance_figures
+from scopemap_bench.evaluation.consistency import ConsistencyMeter
+from scopemap_bench.evaluation.depth import mean_depth_report, scale_jitter
+from scopemap_bench.evaluation.paper import paper_figures
+from scopemap_bench.evaluation.surface import compare_surfaces, distance_figures
+from scopemap_bench.result import RunResult
+from scopemap_bench.summary import summarise
+from scopemap_bench.table import Table
+from scopemap_bench.tables import PublishedTable, benchmark_tables, published_rows, read_table, write_tables
 
 NAN = float("nan")
 MATCHED = match(*(as_trajectory(poses) for poses in vector_a()), "sim3")
@@ -159,7 +159,7 @@ def test_a_method_that_died_for_one_seed_says_so_and_does_not_compete() -> None:
 
 @pytest.mark.parametrize(("name", "file"), [*zip(("table1", "table2", "table3"), PUBLISHED, strict=True)])
 def test_published_rows_are_the_files(name: str, file: str) -> None:
-    text = (resources.files("scopemap.benchmark") / "published" / f"{file}.csv").read_text()
+    text = (resources.files("scopemap_bench") / "published" / f"{file}.csv").read_text()
     table = tables(RESULTS, paper_units=True)[name]
     printed = [row for row in cells(table) if row["source"] == "published"]
     expected = list(csv.DictReader(text.splitlines()))
@@ -331,6 +331,6 @@ def test_rows_keep_the_order_of_the_plan() -> None:
 
 
 def test_without_pandas_the_error_names_the_extra() -> None:
-    code = "import sys; sys.modules['pandas'] = None; import scopemap.benchmark.tables"
+    code = "import sys; sys.modules['pandas'] = None; import scopemap_bench.tables"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1].endswith("tables of runs need pandas: pip install -e '.[bench]'")

@@ -17,8 +17,8 @@ from scopemap.cameras.formats.reading import read_calibration, stated_calibratio
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, SettingsError
-from scopemap.io.datasets.tum import CAMERAS as ROOMS
 from scopemap.io.opening import open_sequence
+from scopemap_bench.datasets.tum import CAMERAS as ROOMS
 
 # The pictures of `write_pictures` are 135x108 px.
 LARGE = PinholeCamera(200.0, 201.0, 140.0, 105.0, 270, 216)

@@ -19,7 +19,7 @@ import pytest
 from tiny_phantom import FRAMES, SIZE, only_images, write_black, write_tiny
 
 from scopemap import __version__
-from scopemap.cli import main
+from scopemap.cli.app import main
 
 OPTIONS = {
     "run": "--out --preset --config --dataset --camera --fov --camera-fit --stereo --deinterlace --near-far --depth"

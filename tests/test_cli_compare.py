@@ -14,10 +14,10 @@ from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.benchmark.result import RunResult
-from scopemap.cli import app
+from scopemap.cli.app import app
 from scopemap.errors import InputError
 from scopemap.trajectory.trajectory import write_kitti
+from scopemap_bench.result import RunResult
 
 
 def run(*arguments: object, code: int = 0) -> object:

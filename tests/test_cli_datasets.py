@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from drawn_inputs import picture, save, write_c3vd
 
-from scopemap.cli import main
-from scopemap.io.opening import DATASETS
+from scopemap.cli.app import main
+from scopemap.io.opening import readers
 
 Say = Callable[..., tuple[int, str, str]]
 
@@ -99,11 +99,11 @@ def test_the_reader_and_the_camera_can_be_named(datasets: Say, sound: Path, tmp_
 def test_list_names_every_reader(datasets: Say) -> None:
     code, out, err = datasets("list", "--json")
     rows = json.loads(out)
-    assert (code, err, [row["name"] for row in rows]) == (0, "", list(DATASETS))
+    assert (code, err, [row["name"] for row in rows]) == (0, "", list(readers()))
     assert all(row["what"] and row["recognised"] for row in rows)
     told = {row["name"]: row for row in rows}
     assert told["c3vd"]["what"].startswith("C3VD: phantom colonoscopy")
     assert told["video"]["recognised"] == "`path` is a file"
     table = datasets("list")[1]
-    assert all(re.search(rf"│ {re.escape(name)} ", table) for name in DATASETS)
+    assert all(re.search(rf"│ {re.escape(name)} ", table) for name in readers())
     assert datasets("list", "--quiet") == (0, "", "")

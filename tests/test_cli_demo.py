@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.benchmark import demonstration
-from scopemap.benchmark.demonstration import Demonstration
-from scopemap.cli import main
+from scopemap.actions import demo as demonstration
+from scopemap.actions.demo import Demonstration
+from scopemap.cli.app import main
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.io import weights

@@ -15,10 +15,10 @@ from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.cli.evaluate import evaluate
 from scopemap.errors import AlignmentError, InputError, SettingsError
 from scopemap.geometry.align import align_trajectories
 from scopemap.trajectory.trajectory import path_length_mm, write_kitti, write_tum
+from scopemap_bench.cli.evaluate import evaluate
 
 KEYS = [
     *("frames", "tracked", "align", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),

@@ -12,15 +12,15 @@ from drawn_climb import frames_of, path_of, submap_text, write_foreign_run, writ
 from front_door import refused
 from typer.testing import CliRunner
 
-from scopemap.cli import app
+from scopemap.cli.app import app
 from scopemap.errors import AlignmentError, InputError
-from scopemap.evaluation import climb
-from scopemap.evaluation.climb import LEAST_FRAMES, climb_figures
-from scopemap.evaluation.protocols import PROTOCOLS
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import se3_exp, so3_exp
-from scopemap.trajectory.formats.climb import read_climb_reference, read_submap, write_submap
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.climb import figures as climb
+from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
+from scopemap_bench.evaluation.protocols import PROTOCOLS
+from scopemap_bench.trajectories.climb import read_climb_reference, read_submap, write_submap
 
 QUARTER_TURN = Similarity(10.0, so3_exp(np.array([0, 0, np.pi / 2])), np.array([5.0, -3.0, 2.0]))
 

@@ -19,10 +19,10 @@ from front_door import call, refused
 from test_datasets_stereomis import write_frames
 from tiny_phantom import write_tiny
 
-from scopemap.benchmark.climb_check import submission_problems
-from scopemap.benchmark.climb_submission import write_submission
 from scopemap.errors import InputError
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.climb.check import submission_problems
+from scopemap_bench.climb.submission import write_submission
 
 ROOT = Path(__file__).resolve().parents[1]
 Edit = Callable[[Path], object]
@@ -160,17 +160,17 @@ def test_every_video_needs_its_clip(run: Path, tmp_path: Path) -> None:
 
 def test_the_command_writes_and_checks(run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "submission"
-    assert call("export", run, "--to", "climb", "--out", out, "--json") == 0
+    assert call("climb", run, "--out", out, "--json") == 0
     assert json.loads(capfd.readouterr().out) == {
         "out": str(out),
         "format": "climb",
         "written": ["Seq_001_a"],
         "problems": [],
     }
-    assert call("export", "--to", "climb", "--out", out) == 0
+    assert call("climb", "--out", out) == 0
     assert capfd.readouterr().out == f"{out}: valid\n"
     (out / "Seq_001_a/3/runtime.txt").unlink()
-    assert "1 problems, the first: cannot read" in refused(capfd, "export", "--to", "climb", "--out", out, "--quiet")
+    assert "1 problems, the first: cannot read" in refused(capfd, "climb", "--out", out, "--quiet")
 
 
 def test_one_call_of_the_container_writes_every_clip(tmp_path: Path) -> None:

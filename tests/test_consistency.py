@@ -14,16 +14,16 @@ from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose,
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
-from scopemap.evaluation.consistency import (
+from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
+from scopemap.io.opening import open_sequence
+from scopemap_bench.evaluation.consistency import (
     ConsistencyMeter,
     alignment_errors,
     depth_change,
     mean_change,
     projected_depth,
 )
-from scopemap.evaluation.correspondences import FrameCorrespondences, FrameMatcher, have_same_colour
-from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
-from scopemap.io.opening import open_sequence
+from scopemap_bench.evaluation.correspondences import FrameCorrespondences, FrameMatcher, have_same_colour
 
 STILL = [pose()] * 4
 ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]

@@ -15,8 +15,8 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, se3_exp, transform
-from scopemap.io.datasets.c3vd import CAMERA, read_poses
 from scopemap.io.opening import open_sequence
+from scopemap_bench.datasets.c3vd import CAMERA, read_poses
 
 # ---- folders of images
 

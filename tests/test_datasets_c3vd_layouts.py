@@ -12,8 +12,8 @@ from drawn_inputs import SIZE, number_in, picture, poses, save, write_c3vd
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
 from scopemap.io.opening import open_sequence
+from scopemap_bench.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
 
 FULL = (1350, 1080)
 

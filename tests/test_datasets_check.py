@@ -18,15 +18,15 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.io.datasets.checking import Finding, check, check_path, refusal
-from scopemap.io.datasets.pose_depth import PoseDepthTest
-from scopemap.io.datasets.survey import FrameFigures, Survey, survey
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import SourceFrame, SourceTruth
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.datasets.checking import Finding, check, check_path, refusal
+from scopemap_bench.datasets.pose_depth import PoseDepthTest
+from scopemap_bench.datasets.survey import FrameFigures, Survey, survey
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT, SIZE = 6, (64, 48)

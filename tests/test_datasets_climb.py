@@ -10,14 +10,14 @@ import pytest
 from drawn_climb import path_of, write_clip, write_foreign_run, write_reference
 from test_datasets_endomapper import KB4, SIZE
 
-from scopemap.benchmark.methods.method import create_method
-from scopemap.benchmark.plan import MethodPlan, found_sequences, read_plan
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.errors import InputError
-from scopemap.io.datasets.reference import read_reference, reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import read_reference, reference_trajectory
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.methods.method import create_method
+from scopemap_bench.plan import MethodPlan, found_sequences, read_plan
 
 
 def test_a_clip(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from scopemap.cameras.formats.colmap import ModelCamera, camera_model
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 
 SIZE = (80, 64)
 NUMBERS = [2, 9, 10, 12]

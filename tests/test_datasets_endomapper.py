@@ -17,8 +17,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.errors import InputError
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 
 SIZE = (160, 120)
 FRAMES = 6

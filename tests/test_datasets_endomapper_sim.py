@@ -12,10 +12,10 @@ from drawn_inputs import number_in, picture, save
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
-from scopemap.io.datasets import endomapper_sim
-from scopemap.io.datasets.endomapper_sim import read_exr_red
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
+from scopemap_bench.datasets import endomapper_sim
+from scopemap_bench.datasets.endomapper_sim import read_exr_red
 
 SIZE = (96, 72)
 FRAMES = 4

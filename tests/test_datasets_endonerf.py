@@ -15,8 +15,8 @@ from scopemap.config import MaskSettings
 from scopemap.config.input import MaskAdvanced
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.masking.mask_files import create_masks
 
 SIZE = (80, 64)

@@ -16,13 +16,13 @@ from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
 
 from scopemap.cameras.formats.colmap import read_largest_model
 from scopemap.errors import InputError
-from scopemap.io.datasets import endoslam, posed_video
-from scopemap.io.datasets.endomapper_sim import read_exr_red
-from scopemap.io.datasets.endoslam import read_sheet
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.io.video import VideoFile
+from scopemap_bench.datasets import endoslam, posed_video
+from scopemap_bench.datasets.endomapper_sim import read_exr_red
+from scopemap_bench.datasets.endoslam import read_sheet
+from scopemap_bench.datasets.survey import survey
 
 MODEL = "33/sparse/0/images.bin"
 

@@ -14,8 +14,8 @@ from drawn_inputs import frames_of, number_in, picture, save
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 
 SIZE = (80, 64)
 NUMBERS = [3, 9, 10, 24]

@@ -32,10 +32,10 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.scared import ScaredKeyframe
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence
+from scopemap_bench.datasets.scared import ScaredKeyframe
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError, ScopemapError
 from scopemap.io.opening import open_sequence
-from scopemap.trajectory.formats.numbered import find_numbered
+from scopemap_bench.trajectories.numbered import find_numbered
 
 NUMBERS = [1, 2, 4, 7, 8]
 

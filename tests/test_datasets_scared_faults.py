@@ -26,9 +26,9 @@ from drawn_scared import (
 )
 
 from scopemap.errors import InputError, ScopemapError
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.scared import ScaredKeyframe
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
+from scopemap_bench.datasets.scared import ScaredKeyframe
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import InputError
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.stereomis import StereoMisFolder
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
+from scopemap_bench.datasets.stereomis import StereoMisFolder
 
 SIZE = (160, 128)
 FRAMES = 6

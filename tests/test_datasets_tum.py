@@ -13,9 +13,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.tum import associated
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
+from scopemap_bench.datasets.tum import associated
 
 SIZE = (64, 48)  # a tenth of the data set's
 START_S = 1305031102.175304

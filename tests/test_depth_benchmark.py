@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,13 +15,10 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.frame import Frame
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import depth_measures as measures
-import depth_scenes as scenes
-import depth_without_download as bench
-from depth_pictures import draw_scene, draw_sparsification
+from scopemap_bench.scripts import depth_measures as measures
+from scopemap_bench.scripts import depth_scenes as scenes
+from scopemap_bench.scripts import depth_without_download as bench
+from scopemap_bench.scripts.depth_pictures import draw_scene, draw_sparsification
 
 CAMERA = PinholeCamera(50.0, 50.0, 31.5, 23.5, 64, 48)
 ALONG = np.linalg.norm(CAMERA.rays, axis=-1)

@@ -21,7 +21,7 @@ from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.files import FilesDepth, depth_files
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
-from scopemap.io.datasets.c3vd import C3vdFolder
+from scopemap_bench.datasets.c3vd import C3vdFolder
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)

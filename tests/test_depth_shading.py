@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -141,14 +139,9 @@ def test_guided_filter_and_filling_leave_a_constant_alone() -> None:
 
 
 def benchmark() -> ModuleType:
-    file = Path(__file__).resolve().parents[1] / "benchmarks" / "depth_without_download.py"
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[file.stem] = module
-    spec.loader.exec_module(module)
-    return module
+    from scopemap_bench.scripts import depth_without_download
+
+    return depth_without_download
 
 
 @pytest.mark.real

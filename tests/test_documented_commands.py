@@ -13,12 +13,12 @@ import typer
 import typer.main
 from front_door import call
 
-from scopemap.benchmark import demonstration
-from scopemap.cli import app
+from scopemap.actions import demo as demonstration
+from scopemap.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-DOCUMENTS = sorted({*DOCUMENTS, *(ROOT / "benchmarks").glob("*.md")} - {ROOT / "CHANGELOG.md"})
+DOCUMENTS = sorted({*DOCUMENTS, *(ROOT / "bench").glob("*.md")} - {ROOT / "CHANGELOG.md"})
 # ClickException, wherever typer has it.
 REFUSED = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 # Not the name of an image, nor of an import.

@@ -12,14 +12,14 @@ import yaml
 
 import scopemap
 from scopemap import __version__
-from scopemap.cli import app
+from scopemap.cli.app import app
 from scopemap.config import PRESETS, setting_names
-from scopemap.io.opening import DATASETS
+from scopemap.io.opening import readers
 from scopemap.io.weights import REGISTRY
 from scopemap.reconstruction import _COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")])
 GROUPS = {name.split(".")[0] for name in setting_names() if "." in name}
 
 
@@ -68,7 +68,7 @@ def test_the_readme_names_every_preset_and_all_weights() -> None:
 
 def test_reproducing_names_plans_and_weights_that_exist() -> None:
     text = _text("docs/reproduce.md")
-    plans = {path.stem for path in (ROOT / "src/scopemap/benchmark/plans").glob("*.toml")}
+    plans = {path.stem for path in (ROOT / "bench/src/scopemap_bench/plans").glob("*.toml")}
     assert (
         {"scared", "scared-c", "scared-ablations", "hamlyn"}
         <= set(re.findall(r"scopemap bench ([\w-]+)", text))
@@ -93,8 +93,8 @@ def test_every_data_set_is_documented() -> None:
     origins, measuring = origins.split("## Running and measuring")
     rows = [set(re.findall(r"^\| `([\w-]+)`", part, flags=re.MULTILINE)) for part in (layouts, origins)]
     containers = {"rosbag", "dicom", "video", "images"}
-    assert rows == [set(DATASETS), set(DATASETS) - containers]
-    assert set(DATASETS) - containers <= set(re.findall(r"`([\w-]+)`", measuring))
+    assert rows == [set(readers()), set(readers()) - containers]
+    assert set(readers()) - containers <= set(re.findall(r"`([\w-]+)`", measuring))
 
 
 def test_versions_agree() -> None:
@@ -159,7 +159,7 @@ def test_every_extra_is_documented() -> None:
 def test_source_files_that_are_named_exist(name: str) -> None:
     named = re.findall(r"`((?:[\w-]+/)*[\w-]+\.py)`", _text(f"docs/{name}.md"))
     assert named
-    places = (ROOT, ROOT / "src/scopemap", ROOT / "src/scopemap/depth/scopenet", ROOT / "training")
+    places = (ROOT, ROOT / "src/scopemap", ROOT / "bench/src/scopemap_bench", ROOT / "src/scopemap/depth/scopenet", ROOT / "training")
     assert [one for one in named if "NAME" not in one and not any((place / one).exists() for place in places)] == []
 
 

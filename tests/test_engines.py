@@ -14,12 +14,12 @@ import pytest
 from front_door import refused
 from process_tasks import act
 
-from benchmarks.batch import ENGINES, POISONED, single_runs, trial, write_videos
 from scopemap.errors import InputError
 from scopemap.runner.engines import Engine, WorkerNeeds
 from scopemap.runner.processes import ProcessLimits
 from scopemap.runner.ray_engine import RayEngine
 from scopemap.runner.slurm_engine import SlurmEngine
+from scopemap_bench.scripts.batch import ENGINES, POISONED, single_runs, trial, write_videos
 
 NEEDS = WorkerNeeds(cores=1, memory_gb=0.5)
 pytestmark = pytest.mark.skipif(

@@ -13,15 +13,15 @@ from drawn_datasets import WRITERS
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.benchmark.plan import MethodPlan
-from scopemap.benchmark.scoring import default_protocol
-from scopemap.benchmark.truth import open_truth
+from scopemap.actions.inputs import open_truth
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cli.evaluate import evaluate
 from scopemap.errors import CalibrationError, InputError, SettingsError
-from scopemap.io.datasets.reference import read_reference, reference_trajectory
+from scopemap.io.reference import read_reference, reference_trajectory
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.trajectory import write_tum
+from scopemap_bench.cli.evaluate import evaluate
+from scopemap_bench.plan import MethodPlan
+from scopemap_bench.scoring import default_protocol
 
 KNOWS_POSES = sorted(
     {"c3vd", "c3vd:v2", "c3vd:endogslam", "7-scenes", "scared", "scared-c", "endonerf", "tum", "oneslam", "simcol3d"}

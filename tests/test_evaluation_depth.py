@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.errors import SettingsError
-from scopemap.evaluation.depth import (
+from scopemap_bench.evaluation.depth import (
     DEPTH_RANGES_MM,
     DepthFit,
     depth_scale,
@@ -120,7 +120,8 @@ def test_scaled_errors_do_not_depend_on_the_scale_of_the_prediction(seed: int, s
     rng = np.random.default_rng(seed)
     truth, predicted = rng.uniform(5, 100, (2, 12, 9))
     first, second = (
-        evaluate_depth(factor * predicted, truth, scaling=scaling, truth_range_mm=(1.0, 90.0), clip_prediction=True)  # type: ignore[arg-type]
+        evaluate_depth(factor * predicted, truth, scaling=scaling, truth_range_mm=(1.0, 90.0), clip_prediction=True)
+        # type: ignore[arg-type]
         for factor in (1.0, 7.5)
     )
     assert errors_of(second) == pytest.approx(errors_of(first))

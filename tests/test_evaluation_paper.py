@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, vector_a
 
-from scopemap.evaluation.paper import paper_figures
 from scopemap.evaluation.poses import ErrorSummary, match, translation_errors_mm
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import se3_exp, so3_exp
+from scopemap_bench.evaluation.paper import paper_figures
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=8, deadline=None)
@@ -28,7 +28,7 @@ def last_digit(*values: float) -> object:
 
 
 def report_of(estimated: np.ndarray, reference: np.ndarray, mode: str, lost: tuple[int, ...] = ()) -> SimpleNamespace:
-    figures = paper_figures(match(as_trajectory(estimated, lost), as_trajectory(reference), mode))  # type: ignore[arg-type]
+    figures = paper_figures(match(as_trajectory(estimated, lost), as_trajectory(reference), mode))  # type: ignore[arg - type]
     return SimpleNamespace(**figures)
 
 

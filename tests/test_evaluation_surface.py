@@ -11,14 +11,14 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.evaluation.surface import (
+from scopemap.geometry.se3 import se3, so3_exp
+from scopemap_bench.evaluation.surface import (
     compare_surfaces,
     distance_to_mesh,
     normal_consistency,
     oriented_samples,
     surface_points,
 )
-from scopemap.geometry.se3 import se3, so3_exp
 
 
 def brute_force(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from scopemap.benchmark.exports.image_layouts import write_endonerf
+from scopemap.actions.export.image_layouts import write_endonerf
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.rendering import render_mesh
 
@@ -180,7 +180,7 @@ def test_endonerf(run: Path, tmp_path: Path) -> None:
 def test_endonerf_has_its_principal_point_in_the_middle(run: Path, tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from scopemap.benchmark.exports.exported_run import read_exported
+    from scopemap.actions.export.exported_run import read_exported
 
     lens = PinholeCamera(60.0, 48.0, 36.5, 29.0, 80, 64)
     write_endonerf(replace(read_exported(run), camera=lens), tmp_path / "out")

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from tiny_phantom import with_true_depth, write_tiny
 
-from scopemap.benchmark.methods.standing_still import StandingStill
 from scopemap.tracking.track import FrameTracker
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import flow_agreement
+from scopemap_bench.methods.standing_still import StandingStill
+from scopemap_bench.scripts import flow_agreement
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.benchmark.scoring import flow_to_previous
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowPair
+from scopemap_bench.scoring import flow_to_previous
 
 
 class Counting(DisFlow):

@@ -28,10 +28,12 @@ from sample_trajectories import as_trajectory, write_c3vd, write_run
 
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.formats.opening import KINDS, read_trajectory
+from scopemap.trajectory.formats.opening import read_trajectory, trajectory_kinds
 from scopemap.trajectory.trajectory import Trajectory
 
 # ---- SCARED
+
+KINDS = ("auto", *trajectory_kinds())
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from scopemap.io.result_folder import UNFINISHED
 
 _LIMITED = """
 import resource, signal, sys
-from scopemap.cli import main
+from scopemap.cli.app import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
 main()

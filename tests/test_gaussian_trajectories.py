@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.errors import InputError
-from scopemap.trajectory.formats import splatam
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.trajectories import splatam
 
 HELD_OUT = [frame for frame in range(100) if frame % 8 != 7]
 

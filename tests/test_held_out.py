@@ -20,15 +20,15 @@ from torchvision.models import alexnet
 from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
-from scopemap.benchmark.held_out import RunFrames, held_out_agreement
+from scopemap.actions.against_video import RunFrames, held_out_agreement
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cli import app
+from scopemap.cli.app import app
 from scopemap.cli.run import summary_lines
 from scopemap.depth.perceptual import StructureDistance
-from scopemap.evaluation.surface import distances_mm
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, compare_with_frame
 from scopemap.geometry.rendering import render_mesh
 from scopemap.io.weights import REGISTRY
+from scopemap_bench.evaluation.surface import distances_mm
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 BLACK = np.zeros((64, 80, 3), np.uint8)

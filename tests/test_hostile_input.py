@@ -31,10 +31,10 @@ from test_datasets_endomapper import XML, archive_of, images_bin, write_endomapp
 from test_datasets_endoslam import write_real
 
 from scopemap.errors import InputError, ScopemapError
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.datasets.survey import survey
 
 Capture = pytest.CaptureFixture[str]
 

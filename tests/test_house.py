@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,22 +14,21 @@ from statistics import median, quantiles
 import pytest
 
 import scopemap
+from scopemap.config.config import setting_names
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
 # A package may import those before it, and none after it.
 LAYERS = (
-    *("errors", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
+    *("errors", "plugins", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
     *("masking", "flow", "depth", "tracking", "mapping", "fusion", "calibration"),
-    *("pipeline", "estimators", "reconstruction", "runner", "phantom", "evaluation", "inspection", "benchmark", "cli"),
+    *("pipeline", "estimators", "reconstruction", "runner", "evaluation", "inspection", "actions", "cli"),
 )
 STAGES = {"masking", "flow", "depth", "tracking", "mapping", "fusion"}
 MAY_NOT_IMPORT = {"evaluation": STAGES | {"pipeline", "runner", "reconstruction"}}
 NETWORKS = {"torch", "torchvision", "transformers", "huggingface_hub", "safetensors", "lpips"}
 ADAPTERS = ("depth/", "flow/raft.py", "io/weights.py", "io/device.py")
 FORBIDDEN_NAMES = {"utils", "util", "common", "core", "helpers", "base", "misc"}
-# The one network that the package brings along.
-ALLOWED_BYTES = {"src/scopemap/depth/scopenet/scopenet.onnx": 8_000_000}
 ENDINGS = ("print", "exit", "quit", "sys.exit", "os._exit")
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -56,6 +54,9 @@ class _Module:
         return f"{self.name}:{node.lineno} {getattr(node, 'name', '')}".strip()  # type: ignore[attr-defined]
 
 
+BENCH = ROOT / "bench" / "src"
+
+
 def _read(path: Path) -> _Module:
     text = path.read_text()
     return _Module(path, ast.parse(text), len(text.splitlines()))
@@ -63,8 +64,9 @@ def _read(path: Path) -> _Module:
 
 MODULES = [_read(path) for path in sorted(SOURCE.rglob("*.py"))]
 TESTS = [_read(path) for path in sorted((ROOT / "tests").rglob("*.py"))]
-OTHERS = [
-    _read(path) for name in ("benchmarks", "examples", "training") for path in sorted((ROOT / name).rglob("*.py"))
+BENCH_MODULES = [_read(path) for path in sorted(BENCH.rglob("*.py"))]
+OTHERS = BENCH_MODULES + [
+    _read(path) for name in ("examples", "training") for path in sorted((ROOT / name).rglob("*.py"))
 ]
 
 
@@ -118,7 +120,7 @@ def _none(faults: list[str]) -> None:
 
 
 def test_files_are_short() -> None:
-    _none([f"{m.path.name}: {m.lines} lines" for m in [*MODULES, *TESTS, *OTHERS] if m.lines > 400])
+    _none([f"{m.path.name}: {m.lines} lines" for m in [*MODULES, *BENCH_MODULES, *TESTS, *OTHERS] if m.lines > 400])
 
 
 def test_the_median_file_is_short(record_property: pytest.FixtureRequest) -> None:
@@ -144,8 +146,47 @@ def test_no_function_takes_keywords_it_does_not_name() -> None:
     _none([module.at(f) for module in MODULES for f in module.functions() if f.args.kwarg is not None])
 
 
-def test_there_is_half_as_much_test_as_source() -> None:
-    assert sum(test.lines for test in TESTS) >= 0.5 * sum(module.lines for module in MODULES)
+# ---- ceilings: a change that adds pays for its lines here, or raises a number with its reason
+
+
+def _net(modules: list[_Module]) -> int:
+    """Lines that are neither blank, comment, docstring nor import."""
+    count = 0
+    for module in modules:
+        left_out = set[int]()
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                left_out |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+            elif isinstance(node, ast.Module | ast.ClassDef | Function) and ast.get_docstring(node) is not None:
+                left_out |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+        lines = enumerate(module.path.read_text().splitlines(), start=1)
+        count += sum(bool(x.strip()) and not x.strip().startswith("#") and n not in left_out for n, x in lines)
+    return count
+
+
+def _total(modules: list[_Module]) -> int:
+    return sum(module.lines for module in modules)
+
+
+CEILINGS = {
+    "core": (lambda: _total(MODULES), 31_700),
+    "core, net": (lambda: _net(MODULES), 19_700),
+    "bench": (lambda: _total(BENCH_MODULES), 15_500),
+    "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_830),
+    "tests": (lambda: _total(TESTS), 40_700),
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 170),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 26_000),
+    "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 360),
+    "settings": (lambda: len(setting_names()), 115),
+}
+
+
+@pytest.mark.parametrize("name", CEILINGS)
+def test_ceilings(name: str, record_property: pytest.FixtureRequest) -> None:
+    measure, most = CEILINGS[name]
+    found = measure()
+    record_property(name, found)  # type: ignore[operator]
+    assert found <= most, f"{name}: {found}, the ceiling is {most}; pay for the lines, or raise it with a reason"
 
 
 # ---- imports
@@ -225,6 +266,11 @@ def import_closure(start: str) -> set[str]:
     return found
 
 
+def _of_closure(start: str) -> list[_Module]:
+    modules = _module_names()
+    return [modules[name] for name in import_closure(start)]
+
+
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
@@ -283,7 +329,7 @@ def test_no_time_is_told_by_a_clock_that_may_jump() -> None:
 
 def test_nothing_is_left_for_later() -> None:
     later = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b")
-    found = [(module, later.search(module.path.read_text())) for module in MODULES + OTHERS]
+    found = [(module, later.search(module.path.read_text())) for module in MODULES + BENCH_MODULES + OTHERS]
     _none([f"{module.name}: {match[0]}" for module, match in found if match])
 
 
@@ -333,44 +379,3 @@ def test_public_names() -> None:
         assert getattr(scopemap, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'reconstruckt'"):
         _ = scopemap.reconstruckt
-
-
-# ---- the repository
-
-
-def _project_files() -> list[Path]:
-    """What git tracks, and what it would track."""
-    if shutil.which("git") is None or not (ROOT / ".git").exists():
-        pytest.skip("not a git checkout")
-    listed = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    # Somebody's virtual environment in the clone, whatever its name, is no part of the project.
-    environments = tuple(file.parent for file in ROOT.glob("*/pyvenv.cfg"))
-    paths = (ROOT / name for name in listed.splitlines())
-    return [path for path in paths if path.is_file() and not any(map(path.is_relative_to, environments))]
-
-
-def test_no_file_is_large() -> None:
-    sizes = [(path.relative_to(ROOT).as_posix(), path.stat().st_size) for path in _project_files()]
-    _none([f"{name}: {size} bytes" for name, size in sizes if size > ALLOWED_BYTES.get(name, 1_000_000)])
-
-
-@pytest.mark.parametrize(
-    ("what", "pattern"),
-    [
-        ("a package registry's address", r"https?://[^\s/\"')]*(pypi|pythonhosted|npmjs|crates\.io|conda|artifactory)"),
-        ("a host by its number", r"https?://\d+\.\d+\.\d+\.\d+"),
-        ("a path of one machine", r"(?<![\w.}])/(work|root|home)/\w"),
-    ],
-)
-def test_no_file_names(what: str, pattern: str) -> None:
-    found = []
-    for path in _project_files():
-        content = path.read_bytes()
-        if b"\0" in content[:1000]:
-            continue
-        for number, line in enumerate(content.decode("utf-8", errors="ignore").splitlines(), start=1):
-            if re.search(pattern, line):
-                found.append(f"{path.relative_to(ROOT)}:{number} holds {what}: {line.strip()[:100]}")
-    _none(found)

@@ -9,12 +9,12 @@ import pytest
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
-from scopemap.phantom.spec import PhantomSpec, parse_events
-from scopemap.phantom.writer import write_phantom
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
 from scopemap.report.losses import in_words, losses
 from scopemap.tracking.track import TOO_BRIGHT, TOO_DARK, Status, Track
 from scopemap.trajectory.causes import ADVICE, causes_of_loss
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
+from scopemap_bench.phantom.writer import write_phantom
 
 
 def track(reason: str, motion: float = 0.01, status: Status = "lost") -> Track:

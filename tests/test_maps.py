@@ -16,8 +16,6 @@ import trimesh
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.benchmark.climb_check import submission_problems
-from scopemap.benchmark.climb_submission import write_submission
 from scopemap.cli.run import summary_lines
 from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
@@ -26,19 +24,21 @@ from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
-from scopemap.io.datasets.c3vd import C3vdFolder
 from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
 from scopemap.mapping.map_merging import split_maps
 from scopemap.mapping.reprojection import BundleProblem
 from scopemap.mapping.submaps import corrected_frame
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
 from scopemap.reconstruction import DepthReader
 from scopemap.report.submap_summaries import submaps_in_time
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import RELOCALISED, Track
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.climb.check import submission_problems
+from scopemap_bench.climb.submission import write_submission
+from scopemap_bench.datasets.c3vd import C3vdFolder
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 FIRST, SECOND, LOST_BEFORE_NEW = 10, 13, 2
 LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": LOST_BEFORE_NEW}

@@ -23,14 +23,14 @@ from scopemap.fusion.seen_at import SeenAt
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3_exp
 from scopemap.io.decoding import read_decoded
-from scopemap.phantom.render import prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec, parse_events
-from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Step
 from scopemap.runner.provenance import motion_notes
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.reprojection import nonrigidity
 from scopemap.tracking.track import MOVING_SIGMAS, Track
+from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
+from scopemap_bench.phantom.writer import write_phantom
 
 CAMERA = PinholeCamera(160.0, 160.0, 159.5, 119.5, 320, 240)
 MOTION = se3_exp(np.array([0.01, -0.02, 0.01, 2.0, 0.5, -1.0]))

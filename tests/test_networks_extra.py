@@ -18,8 +18,8 @@ from scopemap.depth.perceptual import create_perceptual
 from scopemap.errors import SettingsError
 from scopemap.flow.create import create_flow
 from scopemap.io import weights
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 PACKAGES = ("torch", "torchvision", "transformers", "huggingface_hub", "safetensors", "lpips")
 COMMAND = f"""
@@ -34,7 +34,7 @@ class Without(PathFinder):
 
 
 sys.meta_path[sys.meta_path.index(PathFinder)] = Without
-from scopemap.cli import main
+from scopemap.cli.app import main
 
 main()
 """

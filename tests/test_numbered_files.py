@@ -14,8 +14,8 @@ import pytest
 from drawn_scared import Files, write_loose, write_tar
 
 from scopemap.errors import InputError
-from scopemap.trajectory.formats import numbered
-from scopemap.trajectory.formats.numbered import NumberedFiles, find_numbered
+from scopemap_bench.trajectories import numbered
+from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered
 
 MB = 1 << 20
 

@@ -8,14 +8,14 @@ import plane_scene as scene
 import pytest
 from plane_scene import CAMERA, EVERYWHERE, SIX_PIXELS_MM, View, pose, see, true_flow
 
-from scopemap.evaluation.correspondences import (
+from scopemap.geometry.se3 import inverse
+from scopemap_bench.evaluation.correspondences import (
     Matches,
     displacement_figures,
     lifted_matches,
     match_features,
     orb_features,
 )
-from scopemap.geometry.se3 import inverse
 
 START = see(pose())
 ASIDE = see(pose(at_mm=(SIX_PIXELS_MM, 0.0, 0.0)))

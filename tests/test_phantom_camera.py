@@ -15,12 +15,12 @@ from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.opening import open_sequence
-from scopemap.phantom.coding import VideoCoding
-from scopemap.phantom.exposing import MAX_SAMPLES, exposure_times, lagging_gains, pose_at
-from scopemap.phantom.march import march, rays_of
-from scopemap.phantom.render import Phantom, light, prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
+from scopemap_bench.phantom.coding import VideoCoding
+from scopemap_bench.phantom.exposing import MAX_SAMPLES, exposure_times, lagging_gains, pose_at
+from scopemap_bench.phantom.march import march, rays_of
+from scopemap_bench.phantom.render import Phantom, light, prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 SMALL = PhantomSpec(width=64, height=48, frames=6, seed=3, noise=0.0)
 

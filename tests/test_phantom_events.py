@@ -10,16 +10,16 @@ import pytest
 
 from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.phantom.camera_path import lumen_path, turned
-from scopemap.phantom.instrument import Capsules, insert, instrument
-from scopemap.phantom.render import Phantom, light, prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec, parse_events
+from scopemap_bench.phantom.camera_path import lumen_path, turned
+from scopemap_bench.phantom.instrument import Capsules, insert, instrument
+from scopemap_bench.phantom.render import Phantom, light, prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 
 SMALL = {"width": 64, "height": 48}
 
 
 def phantom(events: str, frames: int = 30, scene: str = "colon") -> Phantom:
-    return prepare(PhantomSpec(scene=scene, frames=frames, seed=5, events=parse_events(events), **SMALL))  # type: ignore[arg-type]
+    return prepare(PhantomSpec(scene=scene, frames=frames, seed=5, events=parse_events(events), **SMALL))  # type: ignore[arg - type]
 
 
 def turns_deg(poses: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ def test_pushed_tissue_moves_two_ways_and_stays_so() -> None:
 
 
 def test_a_push_writes_the_moved_surfaces(tmp_path: Path) -> None:
-    from scopemap.phantom.writer import write_phantom
+    from scopemap_bench.phantom.writer import write_phantom
 
     spec = PhantomSpec(scene="laparoscopy", frames=2, events=parse_events("push:0-1"), width=32, height=32)
     write_phantom(spec, tmp_path / "pushed")

@@ -13,11 +13,11 @@ import trimesh
 import typer
 from typer.testing import CliRunner
 
-from scopemap.cli.phantom import phantom as phantom_command
 from scopemap.errors import InputError, SettingsError
-from scopemap.phantom.render import prepare, render_frame
-from scopemap.phantom.spec import Event, PhantomSpec, parse_events
-from scopemap.phantom.writer import encode_depth, write_phantom
+from scopemap_bench.cli.phantom import phantom as phantom_command
+from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap_bench.phantom.spec import Event, PhantomSpec, parse_events
+from scopemap_bench.phantom.writer import encode_depth, write_phantom
 
 SPEC = PhantomSpec(frames=3, width=64, height=48, deform=True, breath_frames=4.0, seed=2)
 

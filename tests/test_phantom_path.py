@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.phantom.camera_path import lumen_path, sweep_path
-from scopemap.phantom.render import prepare
-from scopemap.phantom.spec import PhantomSpec
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.phantom.camera_path import lumen_path, sweep_path
+from scopemap_bench.phantom.render import prepare
+from scopemap_bench.phantom.spec import PhantomSpec
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scopemap.phantom.deformation import REST
-from scopemap.phantom.march import march
-from scopemap.phantom.noise import noise_at
-from scopemap.phantom.render import light, prepare, render_frame
-from scopemap.phantom.shading import develop, shade
-from scopemap.phantom.spec import PhantomSpec, parse_events
-from scopemap.phantom.volume import Volume
+from scopemap_bench.phantom.deformation import REST
+from scopemap_bench.phantom.march import march
+from scopemap_bench.phantom.noise import noise_at
+from scopemap_bench.phantom.render import light, prepare, render_frame
+from scopemap_bench.phantom.shading import develop, shade
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
+from scopemap_bench.phantom.volume import Volume
 
 SMALL = {"width": 64, "height": 48, "frames": 6}
 

@@ -8,13 +8,13 @@ import trimesh
 from scipy import ndimage
 
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.phantom.deformation import REST, breathing
-from scopemap.phantom.march import march
-from scopemap.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.volume import Volume
-from scopemap.phantom.writer import seen_surface
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.phantom.deformation import REST, breathing
+from scopemap_bench.phantom.march import march
+from scopemap_bench.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.volume import Volume
+from scopemap_bench.phantom.writer import seen_surface
 
 SMALL = {"width": 96, "height": 80, "frames": 12}
 

@@ -22,9 +22,9 @@ from stored_kinds import KINDS, Kind, put
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.io.datasets.checking import Finding, check, refusal
-from scopemap.io.datasets.survey import survey
 from scopemap.io.opening import open_sequence
+from scopemap_bench.datasets.checking import Finding, check, refusal
+from scopemap_bench.datasets.survey import survey
 
 AT = 3
 LEAST_FAULTS = 12

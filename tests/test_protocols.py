@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.errors import AlignmentError
 from scopemap.evaluation.poses import ErrorSummary, translation_errors_mm
-from scopemap.evaluation.protocols import PROTOCOLS, af_figures
 from scopemap.geometry.align import Similarity, align_trajectories
 from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
 from scopemap.trajectory.trajectory import path_length_mm
+from scopemap_bench.evaluation.protocols import PROTOCOLS, af_figures
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=6, deadline=None)

@@ -11,8 +11,8 @@ import pytest
 from drawn_datasets import WRITERS
 
 from scopemap.frame import TruthQuality
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.opening import DATASETS, open_sequence
+from scopemap.io.opening import open_sequence, readers
+from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence
 from scopemap.masking.mask_files import MaskFiles
 
@@ -30,7 +30,7 @@ def sequence(written: tuple[str, Path]) -> Sequence:
 
 
 def test_every_reader_has_a_copy() -> None:
-    assert {name.split(":")[0] for name in NAMES} >= set(DATASETS)
+    assert {name.split(":")[0] for name in NAMES} >= set(readers())
 
 
 def test_it_is_recognised_and_can_be_named(written: tuple[str, Path]) -> None:

@@ -11,11 +11,11 @@ from drawn_inputs import write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
 
 from scopemap.io import images
-from scopemap.io.datasets.reference import reference_trajectory
-from scopemap.io.datasets.scared import ScaredKeyframe
 from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
 from scopemap.io.video import VideoFile
 from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.datasets.scared import ScaredKeyframe
 
 Writer = Callable[[Path], Path]
 

@@ -16,10 +16,10 @@ from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError, SettingsError
 from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.io.opening import open_sequence
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
 from scopemap.pipeline import Pipeline
 from scopemap.runner.run import reconstruct
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from scopemap.errors import AlignmentError
-from scopemap.evaluation.surface import refine, surface_points
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp, transform
+from scopemap_bench.evaluation.surface import refine, surface_points
 
 
 def landscape(side: int = 45, step_mm: float = 1.0) -> trimesh.Trimesh:

@@ -15,7 +15,7 @@ from tiny_phantom import only_images, write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cli import main
+from scopemap.cli.app import main
 from scopemap.config import Config
 from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.source import SourceFrame

@@ -13,10 +13,10 @@ from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
 from scopemap import Config
-from scopemap.benchmark import speed
-from scopemap.benchmark.speed import STAGES, Speed, measure_speed, read_speed, resolved
-from scopemap.cli import app
+from scopemap.cli.app import app
 from scopemap.errors import InputError
+from scopemap_bench import speed
+from scopemap_bench.speed import STAGES, Speed, measure_speed, read_speed, resolved
 
 
 def _functions() -> list[Callable[..., Any]]:

@@ -12,11 +12,11 @@ from chosen_settings import chosen
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.phantom.render import prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.rtdl import align
 from scopemap.tracking.tracker import Tracker
+from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
 
 SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
 # By what is seen alone: measured depth of the frames would hide what these tests look at.

@@ -14,15 +14,15 @@ from tiny_phantom import write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError
-from scopemap.evaluation.surface import compare_surfaces
-from scopemap.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
-from scopemap.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
 from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.datasets.c3vd import CAMERA
 from scopemap.io.opening import open_sequence
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.datasets.c3vd import CAMERA
+from scopemap_bench.evaluation.surface import compare_surfaces
+from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
+from scopemap_bench.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)
 
@@ -154,7 +154,7 @@ def test_of_tissue_that_breathes_each_view_is_asked_about_its_own_shape(breathin
     assert moving.seen is not None
     assert still.seen is not None
     assert moving.seen.mean() > still.seen.mean() + 0.02
-    assert truth.seen_by(sequence.camera, dict(enumerate(views))).seen.mean() >= moving.seen.mean()  # type: ignore[union-attr]
+    assert truth.seen_by(sequence.camera, dict(enumerate(views))).seen.mean() >= moving.seen.mean()  # type: ignore[union - attr]
     with pytest.raises(InputError, match="frame 7 is not among the 3 mesh files"):
         truth.seen_by(sequence.camera, {7: views[0]})
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from tiny_phantom import SIZE
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.evaluation.visibility import pixels_near, seen_points, visible_from
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
-from scopemap.io.datasets.c3vd import CAMERA, C3vdFolder
-from scopemap.phantom.render import prepare, render_frame
-from scopemap.phantom.spec import PhantomSpec
-from scopemap.phantom.writer import seen_surface
+from scopemap_bench.datasets.c3vd import CAMERA, C3vdFolder
+from scopemap_bench.evaluation.visibility import pixels_near, seen_points, visible_from
+from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import seen_surface
 
 EYE = PinholeCamera(80.0, 80.0, 79.5, 63.5, 160, 128)
 HERE = np.eye(4)

@@ -9,9 +9,9 @@ import numpy as np
 
 from scopemap.config import Config
 from scopemap.geometry.se3 import inverse
-from scopemap.phantom.spec import PhantomSpec, parse_events
-from scopemap.phantom.writer import write_phantom
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
+from scopemap_bench.phantom.writer import write_phantom
 
 FRAMES = 9
 SIZE = (160, 128)

@@ -28,7 +28,7 @@ def demo(
     silent = quiet or as_json
     _tell("preparing a phantom colon; the first time kernels are compiled, too", silent)
     # Imported here, so that --help does not wait for the kernels.
-    from scopemap.benchmark import demonstration
+    from scopemap.actions import demo as demonstration
     from scopemap.config import Config
 
     started = time.perf_counter()

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import typer
 
-from scopemap.benchmark.result import without_nan
+from scopemap.io.provenance import without_nan
 
 _LABELS = {
     "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",

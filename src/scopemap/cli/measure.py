@@ -34,7 +34,7 @@ def measure(
         raise typer.BadParameter("two pixels are needed", param_hint="--reference")
     import numpy as np
 
-    from scopemap.benchmark import measuring
+    from scopemap.actions import measure as measuring
 
     unit = None if known is None else np.array(known)
     found = measuring.measure(run, frame, np.array(pixels), unit, reference_mm)

@@ -16,7 +16,7 @@ def report(
     ] = False,
 ) -> None:
     """Write report.html and summary.png of a run into its folder."""
-    from scopemap.benchmark.pictures_again import keep_pictures_again
+    from scopemap.actions.pictures import keep_pictures_again
     from scopemap.errors import InputError
     from scopemap.report.frame_pictures import pictured_frames
     from scopemap.report.page import write_report

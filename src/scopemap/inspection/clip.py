@@ -5,20 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
 from scopemap.inspection.frame_measures import FrameMeasures
-from scopemap.io.datasets import checking
 
 _NAMED = 4
+Severity = Literal["error", "warning", "info"]
 
 Segment = tuple[int, int]
 """First and last position of frames that follow each other; positions count from 0, as `--frames` does."""
 
 
 @dataclass(frozen=True)
-class VideoFinding(checking.Finding):
+class Finding:
+    """A fault or an assumption: its severity, a short code, one sentence."""
+
+    severity: Severity
+    code: str
+    message: str
+
+
+@dataclass(frozen=True)
+class VideoFinding(Finding):
     """One finding: `advice` is the option in full, or ""; `segments` are its frames, empty: the whole video."""
 
     advice: str = ""

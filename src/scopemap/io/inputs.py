@@ -12,7 +12,7 @@ from pathlib import Path
 from scopemap.errors import InputError, check_bytes, reporting
 from scopemap.io.addresses import RemoteFile, is_address, remote_files
 from scopemap.io.images import ImageFolder
-from scopemap.io.opening import DATASETS, VIDEO_ENDINGS
+from scopemap.io.opening import VIDEO_ENDINGS, readers
 
 LIST, TABLE = ".txt", ".csv"
 _COLUMN = "input"
@@ -102,7 +102,7 @@ def _paths(path: Path) -> list[Path]:
 def _in_folder(folder: Path, depth: int = 0) -> Iterator[Path]:
     """Yield the inputs in a folder, in the order of their names; links to folders are not followed."""
     try:
-        if any(kind.recognises(folder) for kind in DATASETS.values() if kind is not ImageFolder):
+        if any(kind.recognises(folder) for kind in readers().values() if kind is not ImageFolder):
             yield folder
             return
         with os.scandir(folder) as entries:

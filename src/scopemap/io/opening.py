@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +15,9 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.c3vd import C3vdFolder
-from scopemap.io.datasets.climb import ClimbClip
 from scopemap.io.datasets.colmap import ColmapFolder
 from scopemap.io.datasets.dicom import Dicom
-from scopemap.io.datasets.endomapper import EndoMapperSequence
-from scopemap.io.datasets.endomapper_sim import EndoMapperSimFolder
-from scopemap.io.datasets.endonerf import EndoNerfFolder
-from scopemap.io.datasets.endoslam import EndoSlamFolder
-from scopemap.io.datasets.hamlyn import HamlynFolder, HamlynTrackingFolder
-from scopemap.io.datasets.oneslam import OneSlamFolder
 from scopemap.io.datasets.rosbag import RosBag
-from scopemap.io.datasets.scared import ScaredCKeyframe, ScaredKeyframe
-from scopemap.io.datasets.servct import ServCtFolder
-from scopemap.io.datasets.sevenscenes import SevenScenesFolder
-from scopemap.io.datasets.simcol import SimColFolder
-from scopemap.io.datasets.stereomis import StereoMisFolder
-from scopemap.io.datasets.tum import TumRgbdFolder
 from scopemap.io.decoding import most_pixels
 from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.images import ImageFolder
@@ -38,16 +25,9 @@ from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import Source, assumed_camera
 from scopemap.io.video import VideoFile
+from scopemap.plugins import plugins
 
-_KINDS: tuple[type[Source], ...] = (
-    *(ScaredCKeyframe, ScaredKeyframe, HamlynFolder, HamlynTrackingFolder, EndoSlamFolder, SimColFolder),
-    *(EndoMapperSequence, ClimbClip, EndoMapperSimFolder, StereoMisFolder, C3vdFolder, EndoNerfFolder),
-    *(ServCtFolder, SevenScenesFolder, TumRgbdFolder, OneSlamFolder, ColmapFolder),
-    *(RosBag, Dicom, VideoFile, ImageFolder),
-)
-DATASETS = {kind.name: kind for kind in _KINDS}
-"""The readers by name, in the order in which `recognises` is called."""
-
+_OWN_KINDS: tuple[type[Source], ...] = (ColmapFolder, RosBag, Dicom, VideoFile, ImageFolder)
 _OF_FILES = (RosBag.name, Dicom.name, VideoFile.name)
 # Those that need no folder inside that of the input.
 _WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
@@ -59,6 +39,13 @@ _SMALLEST_SIDE_PX, _LARGEST_SIDE_PX = 32, 32_000  # OpenCV's `remap` ends at 327
 _LEAST_SEEN_SHARE = 0.05
 _SEARCH_DEPTH = 5
 _DEEPEST_CLOSED, _MOST_FOLDERS = 4, 500
+
+
+@cache
+def readers() -> dict[str, type[Source]]:
+    """Return the readers by name, in the order in which `recognises` is called: those of plug-ins come first."""
+    added = [kind for _, kinds in plugins("scopemap.readers") for kind in kinds]
+    return {kind.name: kind for kind in (*added, *_OWN_KINDS)}
 
 
 def open_sequence(
@@ -73,7 +60,7 @@ def open_sequence(
 ) -> Sequence:
     """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
 
-    `dataset` names the reader (`DATASETS`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
+    `dataset` names the reader (`readers`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
     camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
     of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: by
     `settings.longest_side_px`. `frames` selects positions in the input. `settings` are those of reading. Raises
@@ -152,15 +139,15 @@ def _errors_of_the_system(path: Path | str) -> Iterator[None]:
 
 def _reader(path: Path, dataset: str | None) -> Source:
     dataset, _, part = (dataset or "").partition(":")
-    if dataset and dataset not in DATASETS:
-        raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(DATASETS)}")
+    if dataset and dataset not in readers():
+        raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(readers())}")
     if not path.exists():
         raise InputError(f"reading {path}: no such file or folder")
     if not path.is_dir() and not path.is_file():
         raise InputError(f"reading {path}: it is no file and no folder")
     closed = _closed_folders(path) if path.is_dir() else []
     path = _innermost(path, dataset or None) if path.is_dir() else path
-    kind = dataset or next((name for name, kind in DATASETS.items() if kind.recognises(path)), "")
+    kind = dataset or next((name for name, kind in readers().items() if kind.recognises(path)), "")
     if not kind and path.is_dir():
         _refuse_videos(path)
     kind = kind or ImageFolder.name
@@ -169,9 +156,9 @@ def _reader(path: Path, dataset: str | None) -> Source:
     if part and kind != RosBag.name:
         raise InputError(f"reading {path} as {kind}: only {RosBag.name}:TOPIC has something after a colon")
     within = next((folder for folder in closed if folder.is_relative_to(path)), None)
-    if within is not None and DATASETS[kind] not in _WITHOUT_LAYOUT:
+    if within is not None and readers()[kind] not in _WITHOUT_LAYOUT:
         raise InputError(f"reading {path}: no permission to look into {within}")
-    reader = RosBag(path, part or None) if kind == RosBag.name else DATASETS[kind](path)
+    reader = RosBag(path, part or None) if kind == RosBag.name else readers()[kind](path)
     reader.warnings += [f"left out: no permission to look into {folder}" for folder in closed[:_MOST_NAMED]]
     return reader
 
@@ -206,12 +193,12 @@ def _innermost(path: Path, dataset: str | None) -> Path:
     A bag or a DICOM file that is beside a data set or `images` does not hide them.
     """
     if dataset is not None:
-        return _recognised_below(path, (DATASETS[dataset],)) or path
-    others = tuple(kind for kind in _KINDS if kind not in (RosBag, Dicom))
+        return _recognised_below(path, (readers()[dataset],)) or path
+    others = tuple(kind for kind in readers().values() if kind not in (RosBag, Dicom))
     found = _recognised_below(path, others)
     is_alone = found is not None and found != path and found.name != _IMAGES
     if found is None or (is_alone and not any(k.recognises(found) for k in others if k not in _WITHOUT_LAYOUT)):
-        found = _recognised_below(path, _KINDS)
+        found = _recognised_below(path, tuple(readers().values()))
     return found or path
 
 

@@ -14,7 +14,7 @@ import trimesh
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.geometry.align import align_trajectories
-from scopemap.io.datasets.reference import read_reference
+from scopemap.io.reference import read_reference
 from scopemap.report.frame_pictures import mask_of
 from scopemap.report.kept_run import NOT_USED, KeptRun
 from scopemap.report.losses import losses

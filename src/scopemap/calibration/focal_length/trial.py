@@ -7,7 +7,8 @@ parameter but the focal length: the radius of a ray at the angle t from the axis
 
 The cost of a lens is that of its reprojection errors, in pixels of the picture, so that lenses can be compared, by
 Cauchy's kernel. Errors of neighbouring corners, and those of a corner in successive frames, are alike: `_CORRELATED`
-of them count as one, a number chosen on phantoms (benchmarks/focal_length.py). What is left is a probability over
+of them count as one, a number chosen on phantoms (scopemap_bench/scripts/focal_length.py). What is left is a
+probability over
 kinds and focal lengths.
 """
 

@@ -1,14 +1,4 @@
-"""Text files of poses. One a line: TUM (8 numbers), KITTI (12), C3VD (16), and what OneSLAM and BodySLAM write.
-
-OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes alone to `poses_pred.txt`, as TUM rows
-camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same form.
-BodySLAM (github.com/GuidoManni/BodySLAM, save_poses_as_kitti) writes camera-to-world KITTI lines without a unit.
-
-A `.log` has a line of three integers per pose, then four lines of its 4x4 matrix. The form is Redwood's
-(redwood-data.org/indoor/fileformat.html); Open3D (io/file_format/FileLOG.cpp) writes `i i i+1` and the camera-to-world
-matrix. Endo-Depth-and-Motion (UZ-SLAMLab) writes `trajectory.log` with Open3D, but puts its world-to-camera matrices,
-in metres, there. The two look alike, so a `.log` is read only when its kind is named.
-"""
+"""Text files of poses, one a line: TUM (8 numbers), KITTI (12), C3VD (16)."""
 
 from __future__ import annotations
 
@@ -19,12 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.errors import InputError, reporting
-from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.formats.poses import are_frame_numbers, file_of, from_quaternions, rigid, stamped
 from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
-
-LOG_FILE = "trajectory.log"
-ONESLAM_FILES = ("poses_pred.txt", "poses_gt.txt")
 
 
 @dataclass(frozen=True)
@@ -134,15 +120,6 @@ def read_tum(path: Path, unit: Unit) -> Trajectory:
     return stamped(T, stamps, None, f"{source}, whole stamps taken for frame numbers")
 
 
-def read_oneslam(path: Path, unit: Unit) -> Trajectory:
-    """Read the keyframes of a OneSLAM run, or the `poses_gt.txt` of a data set in its layout."""
-    table = read_numbers(file_of(path, ONESLAM_FILES)).with_columns(8, "OneSLAM").sorted_by_stamp()
-    stamps, (T, words) = table.values[:, 0], tum_poses(table, unit)
-    if not are_frame_numbers(stamps):
-        raise InputError(f"{table.path}: OneSLAM stamps poses by frame number; with seconds the kind is 'tum'")
-    return stamped(T, stamps, None, f"OneSLAM, TUM rows by frame number, camera-to-world, {words}")
-
-
 def read_kitti(path: Path, unit: Unit) -> Trajectory:
     """Read KITTI rows, the upper 3x4 of a camera-to-world pose each; row = frame number, from 0."""
     table = read_numbers(file_of(path, ())).with_columns(12, "KITTI")
@@ -173,27 +150,3 @@ def read_c3vd(path: Path, unit: Unit) -> Trajectory:
 def read_poses(path: Path) -> np.ndarray:
     """Return the camera-to-world poses (N, 4, 4), mm, of C3VD's `pose.txt`; see `read_c3vd`. Raises `InputError`."""
     return read_c3vd(Path(path), "mm").T_world_camera
-
-
-def read_open3d(path: Path, unit: Unit) -> Trajectory:
-    """Read a log of camera-to-world poses, in `unit`; its first integers are the frames' numbers where they ascend."""
-    T, indices = _read_log(file_of(path, (LOG_FILE,)), unit)
-    return stamped(T, indices, None, f"Open3D log, camera-to-world, {unit} (assumed)")
-
-
-def read_endo_depth(path: Path, unit: Unit) -> Trajectory:
-    """Read a log of Endo-Depth-and-Motion: world-to-camera, always metres."""
-    T, indices = _read_log(file_of(path, (LOG_FILE,)), "m")
-    return stamped(inverse(T), indices, None, "Endo-Depth-and-Motion log, world-to-camera inverted, m")
-
-
-def _read_log(path: Path, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
-    rows = read_rows(path)
-    heads = rows[::5]
-    if [len(numbers) for _, numbers in rows] != [3, 4, 4, 4, 4] * len(heads):
-        raise InputError(f"reading {path}: a log has lines of 3, 4, 4, 4 and 4 numbers for each pose")
-    T = np.array([numbers for row, (_, numbers) in enumerate(rows) if row % 5]).reshape(-1, 4, 4)
-    T[:, :3, 3] *= MM_PER_UNIT[unit]
-    indices = np.array([numbers[0] for _, numbers in heads])
-    ascend = are_frame_numbers(indices) and bool(np.all(np.diff(indices) > 0))
-    return rigid(T, [f"{path}, line {line}" for line, _ in heads]), indices if ascend else np.arange(len(T))

@@ -1,0 +1,1 @@
+"""Measures scopemap: plans, scoring, tables, baselines, phantoms, and research data sets."""

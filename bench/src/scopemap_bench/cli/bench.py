@@ -1,0 +1,149 @@
+"""`scopemap bench`: methods side by side on the sequences of a plan; `scopemap bench speed`: the time of each stage."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from scopemap.cli.figures import print_json
+from scopemap.cli.options import AsJson, Quiet
+
+if TYPE_CHECKING:
+    from scopemap_bench.entry import Entry
+    from scopemap_bench.result import RunResult
+    from scopemap_bench.speed import Speed
+
+_Preset = Literal["default", "paper", "paper-strict", "realtime"]
+_TOLERANCE = 0.25  # share by which a stage may be slower: measurements of one machine differ by a tenth
+
+
+def bench(
+    plan: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PLAN|speed",
+            help="A TOML file, or one of the plans of the package; without it these are listed. speed: the processor "
+            "time of each stage.",
+        ),
+    ] = None,
+    video: Annotated[
+        Path | None, typer.Argument(metavar="[VIDEO]", help="What speed measures; by default a phantom.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for runs, tables and figures; continues an earlier call.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the plan's paths.")] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Only print sequences, rows, weights that are missing, and the hours expected."),
+    ] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
+    timeout_s: Annotated[
+        float | None, typer.Option("--timeout", min=1, help="Seconds after which a run is ended.")
+    ] = None,
+    paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
+    frames: Annotated[int | None, typer.Option(min=2, help="speed: frames of the video, from the first.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="speed: names the stages that are slower than in FILE, printed by --json."),
+    ] = None,
+    preset: Annotated[_Preset | None, typer.Option(help="speed: preset of the run, by default default.")] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a benchmark's plan, or the rest of it, and write its tables and figures."""
+    of_plans = {"--out": out, "--data": data, "--timeout": timeout_s}
+    of_plans |= {"--dry-run": dry_run or None, "--retry": retry or None, "--paper-units": paper_units or None}
+    of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset}
+    unused = of_plans if plan == "speed" else of_speed
+    if given := [name for name, value in unused.items() if value is not None]:
+        raise typer.BadParameter(f"only {'plans take' if plan == 'speed' else 'speed takes'} it", param_hint=given[0])
+    if plan == "speed":
+        _print_speed(video, frames, preset or "default", compare, as_json)
+        return
+    from scopemap_bench.plan import read_plan
+
+    if plan is None:
+        _list_plans()
+        return
+    if dry_run:
+        from scopemap_bench.preview import describe
+
+        for line in describe(read_plan(plan), out or Path("."), data):
+            typer.echo(line)
+        return
+    if out is None:
+        raise typer.BadParameter("needed with a plan: the folder for runs, tables and figures", param_hint="--out")
+    from scopemap_bench.figures import FinishedRun, write_results
+    from scopemap_bench.runner import run_plan
+
+    def tell(entry: Entry, result: RunResult, known: bool) -> None:
+        if not (quiet or as_json):
+            typer.echo(_line(result, known))
+
+    benchmark = run_plan(read_plan(plan), out, data=data, retry=retry, timeout_s=timeout_s, listener=tell)
+    runs = [
+        FinishedRun(result, entry.run_folder, entry.open)
+        for entry, result in zip(benchmark.entries, benchmark.results, strict=True)
+    ]
+    title = benchmark.plan.title
+    files = write_results(runs, out, title=title, notes=benchmark.notes, paper_units=paper_units)
+    for note in [] if quiet else benchmark.notes:
+        typer.echo(f"note: {note}", err=True)
+    if as_json:
+        print_json([asdict(result) for result in benchmark.results])
+    elif not quiet:
+        typer.echo(f"{len(files)} tables and figures in {out}; results.md holds the tables")
+
+
+def _print_speed(video: Path | None, frames: int | None, preset: _Preset, compare: Path | None, as_json: bool) -> None:
+    """Measure and print; ends with code 1 where a stage is slower than in the file to compare with."""
+    from scopemap.config import Config
+    from scopemap_bench.speed import measure_speed, read_speed
+
+    before = None if compare is None else read_speed(compare)
+    speed = measure_speed(video, Config.load(preset), frames)
+    if as_json:
+        print_json(speed.json())
+    else:
+        _print_stages(speed)
+    slower = [] if before is None else speed.slower_than(before, _TOLERANCE)
+    for line in slower:
+        typer.echo(f"slower: {line}", err=True)
+    if slower:
+        raise typer.Exit(1)
+    if before is not None and not as_json:
+        typer.echo(f"no stage is more than {_TOLERANCE:.0%} slower than in {compare}")
+
+
+def _print_stages(speed: Speed) -> None:
+    width, height = speed.size
+    typer.echo(f"{speed.clip}: {speed.frames} frames of {width}x{height} px, processor time per frame")
+    typer.echo(f"calibration (one DIS flow at 320x256 px): {speed.calibration_ms:.1f} ms\n")
+    typer.echo(f"{'stage':28s}{'ms':>8s}{'ratio':>8s}{'share':>8s}  thread")
+    for name, stage in speed.stages.items():
+        typer.echo(f"{name:28s}{stage.ms:8.2f}{stage.ratio:8.2f}{stage.share:8.1%}  {stage.thread}")
+    passed = f"{speed.passed_ms:.1f} ms passed, {1e3 / speed.passed_ms:.1f} frames/s"
+    typer.echo(f"\nwhole process, start and compilers too: {speed.cpu_ms:.1f} ms of processor time, {passed}")
+
+
+def _list_plans() -> None:
+    from scopemap_bench.plan import read_plan, shipped_plans
+
+    for name in shipped_plans():
+        plan = read_plan(name)
+        typer.echo(f"{name}: {plan.title}, {len(plan.method)} methods\n    {plan.description}")
+
+
+def _line(result: RunResult, known: bool) -> str:
+    start = f"{result.sequence}: {result.method}: "
+    again = " (kept)" if known else ""
+    if result.status != "done":
+        return f"{start}{'failed, ' if result.status == 'failed' else ''}{result.error}{again}"
+    poses, timing = result.figures.get("poses", {}), result.timing
+    scored = f"ATE {poses['ate_rmse_mm']:.3f} mm, " if poses.get("ate_rmse_mm") is not None else ""
+    pace = timing.get("ms_per_frame")
+    return f"{start}{scored}{f'{pace:.0f} ms a frame' if pace else 'done'}{again}"

@@ -1,0 +1,62 @@
+"""`scopemap compare`: finished runs, and other people's trajectories, side by side."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.cli.figures import print_json
+from scopemap.cli.options import Align, AsJson, Quiet, Unit
+
+
+def compare(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Runs' folders, a benchmark's runs, or trajectory files of any system."),
+    ],
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="True poses: a data set's folder or a trajectory file; a benchmark's runs need none."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
+    names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
+    align: Annotated[
+        Align, typer.Option(help="Alignment; a benchmark's runs keep the figures that they were measured with.")
+    ] = "sim3",
+    unit: Annotated[Unit, typer.Option(help="Unit of trajectory files that do not state one.")] = "mm",
+    consistency: Annotated[
+        bool, typer.Option("--consistency", help="Also the consistency of depth over time.")
+    ] = False,
+    paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure runs against one truth, and print and write their tables and figures."""
+    from scopemap.report.kept_run import is_run
+    from scopemap.report.page import PAGE, write_comparison
+    from scopemap_bench.comparison import compare as compare_runs
+    from scopemap_bench.figures import write_results
+    from scopemap_bench.plan import ProtocolPlan
+    from scopemap_bench.tables import benchmark_tables
+
+    protocol = ProtocolPlan(align=align, consistency=consistency)
+    given = [name.strip() for name in names.split(",")] if names else []
+    runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
+    results = [run.result for run in runs]
+    files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
+    finished = [run for run in runs if is_run(run.folder)]
+    if out is not None and finished:
+        names_shown = [f"{run.result.method}, {run.result.sequence}" for run in finished]
+        files.append(write_comparison([run.folder for run in finished], names_shown, out / PAGE))
+    if as_json:
+        print_json([asdict(result) for result in results])
+    elif not quiet:
+        overview = benchmark_tables(results)[0].without_empty()
+        typer.echo(overview.markdown())
+        typer.echo(overview.caption)
+        if files:
+            seen = f", {PAGE} shows the runs" if finished else ""
+            typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables{seen}")

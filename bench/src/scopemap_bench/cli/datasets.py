@@ -1,0 +1,92 @@
+"""`scopemap datasets`: list the data sets that are read, and check one."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scopemap.cli.figures import print_findings, print_json, print_table, print_values
+from scopemap.cli.options import AsJson, CameraFile, Dataset, Quiet, SetPairs, parse_settings
+from scopemap.cli.progress import count_progress
+from scopemap.errors import InputError, ScopemapError
+
+if TYPE_CHECKING:
+    from scopemap_bench.datasets.checking import Finding
+
+app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """List the data sets that are read, in the order in which they are recognised."""
+    from scopemap.io.opening import readers
+
+    # The docstrings of a reader's module and of its `recognises` are the only description of a data set.
+    rows = [
+        {
+            "name": name,
+            "what": _first_line(sys.modules[kind.__module__]),
+            "recognised": _first_line(kind.recognises).removeprefix("Whether "),
+        }
+        for name, kind in readers().items()
+    ]
+    if as_json:
+        print_json(rows)
+    elif not quiet:
+        print_table(("name", "what it is", "recognised where"), (row.values() for row in rows))
+
+
+@app.command()
+def check(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A video, a folder of images or a data set's folder.")],
+    dataset: Dataset = None,
+    camera: CameraFile = None,
+    settings: SetPairs = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Read a data set once and report errors in its frames, camera, poses and depth; exit code 1 with errors."""
+    from scopemap.config import Config
+    from scopemap.io.opening import open_sequence
+    from scopemap_bench.datasets.checking import check as findings_of
+    from scopemap_bench.datasets.checking import refusal
+    from scopemap_bench.datasets.survey import survey
+
+    figures: dict[str, Any] = {}
+    # Pictures that repeat are to be found here, not left out.
+    reading = Config.load(settings={"input.skip_duplicates": False} | parse_settings(settings or [])).input
+    try:
+        sequence = open_sequence(path, dataset=dataset, camera=camera, settings=reading)
+    except ScopemapError as error:
+        findings = [refusal(error)]
+    else:
+        with count_progress("checking", "checked", silent=quiet or as_json) as listener:
+            found = survey(sequence, listener)
+        figures, findings = found.figures, findings_of(found)
+    if as_json:
+        print_json({"path": str(path), "figures": figures, "findings": [asdict(finding) for finding in findings]})
+    elif not quiet:
+        _print(path, figures, findings)
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        more = f" (and {len(errors) - 1} more error(s))" if len(errors) > 1 else ""
+        raise InputError(f"checking {path}: {errors[0].code}: {errors[0].message}{more}")
+
+
+def _first_line(documented: object) -> str:
+    return (inspect.getdoc(documented) or "").split("\n")[0].rstrip(".")
+
+
+def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None:
+    typer.echo(str(path))
+    if figures:
+        print_values(figures)
+    print_findings([(finding.severity, finding.code, finding.message) for finding in findings])
+    counts = Counter(finding.severity for finding in findings)
+    typer.echo(f"errors: {counts['error']}, warnings: {counts['warning']}")

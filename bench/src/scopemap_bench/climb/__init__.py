@@ -1,0 +1,1 @@
+"""The CLiMB challenge: submissions and their check."""

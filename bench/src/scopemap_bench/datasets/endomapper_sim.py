@@ -1,0 +1,95 @@
+"""EndoMapper's simulated colon, rendered with Unity: pictures, depth and poses (doi 10.1038/s41597-023-02564-7).
+
+`rgb/image_NNNN.png`, `depth/aov_image_NNNN.exr` (the depth buffer, in channel R), and `trajectory.csv` with a row
+`tX;tY;tZ;rX;rY;rZ;rW;time(s)` per picture, from 0: camera-to-world, decimetres. `calibration.txt` holds the pinhole.
+
+The depth buffer v runs from 1 at 1 mm to 0 at 400 mm: the depth is 1 dm / (0.25 + 99.75 v).
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.reading import stated_calibration
+from scopemap.errors import InputError, reporting
+from scopemap.io.decoding import check_pixels
+from scopemap.io.images import by_number
+from scopemap_bench.datasets.unity import UnityFolder
+
+CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)
+"""As published with the simulated sequences."""
+
+_TRAJECTORY, _CALIBRATION = "trajectory.csv", "calibration.txt"
+_MM_PER_DM = 100.0
+_NEAR_DM, _FAR_DM = 0.01, 4.0
+_ASPECT_TOLERANCE = 0.01
+
+
+class EndoMapperSimFolder(UnityFolder):
+    """One simulated sequence; `camera.yaml` beside it is preferred, its `depth_scale` is the mm of a unit (dm)."""
+
+    name = "endomapper-sim"
+    quality = "exact"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, list(by_number((path / "rgb").glob("image_*.png")).values()))
+        self.depth_files = by_number((path / "depth").glob("aov_image_*.exr"))
+        self._read_table(path / _TRAJECTORY, _MM_PER_DM)
+        self.notes += [
+            f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "
+            "the data set does not state which they are, and others use them unconverted",
+            "depth: 1 dm / (0.25 + 99.75 v) of channel R, which other readers take in other ways",
+        ]
+        without = sum(number not in self.poses for number in self.numbers)
+        if without:
+            self._warn(f"{path / _TRAJECTORY}: {without} of {self.count} images have no pose in it")
+        if self.depth_files and find_spec("OpenEXR") is None:
+            self.depth_files = {}
+            self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install -e '.[datasets]'")
+        file = path / _CALIBRATION
+        if self.camera is None and file.is_file():
+            camera = stated_calibration(file, (self.width, self.height)).camera
+            self._set_camera(camera, _CALIBRATION, str(file))
+        elif self.camera is None:
+            self._set_camera(CAMERA, "published calibration of the simulated sequences", "shipped for it")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` holds `rgb/image_*.png`, `depth/aov_image_*.exr` and `trajectory.csv`."""
+        folders = any((path / "rgb").glob("image_*.png")) and any((path / "depth").glob("aov_image_*.exr"))
+        return folders and (path / _TRAJECTORY).is_file()
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        file = self.depth_files.get(index)
+        if file is None:
+            return None
+        v = read_exr_red(file)
+        rows, columns = v.shape
+        if abs(columns * self.height / (rows * self.width) - 1) > _ASPECT_TOLERANCE:
+            raise InputError(
+                f"reading {file}: depth of {columns}x{rows} px for images of {self.width}x{self.height} px"
+            )
+        # A depth buffer holds 0 to 1; NaN compares false.
+        v = np.where((v >= 0) & (v <= 1), v, np.float32(np.nan))
+        depth_dm = 1 / (1 / _FAR_DM + (1 / _NEAR_DM - 1 / _FAR_DM) * v)
+        return (depth_dm * (self.depth_scale_mm or _MM_PER_DM)).astype(np.float32)
+
+
+def read_exr_red(file: Path) -> np.ndarray:
+    """Return the channel R, or Y of a file without R, as (h, w) float32.
+
+    Raises `InputError` for a file that is damaged, has neither channel, or claims more pixels than `decoding` allows.
+    """
+    import OpenEXR
+
+    with reporting(f"reading {file}: no OpenEXR image with a channel R or Y, or damaged"):
+        # Header first: the file's claim is checked before its pixels are decoded.
+        corners = OpenEXR.File(str(file), header_only=True).header()["dataWindow"]
+        width, height = (np.subtract(*reversed(corners), dtype=np.int64) + 1).tolist()
+        check_pixels(width * height, f"reading {file}")
+        channels = OpenEXR.File(str(file), separate_channels=True).channels()
+        return np.array(channels["R" if "R" in channels else "Y"].pixels, dtype=np.float32)

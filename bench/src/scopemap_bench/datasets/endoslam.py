@@ -1,0 +1,189 @@
+"""EndoSLAM: endoscopes and capsules in ex-vivo organs, held by a robot, and the same rendered in Unity.
+
+Real: `Cameras/HighCam/Colon-I/TumorfreeTrajectory_1/{Frames/frame_000060.jpg, Poses/*.xlsx}`. Rendered:
+`UnityCam/Colon/{Frames/image_0000.png, Pixelwise Depths/aov_image_0000.png, Poses/colon_position_rotation.csv}`; copies
+repeat folders (`Frames/Frames`, `Depths/Pixelwise Depths`). `Calibration/cam.txt` (3x3) is beside a camera's organs.
+
+The csv is a table of Unity, row = image number. The xlsx of the robot has the columns `ImageFrame` (the number in the
+image's name), `trans_x,y,z` (metres) and the quaternion `quot_x,y,z,w`. Not documented: the unit of Unity and of
+rendered depth, the frame and axes of the robot. Ozyoruk et al., "EndoSLAM dataset and an unsupervised monocular visual
+odometry and depth estimation approach for endoscopic videos", arXiv 2006.16670.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.errors import InputError, check_bytes, reporting
+from scopemap.frame import TruthQuality
+from scopemap.io.decoding import read_decoded
+from scopemap.io.images import image_files, numbered_images
+from scopemap.trajectory.formats.poses import poses_by_row
+from scopemap_bench.datasets.unity import UnityFolder
+
+UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
+"""UnityCam's `cam.txt` as others quote it, for copies without it."""
+
+RATES_HZ = {"HighCam": 20.0, "LowCam": 20.0, "MiroCam": 3.0, "UnityCam": 30.0, "OlympusCam": 30.0}
+"""Frames per s by the data set's table; PillCam's vary from 4 to 35."""
+
+DEPTH_UNIT_MM = 10.0
+"""Rendered depth read as cm, as most do; its unit is not documented."""
+
+_FRAMES = ("Frames", "Frames/Frames")
+_POSES = ("Poses", "Poses/Poses")
+_DEPTHS = ("Pixelwise Depths", "Depths/Pixelwise Depths", "Pixelwise Depths/Pixelwise Depths")
+_POSE_FILES = ("*position_rotation.csv", "*.xlsx")
+_TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
+_COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
+_MM_PER_METRE = 1000.0
+_SAME = 1e-6
+# Some hundred thousand cells; in memory they take many times as much.
+_MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
+
+
+class EndoSlamFolder(UnityFolder):
+    """The frames of one trajectory; `camera.yaml` beside `Frames` replaces `cam.txt`.
+
+    Raises `InputError` where images and poses do not fit together.
+    """
+
+    name = "endoslam"
+    quality: TruthQuality = "exact"
+    depth_code = ((8, DEPTH_UNIT_MM, 254),)  # 255 was clipped
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _frame_files(path))
+        self._check_numbers()
+        self.depth_files = next((depths for name in _DEPTHS if (depths := numbered_images(path / name))), {})
+        found = (file for name in _POSES for pattern in _POSE_FILES for file in sorted((path / name).glob(pattern)))
+        # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
+        file = next((file for file in found if file.is_file() and not file.name.startswith((".", "~"))), None)
+        rendered = bool(self.depth_files) or (file is not None and file.suffix.lower() == ".csv")
+        usual = "UnityCam" if rendered else "HighCam" if file else ""
+        camera = next((part for part in reversed(path.absolute().parts) if part in RATES_HZ), usual)
+        self.rate_hz = RATES_HZ.get(camera, self.rate_hz)
+        rate_source = f"published rate of {camera}" if camera else "assumed"
+        self.notes = [f"time stamps: image number / {self.rate_hz:g} s ({rate_source})"]
+        if self.depth_files:
+            self.notes.append("depth: 8 bit, unit not documented, read as cm; compare after aligning scale")
+        if file is None:
+            self.warnings.append(f"no pose is known: looked for {' and '.join(_POSE_FILES)} in Poses")
+        elif file.suffix.lower() == ".csv":
+            self._check_poses(file, self._read_rendered(file))
+        else:
+            self._check_poses(file, self._read_robot(file))
+        if self.camera is None:
+            self._set_published(rendered)
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` holds `Frames` with images, and `Poses` or depth beside it or a trajectory's name."""
+        named = _TRAJECTORY.fullmatch(path.absolute().name) is not None
+        known = named or any((path / name).is_dir() for name in (_POSES[0], *_DEPTHS))
+        return known and bool(_frame_files(path))
+
+    def _read_rendered(self, file: Path) -> int:
+        """Read Unity's table and return the number of its rows."""
+        count = self._read_table(file, _MM_PER_METRE)
+        rotations = np.array([T[:3, :3] for T in self.poses.values()])
+        if len(rotations) > 1 and np.ptp(rotations, axis=0).max() < _SAME:
+            self.warnings.append(f"{file.name}: all rotations are the same; errors of rotation against it mislead")
+        self.notes += [
+            "poses: their unit is not documented, read as metres; compare after aligning scale",
+            "poses: Unity's left-handed axes, y mirrored to OpenCV's (EndoGSLAM mirrors z; neither is documented)",
+            f"poses: row of {file.name} = image number, from 0 (it does not state it)",
+        ]
+        return count
+
+    def _read_robot(self, file: Path) -> int:
+        """Read the robot's spreadsheet and return the number of its rows."""
+        self.quality = "kinematic"
+        rows, where = _sheet_rows(file)
+        for row, T in poses_by_row(rows[:, 1:], _MM_PER_METRE, where).items():
+            image = rows[row, 0]
+            if not (np.isfinite(image) and image >= 0 and image == int(image)):
+                raise InputError(f"{where[row]}: ImageFrame must be the number of an image, found {image:g}")
+            self.poses[int(image)] = T
+        self.notes += [
+            "poses: metres, as in the file; whether of camera or robot hand, and in which axes, is not documented",
+            "poses: joined by ImageFrame = number in the image's name",
+        ]
+        return len(rows)
+
+    def _check_poses(self, file: Path, count: int) -> None:
+        without = sum(number not in self.poses for number in self.numbers)
+        if without == len(self.numbers):
+            raise InputError(
+                f"reading {self.path}: no image has a pose in {file} ({count} rows; images {self.numbers[0]} to "
+                f"{self.numbers[-1]}); do they belong together?"
+            )
+        if without or count != len(self.numbers):
+            self.warnings.append(
+                f"{file.name} holds {count} rows for {len(self.numbers)} images; {without} images have no pose"
+            )
+
+    def _set_published(self, rendered: bool) -> None:
+        size = (self.width, self.height)
+        around = (self.path.absolute(), *self.path.absolute().parents[:3])
+        file = next((f for folder in around if (f := folder / "Calibration" / "cam.txt").is_file()), None)
+        if file is not None:
+            self.camera = read_calibration(file, size).camera
+            self.camera_source = f"intrinsics of the data set ({file})"
+            self.notes.append("cam.txt is taken for pixel centres that count from 0, and no distortion")
+        elif rendered and size == (UNITY_CAMERA.width, UNITY_CAMERA.height):
+            self.camera, self.camera_source = UNITY_CAMERA, "published UnityCam intrinsics"
+
+    def _depth_levels(self, file: Path) -> np.ndarray | None:
+        levels = read_decoded(file)
+        # Depth is the red channel, the last in OpenCV's order.
+        return levels[..., 2] if levels is not None and levels.ndim == 3 else levels
+
+
+def _frame_files(path: Path) -> list[Path]:
+    return next((files for name in _FRAMES if (files := image_files(path / name))), [])
+
+
+def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:
+    """Return the columns `_COLUMNS` of the first sheet, (N, 8), NaN for empty cells, and the place of each row."""
+    sheet = read_sheet(file)
+    names = [name.lower().replace("quat_", "quot_") for name in sheet[0][1]] if sheet else []
+    missing = [name for name in _COLUMNS if name not in names]
+    if missing:
+        found = ", ".join(filter(None, names)) or "-"
+        raise InputError(f"{file}: the first sheet has no column {', '.join(missing)}, found {found}")
+    wanted = [names.index(name) for name in _COLUMNS]
+    filled = [(f"{file}, row {number}", cells) for number, cells in sheet[1:] if any(cells[c] for c in wanted)]
+    rows = []
+    for place, cells in filled:
+        with reporting(f"{place}: expected {len(wanted)} numbers"):
+            rows.append([float(cells[column] or "nan") for column in wanted])
+    if not rows:
+        raise InputError(f"reading {file}: it holds no pose")
+    return np.array(rows), [place for place, _ in filled]
+
+
+def read_sheet(file: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of the first sheet that hold anything: row number from 1, and the text of each cell, "" if empty.
+
+    Raises `InputError` for any other file, for one that unpacks to more than 32 MB, and without `openpyxl`.
+    """
+    if find_spec("openpyxl") is None:
+        raise InputError(f"reading {file}: it is a spreadsheet; install its reader: pip install -e '.[datasets]'")
+    import openpyxl
+
+    with reporting(f"reading {file}: no Excel workbook, or damaged; download it again"):
+        with zipfile.ZipFile(file) as archive:
+            check_bytes(str(file), sum(member.file_size for member in archive.infolist()), _MOST_BYTES)
+        sheet = openpyxl.load_workbook(file, data_only=True).worksheets[0]
+        if sheet.max_row * sheet.max_column > _MOST_CELLS:
+            raise InputError(f"reading {file}: its first sheet claims {sheet.max_row}x{sheet.max_column} cells")
+        rows = [["" if cell is None else str(cell).strip() for cell in row] for row in sheet.values]
+    return [(number, row) for number, row in enumerate(rows, start=1) if any(row)]

@@ -1,0 +1,122 @@
+"""OneSLAM's layout: images of any monocular endoscope, with truth where it is known (github.com/arcadelab/OneSLAM).
+
+`images/00000000.jpg`, `calibration.json` (`{"intrinsics": {"fx", "fy", "cx", "cy"}, "FPS"}`); optional `mask.bmp`
+(255 = tissue), `poses_gt.txt` (TUM rows, camera-to-world, stamped by frame number), `depths/00000000.png` (uint16, 1000
+= one unit of the poses, 0 = unknown). That unit is not part of the layout: mm unless a line `# unit: m` states it.
+Teufel et al., "OneSLAM to map them all", IJCARS 2024.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.parsing import calibration_bytes
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.errors import CalibrationError, InputError, reporting
+from scopemap.io.decoding import read_decoded
+from scopemap.io.images import ImageFolder, by_number, image_files
+from scopemap.trajectory.formats.poses import are_frame_numbers
+from scopemap.trajectory.formats.text import tum_poses
+from scopemap_bench.datasets.tum import read_stamped
+
+_CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
+_DEPTHS_PER_UNIT = 1000.0
+_TISSUE = 255
+
+
+class OneSlamFolder(ImageFolder):
+    """A folder in OneSLAM's layout; `camera.yaml` beside `images` replaces calibration.json.
+
+    Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read;
+    a calibration that cannot be or does not fit is its `camera_fault`.
+    """
+
+    name = "oneslam"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, list(by_number(image_files(path / "images")).values()))
+        stated: dict[str, Any] = {}
+        with self._making_camera():
+            stated = _read_json(path / _CALIBRATION)
+            if self.camera is None:
+                self.camera = read_calibration(path / _CALIBRATION, (self.width, self.height)).camera
+                straight = ", taken as of images without distortion" * isinstance(self.camera, PinholeCamera)
+                self.camera_source = f"{_CALIBRATION} beside the frames{straight}"
+        if stated.get("FPS") is not None:
+            found = f"found {stated['FPS']!r:.80}"
+            with reporting(f"reading {path / _CALIBRATION}: FPS must be a positive number, {found}"):
+                self.rate_hz = float(stated["FPS"])
+                if not 0 < self.rate_hz < float("inf"):
+                    raise ValueError("out of range")
+        given = "FPS of calibration.json" if stated.get("FPS") is not None else "assumed: calibration.json has no FPS"
+        self.notes = [f"time stamps: frame number / {self.rate_hz:g} s ({given})"]
+        self._tissue = self._read_mask()
+        mm_per_unit = self._read_poses()
+        self.depth_files = by_number(image_files(path / "depths"))
+        step_mm = mm_per_unit / _DEPTHS_PER_UNIT
+        self.depth_code = ((16, step_mm, 65535),)
+        if self.depth_files and self.depth_scale_mm is None:
+            self.notes.append(f"depth: {step_mm:g} mm per unit of the files, 1000 to a unit of the scene")
+        if self.depth_files or self.poses:
+            self.notes.append("the layout does not state how poses and depth came about: taken as registered")
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` holds `images` with images, and calibration.json with `intrinsics`."""
+        if not ((path / _CALIBRATION).is_file() and image_files(path / "images")):
+            return False
+        with suppress(CalibrationError):
+            return "intrinsics" in _read_json(path / _CALIBRATION)
+        return False
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        depth_mm = super()._depth_mm(index)
+        if depth_mm is None or self._tissue is None:
+            return depth_mm
+        if depth_mm.shape != self._tissue.shape:
+            sizes = f"{depth_mm.shape[1]}x{depth_mm.shape[0]} px, {_MASK} {self.width}x{self.height} px"
+            raise InputError(f"reading {self.depth_files[index]}: depth is {sizes}; they must be of one size")
+        return np.where(self._tissue, depth_mm, np.float32(np.nan))
+
+    def _read_poses(self) -> float:
+        """Read the poses by frame number, and return the mm per unit of the scene."""
+        file = self.path / _POSES
+        if not file.is_file():
+            self.notes.append(f"no pose is known: there is no {_POSES}")
+            return 1.0
+        table = read_stamped(file)
+        if not are_frame_numbers(table.values[:, 0]):
+            raise InputError(f"reading {file}: its rows are stamped by frame number here, but not all stamps are whole")
+        T, unit = tum_poses(table, "mm")
+        self.poses = dict(zip(table.values[:, 0].astype(int).tolist(), T, strict=True))
+        found = sum(number in self.poses for number in self.numbers)
+        self.notes.append(f"poses: of {found} of {self.count} frames, camera-to-world, {unit}")
+        if not found:
+            self._warn(f"{file}: no row is stamped with the number of an image")
+        return table.unit("mm")[0]
+
+    def _read_mask(self) -> np.ndarray | None:
+        file = self.path / _MASK
+        if not file.is_file():
+            return None
+        level = read_decoded(file, cv2.IMREAD_GRAYSCALE)
+        if level is None or level.shape != (self.height, self.width):
+            found = "no readable image" if level is None else f"{level.shape[1]}x{level.shape[0]} px"
+            raise InputError(f"reading {file}: expected a mask of {self.width}x{self.height} px, found {found}")
+        self.notes.append(f"{_MASK} is applied to the true depth only; `mask.files` leaves pixels out of tracking")
+        return level == _TISSUE
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    with reporting(f"cannot read the calibration in {file}", kind=CalibrationError):
+        stated = json.loads(calibration_bytes(file))
+        if not isinstance(stated, dict):
+            raise ValueError('it is no object with "intrinsics"')
+        return stated

@@ -1,0 +1,78 @@
+"""7-Scenes: RGB-D sequences of rooms (Shotton et al., CVPR 2013), for odometry and fusion with measured depth.
+
+`frame-NNNNNN.color.png`, `.depth.png` (uint16 mm, 65535 = unknown), `.pose.txt` (4x4 camera-to-world, metres), optional
+`camera-intrinsics.txt` (3x3). Colour and depth come from two cameras of a Kinect, and are not registered in the files;
+poses and the published intrinsics are the depth camera's. Here the camera is that of the colour images, with the
+Kinect's nominal focal length and distance from the depth camera, and depth and poses are brought to it. (Where depth
+jumps in "redkitchen", the gradient of colour is then 2.3 times its mean; in the files as they are, 0.8 times.)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.rectification import DepthSensor
+from scopemap.errors import CalibrationError
+from scopemap.geometry.se3 import inverse, se3
+from scopemap.io.images import ImageFolder, image_files
+from scopemap_bench.trajectories.sevenscenes import read_seven_scenes_pose
+
+DEPTH_CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
+"""As published."""
+
+COLOUR_CAMERA = PinholeCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
+"""Not published; nominal of a Kinect, and what others use."""
+
+T_COLOUR_DEPTH = se3(np.eye(3), np.array([-25.0, 0.0, 0.0]))
+"""mm; nominal of a Kinect."""
+
+
+class SevenScenesFolder(ImageFolder):
+    """One 7-Scenes sequence, or a folder in its layout."""
+
+    name = "7-scenes"
+    depth_code = ((16, 1.0, 65534),)
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, [file for file in image_files(path) if file.stem.endswith(".color")])
+        stems = {number: file.name.split(".color.")[0] for number, file in self.file_of.items()}
+        depths = {number: path / f"{stem}.depth.png" for number, stem in stems.items()}
+        poses = {number: path / f"{stem}.pose.txt" for number, stem in stems.items()}
+        self.depth_files = {number: file for number, file in depths.items() if file.is_file()}
+        self._pose_files = {number: file for number, file in poses.items() if file.is_file()}
+        if self.camera is None:
+            with self._making_camera():
+                self._use_kinect()
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` holds `frame-*.color.*` and poses beside them."""
+        return any(path.glob("frame-*.color.*")) and any(path.glob("frame-*.pose.txt"))
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the pose in the frame's file; None where tracking lost it (not finite) or there is no file."""
+        file = self._pose_files.get(index)
+        T_world_camera = None if file is None else read_seven_scenes_pose(file)
+        if T_world_camera is None or self.depth_sensor is None:
+            return T_world_camera
+        return T_world_camera @ inverse(self.depth_sensor.T_colour_depth)
+
+    def _use_kinect(self) -> None:
+        file = self.path / "camera-intrinsics.txt"
+        stated = read_calibration(file, (self.width, self.height)).camera if file.is_file() else None
+        if stated is not None and stated != DEPTH_CAMERA.resized(self.width, self.height):
+            self.camera, self.camera_source = stated, "camera-intrinsics.txt"
+            self.notes.append("camera-intrinsics.txt is not a Kinect's: depth is taken as registered to colour")
+            return
+        if self.width * COLOUR_CAMERA.height != self.height * COLOUR_CAMERA.width:
+            raise CalibrationError(
+                f"the 7-Scenes intrinsics are for 640x480 px, but the images are {self.width}x{self.height} px: "
+                "give a calibration (--camera)"
+            )
+        self._set_camera(COLOUR_CAMERA, "a Kinect's nominal colour camera", "of a Kinect")
+        self.depth_sensor = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
+        self.notes.append("depth and poses are the depth camera's: brought to the colour camera beside it")

@@ -1,0 +1,1 @@
+"""Numbers only: depth, surfaces, consistency, the protocols of other papers."""

@@ -1,0 +1,108 @@
+"""The methods of a benchmark by the name that a plan's `use` gives, and those that are a run of our pipeline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from scopemap.config import Config
+from scopemap.errors import SettingsError
+from scopemap.estimators import missing_weights
+from scopemap.io.sequence import Sequence
+from scopemap.pipeline import Step
+from scopemap.runner.run import reconstruct
+from scopemap.tracking.track import FrameTracker
+from scopemap_bench.methods.endo_depth_and_motion import create_endo_depth_and_motion
+from scopemap_bench.methods.imported import ImportedTrajectory
+from scopemap_bench.methods.open3d_odometry import Open3dTracker
+from scopemap_bench.methods.standing_still import StandingStill
+from scopemap_bench.plan import MethodPlan
+
+# Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
+PLAIN = {
+    "mapis.advanced.frame_scale": "none",
+    "mapis.paper.blend": "none",
+    "smoothing.method": "none",
+    "mapping.method": "none",
+}
+
+BASELINES: dict[str, Callable[[], FrameTracker]] = {
+    "endo-depth-and-motion": create_endo_depth_and_motion,
+    "steinbruecker": partial(Open3dTracker, "steinbruecker"),
+    "park": partial(Open3dTracker, "park"),
+    "point-to-point": partial(Open3dTracker, "point-to-point"),
+    "point-to-plane": partial(Open3dTracker, "point-to-plane"),
+    "standing-still": StandingStill,
+}
+"""Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
+
+
+class Method(Protocol):
+    """Turns a sequence into a run's folder, which the same code then scores for all methods."""
+
+    def missing(self, settings: Mapping[str, Any]) -> str:
+        """Return what the method needs and this machine does not have, in one line; "" where it can run."""
+
+    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
+        """Write at least trajectory.tum, frames.csv and provenance.json to `out` and return the times.
+
+        All methods get the same `sequence` of frames, whose truth they must not read, and the same `settings` (dotted
+        names): depth and its anchor, masks, fusion. Times are "ms_per_frame", from the first finished frame to the last
+        without start-up, "track_ms_per_frame" and "seconds_STAGE"; none where they are unknown. Raises any error of the
+        method.
+        """
+
+
+@dataclass(frozen=True)
+class PipelineMethod:
+    """A run of the pipeline as `scopemap run` does it; a baseline replaces the tracker and gets plain depth."""
+
+    plan: MethodPlan
+
+    def config(self, settings: Mapping[str, Any]) -> Config:
+        """Return the preset, then the shared `settings` (it cannot replace a depth that they name), then its own."""
+        plain = {} if self.plan.use == "scopemap" else PLAIN
+        return Config.load(self.plan.preset, settings={**settings, **plain, **self.plan.settings})
+
+    def missing(self, settings: Mapping[str, Any]) -> str:
+        """Return the weights that are not on this machine."""
+        names = missing_weights(self.config(settings))
+        return f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
+
+    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
+        """Reconstruct into `out`; raises what the pipeline raises.
+
+        Times are those of the run's own clock: "tracking" is tracking, depth refinement and the choice of keyframes.
+        """
+        tracker = None if self.plan.use == "scopemap" else BASELINES[self.plan.use]()
+        finished: list[float] = []
+
+        def note(step: Step) -> None:
+            finished.append(time.perf_counter())
+
+        config = self.config(settings)
+        result = reconstruct(sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
+        frames, seconds = len(result.records), result.provenance["seconds"]
+        # Work after the last frame counts for all frames.
+        afterwards = sum(seconds.get(part, 0.0) for part in ("back end", "depth corrected", "fuse"))
+        return {
+            "ms_per_frame": 1e3 * ((finished[-1] - finished[0]) / max(frames - 1, 1) + afterwards / frames),
+            "track_ms_per_frame": 1e3 * seconds["track"] / frames,
+            **{f"seconds_{stage.replace(' ', '_')}": value for stage, value in seconds.items()},
+        }
+
+
+def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed: int = 0) -> Method:
+    """Return the method of a plan; raises `SettingsError` for an unknown one.
+
+    data : folder of imported trajectories. sequence, seed : which of them, by the name of the sequence.
+    """
+    if plan.use == "import":
+        return ImportedTrajectory(plan, data, sequence, seed)
+    if plan.use != "scopemap" and plan.use not in BASELINES:
+        raise SettingsError(f"unknown method '{plan.use}': choose one of scopemap, import, {', '.join(BASELINES)}")
+    return PipelineMethod(plan)

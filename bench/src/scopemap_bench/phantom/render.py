@@ -1,0 +1,176 @@
+"""Phantom: a scene, a camera path and a light; each frame with its exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scopemap.errors import InputError
+from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.phantom.camera_path import lumen_path, sweep_path, touching, turned
+from scopemap_bench.phantom.cavity import Tint, laparoscopy_volume
+from scopemap_bench.phantom.deformation import REST, Breathing, Push, TissueMotion, breathing, poke, push
+from scopemap_bench.phantom.exposing import exposure_times, lagging_gains, pose_at
+from scopemap_bench.phantom.instrument import insert, instrument
+from scopemap_bench.phantom.lumen import colon_volume, tube_volume
+from scopemap_bench.phantom.march import SurfaceBuffers, march
+from scopemap_bench.phantom.shading import develop, disturb, exposure_for, shade, vignette
+from scopemap_bench.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
+from scopemap_bench.phantom.texture import Appearance
+from scopemap_bench.phantom.volume import Volume
+
+_COLON_RGB = np.array([0.64, 0.265, 0.165])
+_TUBE_RGB = np.array([0.55, 0.30, 0.22])
+# Exposure is measured in a small picture, as cameras do.
+_METERING_SHARE = 8
+# Where a frame shows what is poked, over its height and width.
+_POKED_AT = 0.5, 0.68
+_PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """A scene with the path through it, ready to be rendered frame by frame.
+
+    Attributes
+    ----------
+    volume, appearance : shape and appearance of the tissue at rest. motion : how it moves.
+    poses : (N, 4, 4) float64, camera to world, mm.
+    exposure : gain of every frame, or of each (N,); None: each frame has its own.
+    """
+
+    spec: PhantomSpec
+    volume: Volume
+    appearance: Appearance
+    poses: np.ndarray
+    motion: TissueMotion
+    exposure: float | np.ndarray | None
+
+
+def prepare(spec: PhantomSpec) -> Phantom:
+    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame.
+
+    Raises `InputError` where the path file cannot be used or holds fewer poses than the frames wanted.
+    """
+    poses = camera_path(spec)
+    volume, appearance = build_scene(spec, poses)
+    for event in _events(spec, "contact"):
+        poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
+    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None)
+    if not spec.auto_exposure:
+        return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
+    return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
+
+
+def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
+    return [event for event in spec.events if event.kind == kind]
+
+
+def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotion:
+    """Breathing and pushes of the tissue."""
+    parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
+    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene == "laparoscopy" else "lumen"]
+    for event in _events(spec, "push"):
+        parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
+    parts += [_poke(spec, event, poses[min(event.first, len(poses) - 1)], volume) for event in _events(spec, "poke")]
+    return TissueMotion(tuple(parts))
+
+
+def _poke(spec: PhantomSpec, event: Event, T_world_camera: np.ndarray, volume: Volume) -> Push:
+    """Return the push of what a camera sees on the right of its middle: half into the wall, half along it.
+
+    Raises `InputError` where nothing is seen there.
+    """
+    surface = march(volume, spec.camera, T_world_camera, REST)
+    row, column = (round(share * side) for share, side in zip(_POKED_AT, surface.depth_mm.shape, strict=True))
+    if not np.isfinite(surface.depth_mm[row, column]):
+        raise InputError(f"nothing to poke: frame {event.first} shows no tissue on the right of its middle")
+    normal = T_world_camera[:3, :3] @ surface.normal[row, column]
+    along = np.cross(normal, T_world_camera[:3, 1])
+    direction = along / np.linalg.norm(along) - normal
+    direction /= np.linalg.norm(direction)
+    return poke(event.first, event.last, surface.rest_mm[row, column], direction, surface.depth_mm[row, column])
+
+
+def _lagging_exposure(phantom: Phantom) -> np.ndarray:
+    """Gain of each frame (N,), which follows what the frame needs with the lag of `phantom.spec`."""
+    spec = phantom.spec
+    width, height = (max(size // _METERING_SHARE, 16) for size in (spec.width, spec.height))
+    small = replace(phantom, spec=replace(spec, width=width, height=height, shutter=0.0))
+    wanted = np.array([exposure_for(light(small, index)[0]) for index in range(len(phantom.poses))])
+    return lagging_gains(wanted, spec.exposure_lag_frames)
+
+
+def camera_path(spec: PhantomSpec) -> np.ndarray:
+    """Return the poses (N, 4, 4) of `spec`, camera to world, mm: from its file, or generated for its scene."""
+    if spec.path_file is None:
+        # Every `speed`-th pose of a path that is as much longer.
+        frames = ((spec.frames or DEFAULT_FRAMES) - 1) * spec.speed + 1
+        if spec.scene == "laparoscopy":
+            path = sweep_path(frames, spec.loop, spec.seed)
+        else:
+            path = lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
+        return _with_turns(path[:: spec.speed], spec)
+    poses = read_poses(spec.path_file)
+    if spec.frames is not None and spec.frames > len(poses):
+        raise InputError(
+            f"{spec.path_file} holds {len(poses)} poses, {spec.frames} frames were asked for: ask for fewer"
+        )
+    return _with_turns(poses[: spec.frames], spec)
+
+
+def _with_turns(poses: np.ndarray, spec: PhantomSpec) -> np.ndarray:
+    for number, event in enumerate(_events(spec, "turn")):
+        poses = turned(poses, event.first, event.last, back=number % 2 == 1)
+    return poses
+
+
+def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearance]:
+    """Return shape and appearance of the scene of `spec`, built around the poses (N, 4, 4)."""
+    if spec.scene == "tube":
+        return tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed)
+    base: np.ndarray | Tint
+    if spec.scene == "colon":
+        volume, base = colon_volume(poses, spec.seed), _COLON_RGB
+    else:
+        volume, base = laparoscopy_volume(poses, spec.seed)
+    return volume, Appearance(base, spec.texture, spec.gloss, spec.seed)
+
+
+def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Return linear light (H, W, 3) float32 of a frame before exposure, and the surface at the frame's own pose.
+
+    Light is the mean over the time during which the shutter is open.
+    """
+    spec = phantom.spec
+    radiance, surface = _light_at(phantom, float(index))
+    if spec.shutter > 0:
+        times = exposure_times(index, spec.shutter, phantom.poses, surface, spec.camera)
+        if len(times) > 1:
+            radiance = np.stack([_light_at(phantom, time)[0] for time in times]).mean(0, dtype=np.float32)
+    return radiance, surface
+
+
+def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Linear light at a moment, in frames, and the surface that it came from."""
+    camera, look = phantom.spec.camera, phantom.appearance
+    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.motion.at(time))
+    rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
+    albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
+    radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
+    for event in _events(phantom.spec, "instrument"):
+        tool = instrument(time, event.first, event.last, phantom.spec.scene == "laparoscopy", phantom.spec.seed)
+        radiance, surface = insert(tool, radiance, surface, camera)
+    return radiance * vignette(camera), surface
+
+
+def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
+    """Return frame `index` as sRGB (H, W, 3) uint8, before video coding, and the surface that it shows."""
+    spec = phantom.spec
+    linear, surface = light(phantom, index)
+    gain = exposure_for(linear) if phantom.exposure is None else phantom.exposure
+    gain = gain if isinstance(gain, float) else gain[index]
+    rng = np.random.default_rng((spec.seed, 4, index))
+    kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
+    return develop(disturb(linear * np.float32(gain), kinds, rng, index), spec.noise, rng), surface

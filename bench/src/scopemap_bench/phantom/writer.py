@@ -1,0 +1,123 @@
+"""Write a phantom as a C3VD folder, with a calibration file and the true surface beside the frames.
+
+0000_color.png  0000_depth.tiff  pose.txt  camera.yaml  mesh_truth.ply  [mesh_truth/0000.ply]  phantom.json
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.errors import InputError
+from scopemap.fusion.mesh import marching_cubes
+from scopemap.io.decoding import write_encoded
+from scopemap_bench.phantom.coding import VideoCoding
+from scopemap_bench.phantom.render import Phantom, prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.volume import Volume
+
+CLIPPED = 65535
+_OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
+_NEWTON_STEPS = 4
+_SEEN_MARGIN_VOXELS = 2
+_RIM_VOXELS = 4
+
+
+def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
+    """Return the true surface at rest in the voxels `seen` (X, Y, Z) bool and a rim of 2 around them, world mm.
+
+    Vertices are exact to 1e-4 mm, faces counter-clockwise seen from the camera. Raises `InputError` where there is no
+    surface in these voxels.
+    """
+    # The spline is defined where the whole neighbourhood of a voxel is inside the grid.
+    inner = (slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3
+    where = np.zeros(seen.shape, bool)
+    where[inner] = ndimage.binary_dilation(seen, iterations=_SEEN_MARGIN_VOXELS)[inner]
+    values = volume.coefficients
+    for axis in range(3):
+        values = ndimage.convolve1d(values, np.array([1, 4, 1]) / 6, axis=axis, mode="nearest")
+    if not where.any() or values[where].min() > 0 or values[where].max() < 0:
+        raise InputError("no tissue is in sight of the camera path: nothing to make a true mesh of")
+    vertices, faces = marching_cubes(values, where[1:, 1:, 1:])
+    points = vertices * volume.voxel_mm + volume.origin_mm
+    for _ in range(_NEWTON_STEPS):
+        value, gradient = volume.values_at(points)
+        shift = -(value / (gradient**2).sum(1))[:, None] * gradient
+        points = points + np.clip(np.nan_to_num(shift), -0.5 * volume.voxel_mm, 0.5 * volume.voxel_mm)
+    return trimesh.Trimesh(points, faces, process=False)
+
+
+def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
+    """Render the phantom of `spec` into `folder`, calling `progress(frames done, frames in all)` after each frame.
+
+    Raises `InputError` for a folder that holds other files or cannot be written, and for an unusable path file.
+    """
+    folder = Path(folder)
+    _check_free(folder)
+    phantom = prepare(spec)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in chain.from_iterable(folder.glob(pattern) for pattern in _OWN_FILES):
+            file.unlink()
+        _write_description(phantom, folder / "phantom.json")
+        # C3VD's lines: 16 numbers, transposed, so that the translation is the last row.
+        rows = phantom.poses.transpose(0, 2, 1).reshape(-1, 16)
+        np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
+        write_calibration(spec.camera, folder / "camera.yaml", spec.depth_scale_mm, rate_hz=spec.fps)
+        seen = np.zeros(phantom.volume.coefficients.shape, bool)
+        coding = None if spec.h264_crf is None else VideoCoding(spec.h264_crf, spec.width, spec.height)
+        for index in range(len(phantom.poses)):
+            rgb, surface = render_frame(phantom, index)
+            seen[phantom.volume.cells_of(surface.rest_mm)] = True
+            rgb = rgb if coding is None else coding(rgb)
+            write_encoded(folder / f"{index:04d}_color.png", rgb[..., ::-1])
+            write_encoded(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
+            if progress is not None:
+                progress(index + 1, len(phantom.poses))
+        _write_meshes(phantom, seen_surface(phantom.volume, seen), folder)
+    except OSError as error:
+        raise InputError(f"cannot write the phantom to {folder}: {error}") from None
+
+
+def encode_depth(depth_mm: np.ndarray, scale_mm: float) -> np.ndarray:
+    """Return depth (H, W) in mm, NaN = unknown, as uint16: 0 = unknown, 65535 = too far, else units of `scale_mm`."""
+    units = np.clip(np.rint(np.nan_to_num(depth_mm.astype(np.float64)) / scale_mm), 1, CLIPPED)
+    return np.where(np.isnan(depth_mm), 0, units).astype(np.uint16)
+
+
+def _check_free(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"cannot write a phantom to {folder}: it is a file; name a new folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "phantom.json").is_file():
+        raise InputError(f"will not write a phantom into {folder}: it holds other files; name a new or empty folder")
+
+
+def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None:
+    mesh.export(folder / "mesh_truth.ply")
+    if phantom.motion.parts:
+        (folder / "mesh_truth").mkdir(exist_ok=True)
+        for index in range(len(phantom.poses)):
+            moved = phantom.motion.at(index).move(np.asarray(mesh.vertices))
+            trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
+
+
+def _write_description(phantom: Phantom, file: Path) -> None:
+    files = ("path_file", "camera_file")
+    spec = {key: str(value) if key in files and value else value for key, value in asdict(phantom.spec).items()}
+    description = {
+        "made_by": f"scopemap {version('scopemap')}",
+        "spec": spec,
+        "frames": len(phantom.poses),
+        "exposure": None if phantom.exposure is None else np.asarray(phantom.exposure).tolist(),
+        "voxel_mm": phantom.volume.voxel_mm,
+    }
+    file.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")

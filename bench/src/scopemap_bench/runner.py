@@ -1,0 +1,272 @@
+"""Runs a plan: each entry in a process of its own, with a time limit. A second call continues an interrupted one.
+
+OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/
+
+A method may use all memory, crash in foreign code or call exit: its row says so and the benchmark continues. The
+process of an entry is `python -m scopemap_bench.runner ENTRY.json`, so peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from scopemap.config import Config
+from scopemap.errors import InputError, ScopemapError, SettingsError
+from scopemap.estimators import missing_weights
+from scopemap.io.sequence import Sequence
+from scopemap_bench.entry import Entry, entries_of
+from scopemap_bench.methods.method import Method, PipelineMethod, create_method
+from scopemap_bench.plan import Plan, found_sequences
+from scopemap_bench.result import FILE_NAME, RunResult
+from scopemap_bench.scoring import score
+
+Listener = Callable[[Entry, RunResult, bool], None]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """The entries of a plan in order, their results, and notes on both."""
+
+    plan: Plan
+    entries: list[Entry]
+    results: list[RunResult]
+    notes: list[str]
+
+
+def run_plan(
+    plan: Plan,
+    out: Path,
+    *,
+    data: Path | None = None,
+    retry: bool = False,
+    listener: Listener | None = None,
+    timeout_s: float | None = None,
+) -> Benchmark:
+    """Run the entries that are not done yet and return all rows.
+
+    An entry is done when its `result.json` has its fingerprint: settings, sequence, method, protocol, seed. Failed rows
+    are kept, too, unless `retry`. `listener` is called with each row, and whether it was kept. A method that takes
+    longer than `timeout_s` is ended and fails.
+
+    What a method needs and this machine does not have is a row of status "missing", looked for again by each call.
+
+    Raises `InputError` where no sequence is found or `out` cannot be written.
+    """
+    out = Path(out).resolve()
+    entries, notes = planned(plan, out, data)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write a benchmark to {out}: {error.strerror or error}") from None
+    results = []
+    for entry in entries:
+        kept = kept_result(entry, retry=retry)
+        if kept is not None:
+            results.append(kept)
+        elif reason := what_is_missing(entry):
+            results.append(_without_figures(entry, "missing", reason))
+        else:
+            results.append(_run_in_process(entry, timeout_s))
+        if listener:
+            listener(entry, results[-1], kept is not None)
+    return Benchmark(plan, entries, results, notes + _commits_note(results))
+
+
+def planned(plan: Plan, out: Path, data: Path | None = None) -> tuple[list[Entry], list[str]]:
+    """Return the entries of a plan, and a note for each sequence that is missing.
+
+    Raises `InputError` where no sequence is found, `SettingsError` for unknown methods and for two entries with one
+    folder.
+    """
+    data = None if data is None else Path(data).resolve()
+    sequences, notes = found_sequences(plan, data)
+    for method in plan.method:
+        create_method(method, data)
+    entries = list(entries_of(plan, sequences, data, out))
+    folders = Counter(entry.folder for entry in entries)
+    for entry in entries:
+        if folders[entry.folder] > 1:
+            raise SettingsError(
+                f"the plan '{plan.title}' has two sequences that are called '{entry.label}' (letters and digits "
+                "count): give them names"
+            )
+    return entries, notes
+
+
+def run_entry(entry: Entry) -> RunResult:
+    """Run a method on its sequence in this process, score it, and return the row; a `ScopemapError` is a failed row."""
+    try:
+        entry.render_phantom()
+        sequence = entry.open()
+        timing = method_of(entry).run(sequence, entry.shared_settings(), entry.run_folder)
+        memory_mb = _peak_memory_mb()
+        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
+    except ScopemapError as error:
+        return _without_figures(entry, "failed", str(error))
+    return RunResult(
+        entry.label,
+        entry.method.name,
+        entry.seed,
+        figures=figures,
+        timing=timing | {"peak_memory_mb": memory_mb},
+        facts=_facts(entry) | {"truth": _quality_of_truth(sequence)},
+    )
+
+
+def worker_command(file: Path) -> list[str]:
+    """Return the command that runs the entry in `file`."""
+    return [sys.executable, "-m", "scopemap_bench.runner", str(file)]
+
+
+def end_with_parent() -> None:
+    """End this process soon after the process that started it: nobody would read the row."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        signal.raise_signal(signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def kept_result(entry: Entry, *, retry: bool = False) -> RunResult | None:
+    """Return the row of an earlier call, if it belongs to this entry; None for a failed one with `retry`."""
+    try:
+        result = RunResult.load(entry.folder)
+    except InputError:  # none, or a damaged one
+        return None
+    stale = result.facts.get("key") != entry.key or (retry and result.status == "failed")
+    return None if stale else result
+
+
+def what_is_missing(entry: Entry) -> str:
+    """Return what an entry needs and this machine does not have, in one line; "" where it can run."""
+    try:
+        if entry.protocol.consistency and (names := missing_weights(Config(), entry.protocol.flow)):
+            return f"its measure needs weights: {', '.join(names)} (scopemap models pull NAME)"
+        return method_of(entry).missing(entry.shared_settings())
+    except ScopemapError:  # the run reports it
+        return ""
+
+
+def method_of(entry: Entry) -> Method:
+    """Return the method of an entry."""
+    return create_method(entry.method, entry.data, entry.sequence.name, entry.seed)
+
+
+def _run_in_process(entry: Entry, timeout_s: float | None) -> RunResult:
+    """Run an entry in a process of its own and return its row, whatever happens to the process."""
+    (entry.folder / FILE_NAME).unlink(missing_ok=True)
+    shutil.rmtree(entry.run_folder, ignore_errors=True)
+    command, log = worker_command(entry.save()), entry.folder / "log.txt"
+    with log.open("w", encoding="utf-8") as output:
+        try:
+            code = subprocess.run(  # noqa: S603 - this program, its arguments a list
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, timeout=timeout_s
+            ).returncode
+            error = _cause(code, log) if code else "ended without a result"
+        except subprocess.TimeoutExpired:
+            error = f"took longer than {timeout_s:g} s"
+    # A saved row is valid even if foreign code crashed at the end of the process.
+    if not (entry.folder / FILE_NAME).is_file():
+        _without_figures(entry, "failed", error).save(entry.folder)
+    return RunResult.load(entry.folder)
+
+
+def _cause(code: int, log: Path) -> str:
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1][:300] if lines else f"ended with exit code {code}"
+
+
+def _without_figures(entry: Entry, status: Literal["failed", "missing"], reason: str) -> RunResult:
+    return RunResult(entry.label, entry.method.name, entry.seed, status, reason, facts=_facts(entry))
+
+
+def _facts(entry: Entry) -> dict[str, Any]:
+    """Return where and with what an entry is run."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {
+        "key": entry.key,
+        "align": entry.sequence.align or entry.protocol.align,
+        "depth": _depth_of(entry),
+        "versions": {name: version(name) for name in ("scopemap", "numpy", "onnxruntime", "numba")},
+        "commit": source_commit(),
+        "machine": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}, {cores} cores",
+    }
+
+
+def _depth_of(entry: Entry) -> str:
+    """Return the depth that an entry's settings name and its anchor; "" for an import."""
+    method = method_of(entry)
+    if not isinstance(method, PipelineMethod):
+        return ""
+    if entry.sequence.depth:
+        return entry.sequence.depth.partition(":")[0]
+    depth = method.config(entry.settings | entry.sequence.settings).depth
+    anchor = "" if depth.anchor in ("auto", depth.backend) else f", anchor {depth.anchor}"
+    return depth.backend.partition(":")[0] + anchor
+
+
+def _quality_of_truth(sequence: Sequence) -> str:
+    """Return the source of the true poses ("exact", "kinematic", ...), "" where there are none."""
+    stamps = sequence.source.stamps(sequence.selection)
+    truth = sequence.source.truth(stamps[0][0]) if stamps else None
+    return truth.quality if truth else ""
+
+
+def _peak_memory_mb() -> float:
+    """Return the peak memory of this process, MB; NaN where the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return math.nan
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def source_commit() -> str:
+    """Return the commit of the source tree of this package, "+" where it was changed; "" where it is in none."""
+    try:
+        # The package may be installed inside another project's repository, whose commits are unrelated.
+        _git("ls-files", "--error-unmatch", Path(__file__).name)
+        return _git("describe", "--always", "--abbrev=10", "--dirty=+", "--exclude=*")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _git(*arguments: str) -> str:
+    folder = Path(__file__).resolve().parent
+    command = ["git", *arguments]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - constants
+    return ran.stdout.strip()
+
+
+def _commits_note(results: list[RunResult]) -> list[str]:
+    """Return a note where rows come from different commits: their figures do not compare."""
+    commits = sorted({str(result.facts.get("commit", "")) for result in results} | {source_commit()})
+    if len(commits) < 2:
+        return []
+    return [f"rows come from different commits of scopemap ({', '.join(commits)}); a new --out folder runs all again"]
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    given = Entry.load(Path(sys.argv[1]))
+    run_entry(given).save(given.folder)

@@ -1,0 +1,263 @@
+"""Scores a run's folder against the truth of its sequence: the same figures for every method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from scopemap.actions.inputs import is_camera_of, open_truth
+from scopemap.config import MaskSettings
+from scopemap.errors import AlignmentError, InputError
+from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
+from scopemap.flow.create import create_flow
+from scopemap.flow.estimator import FlowEstimator, pair_flow
+from scopemap.geometry.align import AlignMode, Similarity
+from scopemap.io.opening import open_sequence
+from scopemap.io.reference import reference_trajectory
+from scopemap.io.sequence import Sequence
+from scopemap.masking.masker import Masker
+from scopemap.reconstruction import DepthReader
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.evaluation.consistency import ConsistencyMeter
+from scopemap_bench.evaluation.correspondences import FrameMatcher
+from scopemap_bench.evaluation.depth import (
+    DEPTH_RANGES_MM,
+    DepthPairs,
+    DepthScaling,
+    evaluate_depth_sequence,
+    fit_sequence,
+)
+from scopemap_bench.evaluation.paper import paper_figures
+from scopemap_bench.evaluation.protocols import PROTOCOLS
+from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
+from scopemap_bench.plan import ProtocolPlan
+from scopemap_bench.result import Figures
+
+_CONSISTENCY_PX = 1.0
+_MAX_VIEWS = 40
+
+
+def score(
+    folder: Path,
+    sequence: Sequence,
+    protocol: ProtocolPlan,
+    align: AlignMode | None = None,
+    flows: Path | None = None,
+) -> Figures:
+    """Return all figures of a run's folder that the truth of its sequence allows, by group.
+
+    `align` replaces the protocol's; `flows` is a folder that keeps the flow for the next method. A group without a
+    truth is left out. A trajectory that cannot be aligned (too few frames tracked) has "poses" without errors.
+    """
+    estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
+    figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
+    if matched is not None and protocol.surface:
+        surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
+        figures |= {"surface": surface} if surface else {}
+    depth = DepthReader(folder)
+    if depth.present and protocol.depth:
+        figures |= _depth(depth, sequence, protocol)
+    if depth.present and protocol.consistency:
+        figures |= _consistency(depth, sequence, estimate, protocol, flows)
+    return figures
+
+
+def pose_groups(
+    estimate: Trajectory, reference: Trajectory | None, protocol: ProtocolPlan, align: AlignMode
+) -> tuple[Figures, MatchedTrajectories | None]:
+    """Return "poses", "paper" and the named protocols' groups, and the alignment.
+
+    Without an alignment, "poses" holds the figures that need no truth, by the names of `pose_report`.
+    """
+    matched = None
+    if reference is not None:
+        # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
+        matched = _matched(estimate, reference, align) or _matched(estimate, reference, "origin")
+    if matched is None or reference is None:
+        tracked = estimate.tracked
+        own = {"frames": len(tracked), "tracked": int(np.count_nonzero(tracked))}
+        own |= {"longest_tracked": longest_run(tracked), "frames_until_loss": frames_until_loss(tracked)}
+        return {"poses": own}, None
+    figures: Figures = {"poses": pose_report(matched), "paper": paper_figures(matched)}
+    for name in protocol.protocols:
+        # A protocol's own fit may fail where ours does not: then it has no figures.
+        with suppress(AlignmentError):
+            known = PROTOCOLS[name]
+            figures[name] = known(estimate, reference) | {"description": known.description, "source": known.source}
+    return figures, matched
+
+
+def _matched(estimate: Trajectory, reference: Trajectory, align: AlignMode) -> MatchedTrajectories | None:
+    try:
+        return match(estimate, reference, align)
+    except AlignmentError:
+        return None
+
+
+def surface_figures_of(
+    run: Path, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
+) -> dict[str, float]:
+    """Return the figures of a run's mesh.ply against the true surface of a data set; {} where there is none.
+
+    With a sequence, the part of the true surface that its views show is found, where the data set does not state it.
+    `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
+    """
+    file = run / "mesh.ply"
+    if not file.is_file():
+        return {}
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+    except Exception as error:  # trimesh raises whatever its parsers raise
+        raise InputError(f"cannot read the mesh {file}: {error}") from error
+    return surface_figures(mesh, truth, similarity, icp=icp)
+
+
+def surface_figures(
+    mesh: trimesh.Trimesh, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
+) -> dict[str, float]:
+    """Return the figures of a mesh, world mm, against the true surface of a data set, as in `surface_figures_of`."""
+    true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
+    if true_surface is None:
+        return {}
+    moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
+    camera = None
+    if true_surface.T_view is not None:
+        camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera
+    return measure_surface(moved, true_surface, camera=camera, icp=icp)
+
+
+def _seen_surface(sequence: Sequence) -> TrueSurface | None:
+    """Return the true surface with the part that the sequence's frames show."""
+    surface = read_true_surface(sequence.path)
+    whole_clip = sequence.selection == slice(None)
+    # What a data set states as seen is valid for its whole clip.
+    if surface is None or (surface.seen is not None and whole_clip) or surface.T_view is not None:
+        return surface
+    stamps = sequence.source.stamps(sequence.selection) or []
+    chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]}
+    views = {
+        truth.index: (truth.T_world_camera, truth.depth_mm)
+        for frame, truth in sequence
+        if frame.index in chosen
+        and truth is not None
+        and truth.T_world_camera is not None
+        and truth.depth_mm is not None
+    }
+    return surface.seen_by(sequence.camera, views) if views else surface
+
+
+def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:
+    """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
+
+    True depth counts within the range that is usual for the data set (`DEPTH_RANGES_MM`). Raises `InputError` where the
+    run kept no depth, or its camera is not that of the data set, or the data set has no true depth.
+    """
+    depth = DepthReader(run)
+    if not depth.present:
+        raise InputError(f"{run} holds no depth maps (depth/depth.json); only a run's folder does")
+    sequence = open_truth(run, truth)
+    if not is_camera_of(run, sequence):
+        raise InputError(f"the run {run} was made with another camera than {truth} gives: their depths do not compare")
+    protocol = default_protocol(sequence)
+    figures: Figures = {}
+    if scaling is not None:
+        figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}))
+        if not figures:
+            raise InputError(f"{truth} has no true depth of the frames with depth in {run}")
+    if consistency:
+        figures |= _consistency(depth, sequence, read_trajectory(run), protocol)
+    return figures
+
+
+def default_protocol(sequence: Sequence) -> ProtocolPlan:
+    """Return the protocol with the range of true depth that is usual for the data set."""
+    name = next((known for known in DEPTH_RANGES_MM if sequence.source.name.startswith(known)), "")
+    return ProtocolPlan(depth_range_mm=DEPTH_RANGES_MM.get(name, ProtocolPlan().depth_range_mm))
+
+
+def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
+    """Return a factory of (estimated, true) depth of the frames that have both."""
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for frame, truth in sequence:
+            estimated_mm = depth.read(frame.index)
+            if truth is not None and truth.depth_mm is not None and estimated_mm is not None:
+                yield estimated_mm, truth.depth_mm
+
+    return pairs
+
+
+def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
+    report = evaluate_depth_sequence(
+        _true_pairs(depth, sequence),
+        scaling=protocol.depth_scaling,
+        truth_range_mm=protocol.depth_range_mm,
+        clip_prediction=protocol.clip_depth,
+    )
+    if not report.frames:
+        return {}
+    return {"depth": report.mean | {"jitter": report.jitter}}
+
+
+def _consistency(
+    depth: DepthReader,
+    sequence: Sequence,
+    estimate: Trajectory,
+    protocol: ProtocolPlan,
+    flows: Path | None = None,
+) -> Figures:
+    """Measure depth over time, after one scale factor for all frames where true depth is known."""
+    scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    camera = sequence.camera
+    matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
+    estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
+    folder = None if flows is None else flows / estimator.name
+    poses = {
+        index: estimate.T_world_camera[row]
+        for row, index in enumerate(estimate.indices.tolist())
+        if estimate.tracked[row]
+    }
+    before: np.ndarray | None = None
+    for frame, truth in sequence:
+        # Highlights move with the lamp, and pixels outside the field of view show no tissue: one mask for all methods.
+        valid = masker(frame).valid
+        found = (None, None) if before is None else flow_to_previous(estimator, frame.index, before, frame.rgb, folder)
+        correspondence = matcher.match(frame.rgb, valid, *found)
+        before = frame.rgb
+        depth_mm = depth.read(frame.index)
+        meter.add(
+            np.full(valid.shape, np.nan, np.float32) if depth_mm is None else depth_mm,
+            valid,
+            correspondence,
+            T_world_camera=poses.get(frame.index),
+            T_reference_camera=None if truth is None else truth.T_world_camera,
+            true_depth_mm=None if truth is None else truth.depth_mm,
+        )
+    return {"consistency": meter.report() | {"flow": estimator.name}}
+
+
+def flow_to_previous(
+    estimator: FlowEstimator, index: int, rgb_previous: np.ndarray, rgb_current: np.ndarray, folder: Path | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return flow (H, W, 2) float32 px from frame `index` to the one before, and its consistent pixels (H, W) bool.
+
+    `folder` keeps the flow of one sequence and one estimator, so that all methods are measured with the same one. Half
+    precision (0.03 px at most for flows below 64 px), with and without a folder.
+    """
+    file = None if folder is None else folder / f"{index:06d}.npz"
+    if file is not None and file.is_file():
+        with np.load(file) as kept:
+            return kept["to_previous"].astype(np.float32), kept["consistent"]
+    found = pair_flow(estimator, rgb_previous, rgb_current, _CONSISTENCY_PX)
+    half = found.to_previous.astype(np.float16)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        draft = file.with_suffix(".part.npz")
+        np.savez_compressed(draft, to_previous=half, consistent=found.consistent)
+        draft.replace(file)
+    return half.astype(np.float32), found.consistent

@@ -1,0 +1,1 @@
+"""Scripts behind the tables of BENCHMARK.md: `python -m scopemap_bench.scripts.NAME`."""

@@ -1,0 +1,282 @@
+"""Processor time of each stage of a run on this machine, and its comparison with an earlier measurement.
+
+Processor time, not time that passes: what else runs on the machine disturbs it less. A stage counts without the stages
+that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's DIS flow of a fixed pair of
+images: not this package's code, and like most of its work.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+
+from scopemap.config import Config
+from scopemap.errors import InputError
+from scopemap.io.opening import open_sequence
+from scopemap.runner.run import reconstruct
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.phantom.writer import write_phantom
+
+PHANTOM = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
+"""What is measured without a video."""
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "rectify": ("cameras.rectification:Rectifier.image",),
+    "masks": ("masking.masker:Masker.__call__",),
+    "depth network": (
+        "depth.scopenet.estimator:ScopeNetDepth.estimate",
+        "depth.depth_anything:DepthAnything.estimate",
+        "depth.depth_pro:DepthPro.estimate",
+    ),
+    "metric anchor": ("depth.anchor:AnchoredDepth.metric",),
+    "correspondence": ("depth.correspondence:DenseMatcher.match",),
+    "perceptual distance": ("depth.perceptual:StructureDistance.compare", "depth.perceptual:LpipsAlex.compare"),
+    "flow": (
+        *("flow.dis:DisFlow.estimate", "flow.dis:DisFlow.estimate_checked", "flow.dis:DisFlow.estimate_both_from"),
+        *("flow.raft:RaftFlow.estimate", "flow.raft:RaftFlow.estimate_both"),
+    ),
+    "tracking": ("tracking.tracker:Tracker.track",),
+    "corners": ("flow.corners:KeyframeMatcher.match", "flow.corners:KeyframeMatcher.set_keyframe"),
+    "pose from corners": ("tracking.tracker:pose_from_correspondences",),
+    "photometric alignment": ("tracking.tracker:align",),
+    "relocalisation": ("tracking.relocalisation:Relocaliser.find",),
+    "MAPIS": ("depth.mapis:Mapis.refine",),
+    "keyframe": ("tracking.tracker:Tracker.insert_keyframe", "mapping.submaps:Mapper.add_keyframe"),
+    "store": ("fusion.frame_store:FrameStore.put", "fusion.frame_store:FrameStore._read"),
+    "feature tracks": ("mapping.feature_tracks:FeatureTracks.add",),
+    "depth triangulation": ("mapping.multiview_depth:triangulate_depth", "mapping.multiview_depth:carry_depth"),
+    "fusion": ("fusion.volume:TsdfVolume.integrate",),
+    "writing": ("reconstruction:DepthWriter.__call__", "reconstruction:Reconstruction.save"),
+}
+"""Functions, "module:name" in the package, whose processor time is a stage's; the rest is that of the run's parts."""
+
+_PARTS = "runner.run:Clock.timed"  # called with the part's name
+_CALLER = {"correspondence": "flow to the previous frame", "corners": "flow to the keyframe"}
+_OTHER_FLOW = "flow between keyframes"
+_NOISE = 0.05  # of the calibration
+_WARM_UP_FRAMES = 12  # compile, load and fill caches
+_CALIBRATION_RUNS = 15
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Processor time of a stage.
+
+    Attributes
+    ----------
+    ms : per frame of the clip: median of a call times calls per frame, summed over the stage's functions.
+    ratio : the same over the calibration. share : of all stages. thread : the thread that most of it ran in.
+    """
+
+    ms: float
+    ratio: float
+    share: float
+    thread: str
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Processor time per frame of a run's stages on one machine.
+
+    Attributes
+    ----------
+    clip : name of the input. frames : how many. preset : of the run. size : (width, height) of the working images, px.
+    calibration_ms : processor time of the calibration. cpu_ms : of the whole process, per frame.
+    passed_ms : time that passed, per frame. stages : by name.
+    """
+
+    clip: str
+    frames: int
+    preset: str
+    size: tuple[int, int]
+    calibration_ms: float
+    cpu_ms: float
+    passed_ms: float
+    stages: dict[str, StageTime]
+
+    @property
+    def _measured(self) -> str:
+        return f"{self.frames} frames of {self.clip} at {self.size[0]}x{self.size[1]} px, preset {self.preset}"
+
+    def json(self) -> dict[str, Any]:
+        """Return the figures as `read_speed` reads them."""
+        rounded = {name: {k: _rounded(v) for k, v in asdict(stage).items()} for name, stage in self.stages.items()}
+        return {k: _rounded(v) for k, v in asdict(self).items()} | {"stages": rounded}
+
+    def slower_than(self, before: Speed, tolerance: float) -> list[str]:
+        """Return a line for each stage whose ratio to the calibration has grown by more than the share `tolerance`.
+
+        Stages below a twentieth of the calibration are within the noise. Raises `InputError` for another clip,
+        number of frames or preset.
+        """
+        if before._measured != self._measured:
+            raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
+        lines = []
+        for name, stage in self.stages.items():
+            then = before.stages[name].ratio if name in before.stages else 0.0
+            if stage.ratio > max((1 + tolerance) * then, then + _NOISE):
+                lines.append(f"{name}: {stage.ratio:.2f} of the calibration, before {then:.2f}")
+        return lines
+
+
+def read_speed(file: Path) -> Speed:
+    """Return the measurement that a file holds; raises `InputError` where it holds none."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        stages = {name: StageTime(**stage) for name, stage in content.pop("stages").items()}
+        return Speed(**content | {"size": tuple(content["size"])}, stages=stages)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(f"reading {file}: it holds no measurement of speed ({error})") from None
+
+
+def measure_speed(video: Path | None, config: Config, frames: int | None = None) -> Speed:
+    """Run a video, or by default a phantom, and return the processor time of its stages.
+
+    frames : how many of the video, None: all. OpenCV has one thread meanwhile, so that its work is counted where it is
+    called. Not for use beside other runs in the process.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if video is None:
+                write_phantom(PHANTOM, Path(folder) / "phantom")
+            path, out = video or Path(folder) / "phantom", Path(folder) / "run"
+            reconstruct(open_sequence(path, frames=slice(_WARM_UP_FRAMES)), config, out=out)
+            return _measured(path, config, frames, out)
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Speed:
+    sequence, clock = open_sequence(path, frames=slice(frames)), _Stopwatch()
+    calibrations = _calibrations_ms()
+    started, cpu_started = time.perf_counter(), time.process_time()
+    with clock.attached():
+        result = reconstruct(sequence, config, out=out, overwrite=True)
+    count = len(result.records)
+    cpu_ms = 1e3 * (time.process_time() - cpu_started) / count
+    passed_ms = 1e3 * (time.perf_counter() - started) / count
+    calibration_ms = float(np.median(calibrations + _calibrations_ms()))
+    return Speed(
+        sequence.name,
+        count,
+        config.preset,
+        (sequence.camera.width, sequence.camera.height),
+        calibration_ms,
+        cpu_ms,
+        passed_ms,
+        clock.stages(count, calibration_ms),
+    )
+
+
+class _Stopwatch:
+    """Notes the processor time of calls of the stages' functions, without that of the stages within them."""
+
+    def __init__(self) -> None:
+        # By stage, thread and function: functions of a stage may take very different times.
+        self._seconds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+        self._local = threading.local()
+
+    @contextmanager
+    def attached(self) -> Iterator[None]:
+        """Replace the functions of `STAGES` by timed ones while the context lasts."""
+        places = [(resolved(place), stage) for stage, places in STAGES.items() for place in places]
+        clock, method = resolved(_PARTS)
+        original = getattr(clock, method)
+
+        def timed(own: Any, part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+            with self.noted(part):
+                return original(own, part, call, *arguments)
+
+        with ExitStack() as replaced:
+            replaced.enter_context(patch.object(clock, method, timed))
+            for (owner, name), stage in places:
+                function = getattr(owner, name)
+                timed_function = wraps(function)(self.noted(stage, function.__qualname__)(function))
+                replaced.enter_context(patch.object(owner, name, timed_function))
+            yield
+
+    @contextmanager
+    def noted(self, stage: str, function: str = "") -> Iterator[None]:
+        """Note the processor time of what is within as that of a function of a stage; usable as a decorator."""
+        # Open calls of this thread: stage, seconds of the stages within.
+        calls: list[tuple[str, list[float]]] = self._local.__dict__.setdefault("calls", [])
+        name, within = _named(stage, [call for call, _ in calls]), [0.0]
+        calls.append((stage, within))
+        started = time.thread_time()
+        try:
+            yield
+        finally:
+            seconds = time.thread_time() - started
+            calls.pop()
+            if calls:
+                calls[-1][1][0] += seconds
+            self._seconds[name, _thread_name(), function].append(seconds - within[0])
+
+    def stages(self, frames: int, calibration_ms: float) -> dict[str, StageTime]:
+        """Return the stages that ran, the slowest first."""
+        ms: dict[str, dict[str, float]] = defaultdict(dict)
+        for (stage, thread, _), seconds in self._seconds.items():
+            own_ms = 1e3 * float(np.median(seconds)) * len(seconds) / frames
+            ms[stage][thread] = ms[stage].get(thread, 0.0) + own_ms
+        total = sum(sum(parts.values()) for parts in ms.values())
+        found = {}
+        for stage, threads in sorted(ms.items(), key=lambda item: -sum(item[1].values())):
+            own = sum(threads.values())
+            found[stage] = StageTime(own, own / calibration_ms, own / total, max(threads, key=threads.__getitem__))
+        return found
+
+
+def _named(stage: str, callers: list[str]) -> str:
+    """Return the name of a stage; flow is named by what it is computed for."""
+    if stage != "flow":
+        return stage
+    return next((_CALLER[caller] for caller in callers if caller in _CALLER), _OTHER_FLOW)
+
+
+def _thread_name() -> str:
+    name = threading.current_thread().name
+    return "main" if name == "MainThread" else name.rpartition("_")[0] or name
+
+
+def resolved(place: str) -> tuple[Any, str]:
+    """Return the owner and the name of the function at "module:name"."""
+    module, _, names = place.partition(":")
+    *owners, name = names.split(".")
+    owner: Any = import_module(f"scopemap.{module}")
+    for part in owners:
+        owner = getattr(owner, part)
+    return owner, name
+
+
+def _calibrations_ms() -> list[float]:
+    """Return the processor times of OpenCV's DIS flow of a fixed pair of images, 320x256 px."""
+    noise = np.random.default_rng(0).normal(size=(256, 340)).astype(np.float32)
+    blurred = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    smooth = (127 + 60 * blurred / blurred.std()).clip(0, 255).astype(np.uint8)
+    pair = np.ascontiguousarray(smooth[:, :320]), np.ascontiguousarray(smooth[:, 4:324])
+    dis, times_ms = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM), []
+    for _ in range(_CALIBRATION_RUNS):
+        started = time.thread_time()
+        dis.calc(*pair, np.zeros((256, 320, 2), np.float32))
+        times_ms.append(1e3 * (time.thread_time() - started))
+    return times_ms
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 4) if isinstance(value, float) else value

@@ -1,0 +1,78 @@
+"""Text files of poses that OneSLAM, Open3D and Endo-Depth-and-Motion write.
+
+OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes alone to `poses_pred.txt`, as TUM rows
+camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same form.
+
+A `.log` has a line of three integers per pose, then four lines of its 4x4 matrix. The form is Redwood's
+(redwood-data.org/indoor/fileformat.html); Open3D (io/file_format/FileLOG.cpp) writes `i i i+1` and the camera-to-world
+matrix. Endo-Depth-and-Motion (UZ-SLAMLab) writes `trajectory.log` with Open3D, but puts its world-to-camera matrices,
+in metres, there. The two look alike, so a `.log` is read only when its kind is named.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.errors import InputError
+from scopemap.geometry.se3 import inverse
+from scopemap.trajectory.formats.poses import are_frame_numbers, file_of, rigid, stamped
+from scopemap.trajectory.formats.text import fields_of, read_numbers, read_rows, text_lines, tum_poses
+from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+
+LOG_FILE = "trajectory.log"
+ONESLAM_FILES = ("poses_pred.txt", "poses_gt.txt")
+
+
+def is_oneslam(path: Path) -> bool:
+    """Return whether a file has OneSLAM's comment."""
+    return any(line.startswith("#") and "frame_index" in line for line in text_lines(path)[:2])
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a file begins as a log does."""
+    first = [fields for line in text_lines(path) if (fields := fields_of(line))][:2]
+    return [len(fields) for fields in first] == [3, 4]
+
+
+def refuse_log(path: Path, unit: Unit) -> Trajectory:
+    """Raise `InputError`: a log does not state the direction of its poses."""
+    path = path / LOG_FILE if path.is_dir() else path
+    raise InputError(
+        f"cannot tell which way the poses of {path} point: name the kind, 'open3d' (camera-to-world, as Open3D writes "
+        "them) or 'endo-depth' (world-to-camera in metres, as Endo-Depth-and-Motion does)"
+    )
+
+
+def read_oneslam(path: Path, unit: Unit) -> Trajectory:
+    """Read the keyframes of a OneSLAM run, or the `poses_gt.txt` of a data set in its layout."""
+    table = read_numbers(file_of(path, ONESLAM_FILES)).with_columns(8, "OneSLAM").sorted_by_stamp()
+    stamps, (T, words) = table.values[:, 0], tum_poses(table, unit)
+    if not are_frame_numbers(stamps):
+        raise InputError(f"{table.path}: OneSLAM stamps poses by frame number; with seconds the kind is 'tum'")
+    return stamped(T, stamps, None, f"OneSLAM, TUM rows by frame number, camera-to-world, {words}")
+
+
+def read_open3d(path: Path, unit: Unit) -> Trajectory:
+    """Read a log of camera-to-world poses, in `unit`; its first integers are the frames' numbers where they ascend."""
+    T, indices = _read_log(file_of(path, (LOG_FILE,)), unit)
+    return stamped(T, indices, None, f"Open3D log, camera-to-world, {unit} (assumed)")
+
+
+def read_endo_depth(path: Path, unit: Unit) -> Trajectory:
+    """Read a log of Endo-Depth-and-Motion: world-to-camera, always metres."""
+    T, indices = _read_log(file_of(path, (LOG_FILE,)), "m")
+    return stamped(inverse(T), indices, None, "Endo-Depth-and-Motion log, world-to-camera inverted, m")
+
+
+def _read_log(path: Path, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
+    rows = read_rows(path)
+    heads = rows[::5]
+    if [len(numbers) for _, numbers in rows] != [3, 4, 4, 4, 4] * len(heads):
+        raise InputError(f"reading {path}: a log has lines of 3, 4, 4, 4 and 4 numbers for each pose")
+    T = np.array([numbers for row, (_, numbers) in enumerate(rows) if row % 5]).reshape(-1, 4, 4)
+    T[:, :3, 3] *= MM_PER_UNIT[unit]
+    indices = np.array([numbers[0] for _, numbers in heads])
+    ascend = are_frame_numbers(indices) and bool(np.all(np.diff(indices) > 0))
+    return rigid(T, [f"{path}, line {line}" for line, _ in heads]), indices if ascend else np.arange(len(T))

@@ -1,0 +1,198 @@
+"""Distances and areas on the surface of a run, between pixels of a frame, with intervals.
+
+An interval holds 95 % of what the measure may be by what is known of its errors: of the depth at each pixel, of the
+pixels themselves, of the focal length, and of the scale. Errors are drawn; what two measures share, cancels in a ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from scopemap.actions.export.exported_run import ExportedRun, read_exported
+from scopemap.errors import InputError, SettingsError
+from scopemap.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
+from scopemap.report.kept_run import read_run
+
+_DRAWS, _TAIL_PERCENT = 2000, 2.5
+_PIXEL_ERROR_PX = 1.0
+_DEPTH_ERROR = 0.05
+"""Standard deviation of a depth over the depth, where the run estimated none: the limit of a good surface."""
+_ASSUMED_FOCAL_ERROR = 0.15
+"""Of a focal length by an assumed field of view: 70 degrees stand for 60 to 83."""
+_SCALE_ERROR = {"measured": 0.02, "calibrated": 0.1}
+"""Of a scale by measured depth; by a stated range of depth or by a network that was trained on metric depth."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What was measured, its value, and the ends of its 95 % interval. unit : mm, mm2, or times the reference.
+
+    The value is infinite where the surface has a gap between the points.
+    """
+
+    what: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.value):
+            return f"{self.what}: none, the surface has a gap between the points"
+        return f"{self.what}: {self.value:.3g} {self.unit} ({self.low:.3g} to {self.high:.3g})"
+
+
+@dataclass(frozen=True)
+class _Picked:
+    """Pixels (N, 2) of a frame, the surface's points there, their depth, and its relative standard deviation."""
+
+    pixels: np.ndarray
+    points: list[SurfacePoint]
+    depth_mm: np.ndarray
+    depth_error: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Draws of what all measures of a frame share: depth of the whole frame, focal length and scale, (D,) factors."""
+
+    depth: np.ndarray
+    focal: np.ndarray
+    scale: np.ndarray
+    generator: np.random.Generator
+
+
+def measure(
+    folder: Path, frame: int, pixels: np.ndarray, reference: np.ndarray | None = None, reference_mm: float | None = None
+) -> list[Measure]:
+    """Return distances between two pixels (2, 2) of a frame, straight and along the surface, or the area inside more.
+
+    pixels : x, y of the frame's rectified picture, as large as its depth map; (0, 0) is the middle of its first pixel.
+    reference : two pixels (2, 2) of the same frame whose straight distance is the unit of what is returned, or is
+    `reference_mm`; needed where the run's scale is unknown. Raises `InputError` where the frame, or a surface at a
+    pixel, is not there, and where neither the run nor a reference gives a scale.
+    """
+    if reference is None and reference_mm is not None:
+        raise SettingsError("a length of the reference without its two points: give both")
+    run = read_exported(folder)
+    if not run.scale_known and reference is None:
+        raise InputError(
+            f"{folder}: {run.scale}; give two points as a reference: measures are then multiples of their distance, "
+            "and millimetres where that is given, too"
+        )
+    pose = _pose(run, folder, frame)
+    picked, errors = _picked(run, frame, pose, pixels), _drawn(folder, run)
+    unit, divisor, draws = "mm", 1.0, errors.scale
+    if reference is not None:
+        known = _picked(run, frame, pose, reference)
+        divisor = _straight(np.stack([point.position for point in known.points]))
+        if divisor <= 0:
+            raise InputError("the reference's two points are the same")
+        draws = 1 / _relative(run, known, errors, _straight)
+        unit = "times the reference" if reference_mm is None else "mm"
+        divisor /= reference_mm or 1.0
+    if len(pixels) > 2:
+        area = area_inside(run.mesh, pixels, run.camera, pose)
+        if area <= 0:
+            raise InputError(f"no surface is seen inside the polygon of frame {frame}")
+        relative = _relative(run, picked, errors, _flat_area) * draws**2
+        unit = {"mm": "mm2"}.get(unit, "times the reference's square")
+        return [_measure("area", area / divisor**2, relative, unit)]
+    relative = _relative(run, picked, errors, _straight) * draws
+    straight = _straight(np.stack([point.position for point in picked.points]))
+    along = path_length(run.mesh, *picked.points)
+    found = {"straight": straight, "along the surface": along}
+    return [_measure(what, value / divisor, relative, unit) for what, value in found.items()]
+
+
+def _pose(run: ExportedRun, folder: Path, frame: int) -> np.ndarray:
+    row = np.flatnonzero(run.trajectory.indices == frame)
+    if len(row):
+        return np.asarray(run.trajectory.T_world_camera[row[0]])
+    kept = read_run(folder)
+    place = kept.place[kept.indices == frame]
+    where = f"it is in maps/{place[0]}, a folder of its own" if len(place) and place[0] > 0 else "it has no pose"
+    raise InputError(f"frame {frame} is not in the result {folder}: {where}")
+
+
+def _picked(run: ExportedRun, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
+    points, depths = [], []
+    for pixel in pixels:
+        inside = (pixel >= -0.5).all() and (pixel < [run.camera.width - 0.5, run.camera.height - 0.5]).all()
+        ray = run.camera.unproject(pixel)
+        found = meet_surface(run.mesh, pose[:3, 3], pose[:3, :3] @ ray) if inside else None
+        if found is None:
+            size = f"{run.camera.width}x{run.camera.height} px"
+            raise InputError(f"no surface at pixel {pixel[0]:g},{pixel[1]:g} of frame {frame}, whose size is {size}")
+        points.append(found)
+        depths.append(float((found.position - pose[:3, 3]) @ pose[:3, 2]))
+    depth_mm = np.array(depths)
+    return _Picked(pixels, points, depth_mm, _depth_errors(run, frame, pixels, depth_mm))
+
+
+def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+    """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
+    reader = run.depth()
+    own, sigma = (None, None) if reader is None else (reader.read(frame), reader.read_sigma(frame))
+    column, row = np.round(pixels).astype(int).T
+    errors = np.full(len(pixels), np.nan)
+    for image in () if own is None else (sigma, np.abs(own - _at(depth_mm, row, column, own.shape))):
+        if image is not None:
+            errors = np.fmax(errors, image[row, column] / depth_mm)
+    return np.where(np.isfinite(errors), errors, _DEPTH_ERROR)
+
+
+def _at(values: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    image = np.full(shape, np.nan)
+    image[row, column] = values
+    return image
+
+
+def _drawn(folder: Path, run: ExportedRun) -> _Errors:
+    facts: dict[str, Any] = read_run(folder).provenance
+    camera, source = facts["camera"], str((facts.get("scale") or {}).get("source", ""))
+    focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
+    if str(camera.get("source", "")).startswith("assumed"):
+        focal = max(focal, _ASSUMED_FOCAL_ERROR)
+    kind: Literal["measured", "calibrated"] = "measured" if source.startswith("measured") else "calibrated"
+    generator = np.random.default_rng(0)
+    normal = generator.standard_normal((3, _DRAWS))
+    return _Errors(normal[0], 1 + focal * normal[1], np.exp(_SCALE_ERROR[kind] * normal[2]), generator)
+
+
+def _relative(
+    run: ExportedRun, picked: _Picked, errors: _Errors, figure: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Return draws (D,) of a figure of the points over its value without errors.
+
+    Half of the variance of a depth is that of the whole frame, half its own.
+    """
+    count = len(picked.pixels)
+    own = errors.generator.standard_normal((3, _DRAWS, count))
+    depths = picked.depth_mm * np.exp(picked.depth_error * (errors.depth[:, None] + own[0]) / np.sqrt(2))
+    rays = run.camera.unproject(picked.pixels + _PIXEL_ERROR_PX * np.stack([own[1], own[2]], -1))
+    rays[..., :2] /= errors.focal[:, None, None]
+    points = rays * depths[..., None]
+    exact = run.camera.unproject(picked.pixels) * picked.depth_mm[:, None]
+    return np.asarray(figure(points) / np.maximum(figure(exact), 1e-9))
+
+
+def _straight(points: np.ndarray) -> Any:
+    """Return the distance of the first two of points (..., N, 3)."""
+    return np.linalg.norm(points[..., 1, :] - points[..., 0, :], axis=-1)
+
+
+def _flat_area(points: np.ndarray) -> Any:
+    """Return the area of polygons (..., N, 3), projected to where it is largest."""
+    from_first = points - points[..., :1, :]
+    return 0.5 * np.linalg.norm(np.cross(from_first[..., :-1, :], from_first[..., 1:, :]).sum(axis=-2), axis=-1)
+
+
+def _measure(what: str, value: float, relative: np.ndarray, unit: str) -> Measure:
+    low, high = np.percentile(relative, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
+    return Measure(what, float(value), float(value * min(low, 1.0)), float(value * max(high, 1.0)), unit)
