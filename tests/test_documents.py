@@ -159,7 +159,8 @@ def test_every_extra_is_documented() -> None:
 def test_source_files_that_are_named_exist(name: str) -> None:
     named = re.findall(r"`((?:[\w-]+/)*[\w-]+\.py)`", _text(f"docs/{name}.md"))
     assert named
-    places = (ROOT, ROOT / "src/scopemap", ROOT / "bench/src/scopemap_bench", ROOT / "src/scopemap/depth/scopenet", ROOT / "training")
+    folders = ("", "src/scopemap", "bench/src/scopemap_bench", "src/scopemap/depth/scopenet", "training")
+    places = [ROOT / folder for folder in folders]
     assert [one for one in named if "NAME" not in one and not any((place / one).exists() for place in places)] == []
 
 
