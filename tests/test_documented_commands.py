@@ -15,6 +15,7 @@ from front_door import call
 
 from scopemap.actions import demo as demonstration
 from scopemap.cli.app import app
+from scopemap_bench.scripts.demo_clip import SPEC, write_clip
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
@@ -89,10 +90,11 @@ def test_options_of_commands_in_the_text_exist(document: Path) -> None:
 def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what `scopemap demo` makes in `scopemap-demo`, of 16 small frames."""
     folder = tmp_path_factory.mktemp("documents")
-    spec = replace(demonstration.PHANTOM, frames=16, width=160, height=128)
     demonstration.prepare_out(folder / "scopemap-demo", overwrite=False)
-    demonstration.render(folder / "scopemap-demo", spec)
-    assert call("run", folder / "scopemap-demo/phantom", "--out", folder / "scopemap-demo/run", "--quiet") == 0
+    clip = folder / "scopemap-demo/clip"
+    write_clip(clip, replace(SPEC, frames=16, width=160, height=128))
+    run = (clip / "colon.mp4", "--camera", clip / "camera.yaml", "--out", folder / "scopemap-demo/run", "--quiet")
+    assert call("run", *run) == 0
     return folder
 
 
