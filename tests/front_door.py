@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -23,3 +24,13 @@ def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     assert (code, said.err.count("\n"), said.out) == (1, 1, ""), (code, said)
     assert said.err.startswith("scopemap: ")
     return said.err
+
+
+def said(provenance: dict[str, Any]) -> list[str]:
+    """What a run says about itself, in words."""
+    return [notice["text"] for notice in provenance["notices"]]
+
+
+def warned(provenance: dict[str, Any]) -> list[str]:
+    """What a run says about itself beyond its assumptions, in words."""
+    return [notice["text"] for notice in provenance["notices"] if notice["level"] != "info"]

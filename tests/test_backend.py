@@ -57,7 +57,7 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
     assert rotation_rad < 0.1 * before[0]
     assert translation_mm < 0.15 * before[1]
     assert correction.sigma_px < 0.3
-    assert "5 keyframes adjusted" in correction.description
+    assert "5 keyframes adjusted" in correction.notice.text
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
@@ -127,7 +127,7 @@ def test_keyframes_without_corners_change_nothing() -> None:
         backend.add(replace(_frame(number), valid=speckled))
     correction = backend.adjust()
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
-    assert "no common observations" in correction.description
+    assert "no common observations" in correction.notice.text
 
 
 def test_flow_is_sampled_at_more_points_than_opencv_allows() -> None:
@@ -159,7 +159,7 @@ def test_before_and_after_all_keyframes_the_nearest_correction_is_used() -> None
     assert correction.depth_factor(99) == pytest.approx(1.3)
     middle = correction.pose(30, np.eye(4))
     assert rotation_angle_rad(middle[:3, :3]) == pytest.approx(0.15)
-    assert "as tracked" in correction.description
+    assert "as tracked" in correction.notice.text
 
 
 def _tracked(keyframe: int, x_mm: float, segment: int = 0) -> TrackedPose:
@@ -255,7 +255,7 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
     assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
-    assert "not rigid" in correction.description
+    assert "not rigid" in correction.notice.text
 
 
 def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
@@ -270,7 +270,7 @@ def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
             backend.add(replace(frame, depth_mm=frame.depth_mm * factors))
         correction = backend.adjust()
         assert bool(correction.refused) == refused
-        assert ("depth would have to change by" in correction.description) == refused
+        assert ("depth would have to change by" in correction.notice.text) == refused
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.04])
@@ -292,7 +292,7 @@ def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkey
         backend.add(_frame(number, tracked[number]))
     correction = backend.adjust()
     assert correction.sigma_px < 0.8
-    assert ("depths of keyframes would disagree" in correction.refused) == bool(zoom)
+    assert (correction.notice.code == "mapping-depth-disagrees") == bool(zoom)
     before = _errors(tracked, POSES)
     after = _errors([correction.pose(10 * n, T) for n, T in enumerate(tracked)], POSES)
     assert after == before if zoom else after < (0.3 * before[0], 0.3 * before[1])

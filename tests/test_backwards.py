@@ -15,8 +15,9 @@ from scopemap.mapping import Mapper
 from scopemap.runner.backwards import _agree, _moved
 from scopemap.tracking.relocalisation import Keyframe
 from scopemap.tracking.rtdl import Alignment
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import Track, TrackingLoss
 from scopemap.tracking.tracker import Tracker
+from scopemap.trajectory.causes import LossCause
 
 FRAMES, LOST = 16, range(6, 9)
 LIGHT = {
@@ -37,7 +38,7 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
 
     twice : frames of which every pose is refused later, too.
     """
-    track, reject = Tracker.track, Tracker._reject_reason
+    track, reject = Tracker.track, Tracker._rejection
     now, done = [-1], set[int]()
 
     def watched(self: Tracker, frame: Frame) -> Track:
@@ -46,12 +47,14 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
         done.add(frame.index)
         return found
 
-    def refusing(self: Tracker, keyframe: Keyframe, alignment: Alignment) -> str:
+    def refusing(self: Tracker, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
         first = now[0] in (*LOST, LOST.stop) and now[0] not in done
-        return "refused" if first or (now[0] in twice and now[0] in done) else reject(self, keyframe, alignment)
+        again = now[0] in twice and now[0] in done
+        refused = TrackingLoss(LossCause.VIEW_CHANGED, "refused")
+        return refused if first or again else reject(self, keyframe, alignment)
 
     monkeypatch.setattr(Tracker, "track", watched)
-    monkeypatch.setattr(Tracker, "_reject_reason", refusing)
+    monkeypatch.setattr(Tracker, "_rejection", refusing)
     return reconstruct(open_sequence(phantom), with_true_depth(phantom, **LIGHT | changes))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 import tomllib
 from operator import attrgetter
 from pathlib import Path
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 import scopemap.config
 from docs.settings_page import settings_page
 from scopemap.config import PRESETS, Config, setting_names
-from scopemap.config.config import REMOVED, RENAMED
 from scopemap.errors import SettingsError
 
 SOURCE = Path(scopemap.config.__file__).parents[1]
@@ -243,40 +241,6 @@ def test_any_text_goes_through_a_file(text: str, tmp_path: Path) -> None:
 def test_what_is_no_number_is_refused(key: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"'{key}'.*finite number"):
         Config.load(settings={key: value})
-
-
-def test_settings_of_earlier_versions_are_read_from_files_and_named_on_the_command_line(tmp_path: Path) -> None:
-    file = _write(tmp_path, "[odometry]\nkeyframe_every = 7\n[backend]\nmethod = 'none'\n[fusion]\nmin_weight = 0.5\n")
-    loaded = Config.load(file=file)
-    assert (loaded.tracking.keyframe_every, loaded.mapping.method) == (7, "none")
-    assert loaded.fusion.advanced.min_weight == 0.5
-    for old, new in (
-        ("odometry.keyframe_every", "tracking.keyframe_every"),
-        ("fusion.min_weight", "fusion.advanced.min_weight"),
-    ):
-        with pytest.raises(SettingsError, match=rf"'{re.escape(old)}' is now called '{re.escape(new)}'"):
-            Config.load(settings={old: 7})
-
-
-def test_removed_settings_are_skipped_in_files_and_refused_on_the_command_line(tmp_path: Path) -> None:
-    assert Config.load(file=_write(tmp_path, "[networks]\nflow_iterations = 7\n")) == Config()
-    with pytest.raises(SettingsError, match=r"'networks\.flow_iterations' no longer exists"):
-        Config.load(settings={"networks.flow_iterations": 7})
-
-
-def test_renamed_settings_exist_and_removed_ones_do_not() -> None:
-    names = set(setting_names())
-    assert set(RENAMED.values()) <= names
-    assert not (set(RENAMED) | REMOVED) & names
-
-
-def test_what_depended_on_the_machine_s_weights_is_what_the_preset_names(tmp_path: Path) -> None:
-    file = tmp_path / "old.toml"
-    file.write_text('networks.flow = "auto"\nnetworks.perceptual = "auto"\n')
-    assert Config.load(file=file).networks == Config().networks
-    assert Config.load("paper", file=file).networks.flow == "raft-large"
-    with pytest.raises(SettingsError, match=r"networks\.perceptual"):
-        Config.load(settings={"networks.perceptual": "auto"})
 
 
 def test_the_page_of_settings_is_the_generated_one() -> None:

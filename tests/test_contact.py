@@ -28,9 +28,9 @@ from scopemap.report.losses import losses
 from scopemap.report.verdict import verdict
 from scopemap.runner.records import records_of
 from scopemap.tracking.relocalisation import RotationFollower, rotation_by_flow
-from scopemap.tracking.track import UNCONFIRMED, WALL, Track
+from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
-from scopemap.trajectory.causes import ADVICE, causes_of_loss
+from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FIRST = plane_scene.pose(turn_rad=(0.3, 0.1, 0.0))
@@ -131,7 +131,7 @@ def _tracked(frames: list[Frame], **changes: object) -> list[Track]:
 
 def test_after_a_wall_features_confirm_the_pose_and_tell_the_scale_of_depth() -> None:
     tracks = _tracked(_frames(2.0))
-    assert all(WALL in track.reason for track in tracks[6:9])
+    assert all(track.cause is LossCause.CONTACT for track in tracks[6:9])
     assert causes_of_loss(tracks)[6:9] == ["contact with the wall"] * 3
     assert ADVICE["contact with the wall"]
     assert (tracks[9].status, tracks[9].reason, tracks[9].map) == ("ok", "relocalised", 0)
@@ -144,7 +144,9 @@ def test_a_pose_after_a_wall_that_no_features_confirm_begins_a_new_map_later(mon
     monkeypatch.setattr(Tracker, "_found", lambda *_, **__: None)
     tracks = _tracked(_frames(1.0), new_map_after=4)
     assert [track.status for track in tracks[6:]] == ["lost"] * (3 + 8) + ["initial"] + ["ok"] * 6
-    assert {track.reason for track in tracks[9:17]} == {f"rejected: {UNCONFIRMED}"}
+    assert {track.reason for track in tracks[9:17]} == {
+        "rejected: no features confirm the pose after a wall filled the picture"
+    }
     assert tracks[17].map == 1
 
 
@@ -163,9 +165,10 @@ def _records() -> list[FrameRecord]:
     records, found = list[FrameRecord](), [None, None, None, step, step @ step, None, None, step]
     for index, rotation in enumerate(found):
         is_lost = index in (3, 4, 5, 7)
-        reason = WALL if index == 4 else "rejected: jump" if is_lost else ""
+        lost_by = LossCause.CONTACT if index == 4 else LossCause.VIEW_CHANGED
+        cause = lost_by if is_lost else LossCause.NONE
         T = plane_scene.pose(at_mm=(float(index), 0.0, 0.0), turn_rad=(0.1 * index, 0.0, 0.0))
-        track = Track(index, "lost" if is_lost else "ok", reason, T, 0)
+        track = Track(index, "lost" if is_lost else "ok", "", T, 0, cause=cause)
         track = replace(track, rotation=None if rotation is None else rotation[:3, :3])
         records.append(FrameRecord(index, index / 30, "", track, None if is_lost else T, 1.0, 1.0))
     frames = frozenset({0, 1, 2, 6})

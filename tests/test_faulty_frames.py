@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from front_door import warned
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
@@ -66,7 +67,7 @@ def test_a_frame_with_which_a_stage_fails_is_lost_with_the_reason(
     _break(monkeypatch, kind, name, {4}, error)
     result = reconstruct(open_sequence(folder), with_true_depth(folder))
     assert _lost(result) == {4: reason}
-    assert result.provenance["warnings"][0] == (f"1 frame(s) could not be processed whole (first: frame 4, {reason})")
+    assert warned(result.provenance)[0] == (f"1 frame(s) could not be processed whole (first: frame 4, {reason})")
     assert len(result.mesh.faces) > 100
 
 
@@ -82,7 +83,7 @@ def test_a_frame_without_flow_to_the_one_before_is_still_tracked(folder: Path, m
     _break(monkeypatch, DenseMatcher, "match", {4}, RuntimeError("it broke"))
     result = reconstruct(open_sequence(folder), Config())
     assert result.provenance["tracked"] == FRAMES
-    assert "frame 4, flow failed: it broke" in result.provenance["warnings"][0]
+    assert "frame 4, flow failed: it broke" in warned(result.provenance)[0]
 
 
 @pytest.mark.parametrize("kind", [FilesDepth, Tracker])
@@ -121,7 +122,7 @@ def test_depth_that_is_no_number_is_unknown_and_told(
     assert result.provenance["tracked"] == FRAMES
     assert np.isfinite(result.mesh.vertices).all()
     told = "1 frame(s) got no depth from the network (first: frame 4)"
-    assert (told in result.provenance["warnings"]) == (value != 0)
+    assert (told in warned(result.provenance)) == (value != 0)
 
 
 def _hang_at(name: str, patch: pytest.MonkeyPatch) -> threading.Event:
@@ -149,7 +150,7 @@ def test_a_reader_that_hangs_ends_the_frames_and_what_was_tracked_is_kept(
         gate.set()
     assert time.monotonic() - started < 50
     assert [record.index for record in result.records if record.track.status != "lost"] == [*range(6)]
-    (warning,) = [warning for warning in result.provenance["warnings"] if "hangs" in warning]
+    (warning,) = [warning for warning in warned(result.provenance) if "hangs" in warning]
     late = "its picture after frame 5 did not come within 3 s: a decoder or a disk hangs; the frames until then"
     assert warning == f"{folder}: {late} were used"
     assert len(result.mesh.faces) > 100

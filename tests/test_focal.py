@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from front_door import said
 from turning_clip import SIZE, focal_of, write_clip
 
 from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
@@ -260,7 +261,7 @@ def test_a_camera_at_rest_stays_as_assumed(still: Sequence, focal: str) -> None:
     result = reconstruct(still, config)
     assert result.camera == still.camera
     assert result.provenance["camera"]["focal_sigma_px"] is None
-    camera, notes = result.provenance["camera"]["source"], result.provenance["notes"]
+    camera, notes = result.provenance["camera"]["source"], said(result.provenance)
     assert camera.startswith("assumed: horizontal field of view 70 deg")
     assert ("the motion does not determine it" in camera) == (focal == "auto")
     assert "--fov" not in camera  # it was not given

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from front_door import said
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
@@ -69,8 +70,8 @@ def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
     store.put(wall(30.0))
     assert list(tmp_path.iterdir()) == []
     store.close()
-    for advice, said in (("", "free space there"), ("or fuse at once", "free space there, or fuse at once")):
-        with pytest.raises(InputError, match=rf"cannot store frames in .*gone: No such file.*; {said}$"):
+    for advice, words in (("", "free space there"), ("or fuse at once", "free space there, or fuse at once")):
+        with pytest.raises(InputError, match=rf"cannot store frames in .*gone: No such file.*; {words}$"):
             FrameStore(tmp_path / "gone", advice).put(wall(30.0))
 
 
@@ -147,7 +148,7 @@ def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
         volume.integrate(frame)
     assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)
     assert surface.settings.voxel_mm == 1.0
-    assert len(surface.notes) == (voxel_mm is None)
+    assert len(surface.notices) == (voxel_mm is None)
     assert fusion.fuse([], ()).settings.voxel_mm in (voxel_mm, 1.0)
 
 
@@ -156,7 +157,7 @@ def test_no_known_depth_gives_no_surface() -> None:
     nothing = replace(wall(60.0), depth_mm=np.full((120, 160), np.nan, np.float32))
     fusion.put(nothing)
     surface = fusion.fuse(fusion.store.frames(), {0})
-    assert (len(surface.mesh.vertices), surface.settings, surface.notes) == (0, FusionSettings(), [])
+    assert (len(surface.mesh.vertices), surface.settings, surface.notices) == (0, FusionSettings(), [])
 
 
 @pytest.mark.parametrize("factor", [0.03, 30.0])
@@ -179,4 +180,4 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
     assert len(again.mesh.vertices) == pytest.approx(len(other.mesh.vertices), rel=0.001)
     assert len(other.mesh.vertices) == pytest.approx(len(same.mesh.vertices), rel=0.15)
     assert other.mesh.area == pytest.approx(factor**2 * same.mesh.area, rel=0.1)
-    assert any(f"voxels of {other.config.fusion.voxel_mm:g} mm" in note for note in other.provenance["notes"])
+    assert any(f"voxels of {other.config.fusion.voxel_mm:g} mm" in note for note in said(other.provenance))

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "scopemap"
 # A package may import those before it, and none after it.
 LAYERS = (
-    *("errors", "plugins", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
+    *("errors", "notices", "plugins", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
     *("masking", "flow", "depth", "tracking", "mapping", "fusion", "calibration"),
     *("pipeline", "estimators", "reconstruction", "runner", "evaluation", "inspection", "actions", "cli"),
 )
@@ -210,7 +210,7 @@ def test_nobody_but_the_front_door_imports_the_command_line() -> None:
 
 def test_the_layers_are_the_packages() -> None:
     assert {module.room for module in MODULES} == {*LAYERS, "__init__", "__main__"}
-    assert len(LAYERS) <= 24
+    assert len(LAYERS) <= 25
 
 
 def test_networks_are_imported_by_their_adapters_alone() -> None:
@@ -274,7 +274,8 @@ def _of_closure(start: str) -> list[_Module]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
-    assert len(closure) <= 60, "\n".join(sorted(closure))
+    # With the typed notices and the causes of losses.
+    assert len(closure) <= 64, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

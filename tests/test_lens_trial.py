@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from front_door import warned
 from turning_clip import write_clip
 
 from scopemap.calibration.focal_length.estimate import FocalEstimate
@@ -138,7 +139,7 @@ def test_a_run_sees_through_the_lens_that_was_found(clip: Path, tried: list, tmp
         "estimated: by trial of lenses in 4 windows, orthographic fisheye, fx 100 +- 3 px"
     )
     assert facts["focal_sigma_px"] == pytest.approx(3.0)
-    assert not any("camera is unknown" in warning for warning in result.provenance["warnings"])
+    assert not any("camera is unknown" in warning for warning in warned(result.provenance))
     lens = read_calibration(tmp_path / "out" / "source_camera.yaml", (200, 160)).camera
     assert isinstance(lens, FisheyeCamera)
     assert lens.distortion == pytest.approx(KINDS["orthographic fisheye"])
@@ -156,7 +157,7 @@ def test_the_default_is_named_where_nothing_is_known(
 ) -> None:
     tried.append(said)
     result = reconstruct(open_sequence(clip), Config.load(settings=LIGHT))
-    (warning,) = [text for text in result.provenance["warnings"] if "camera is unknown" in text]
+    (warning,) = [text for text in warned(result.provenance) if "camera is unknown" in text]
     assert "assumed: horizontal field of view 70 deg" in warning
     assert words in warning
     assert words in result.provenance["camera"]["source"]
@@ -167,7 +168,7 @@ def test_the_default_is_named_where_nothing_is_known(
 
 def test_a_stated_view_is_not_tried(clip: Path, tried: list) -> None:
     result = reconstruct(open_sequence(clip, fov_deg=90.0), Config.load(settings=LIGHT))
-    assert not any("camera is unknown" in warning for warning in result.provenance["warnings"])
+    assert not any("camera is unknown" in warning for warning in warned(result.provenance))
     assert not tried
 
 

@@ -8,46 +8,52 @@ import numpy as np
 import pytest
 
 from scopemap import open_sequence, reconstruct
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
+from scopemap.frame import Frame
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
 from scopemap.report.losses import in_words, losses
-from scopemap.tracking.track import TOO_BRIGHT, TOO_DARK, Status, Track
-from scopemap.trajectory.causes import ADVICE, causes_of_loss
+from scopemap.tracking.track import Status, Track, unusable
+from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
 
-def track(reason: str, motion: float = 0.01, status: Status = "lost") -> Track:
-    return Track(0, status, reason, np.eye(4), 0, motion=motion)
+def track(cause: LossCause, motion: float = 0.01, status: Status = "lost") -> Track:
+    return Track(0, status, "", np.eye(4), 0, motion=motion, cause=cause)
 
 
-REJECTED = "rejected: correlation 0.08 with the keyframe"
+OK, REJECTED = track(LossCause.NONE, status="ok"), LossCause.VIEW_CHANGED
 
 
 @pytest.mark.parametrize(
-    ("reason", "motion", "cause"),
+    ("judged", "motion", "cause"),
     [
-        (f"only 3% of the image is usable{TOO_DARK}", 0.0, "too dark"),
-        (f"only 3% of the image is usable{TOO_BRIGHT}", 0.0, "overexposed"),
-        ("only 3% of the image is usable", 0.0, "view covered"),
-        ("only 40% of the usual sharpness: blur, smoke or fluid", 0.01, "smoke, fluid or out of focus"),
-        ("only 40% of the usual sharpness: blur, smoke or fluid", 0.05, "motion blur"),
-        ("rejected: weakly constrained, hardly any texture", 0.05, "no texture"),
-        (REJECTED, 0.05, "fast motion"),
-        (REJECTED, 0.01, "view changed"),
-        (REJECTED, float("nan"), "view changed"),
-        ("too little of its depth is known to start from", 0.01, "other"),
+        *((one, 0.05, one) for one in (LossCause.TOO_DARK, LossCause.VIEW_COVERED, LossCause.CONTACT)),
+        (LossCause.NO_TEXTURE, 0.05, LossCause.NO_TEXTURE),
+        (LossCause.UNSHARP, 0.01, LossCause.UNSHARP),
+        (LossCause.UNSHARP, 0.05, LossCause.MOTION_BLUR),
+        (REJECTED, 0.05, LossCause.FAST_MOTION),
+        (REJECTED, 0.01, LossCause.VIEW_CHANGED),
+        (REJECTED, float("nan"), LossCause.VIEW_CHANGED),
+        (LossCause.OTHER, 0.01, LossCause.OTHER),
     ],
 )
-def test_the_cause_of_the_first_lost_frame(reason: str, motion: float, cause: str) -> None:
-    found = causes_of_loss([track("", status="ok"), track(reason, motion)])
-    assert found == ["", cause]
+def test_the_cause_of_the_first_lost_frame(judged: LossCause, motion: float, cause: LossCause) -> None:
+    assert causes_of_loss([OK, track(judged, motion)]) == [LossCause.NONE, cause]
     assert ADVICE[cause]
 
 
+@pytest.mark.parametrize(("level", "cause"), [(5, "too dark"), (250, "overexposed"), (120, "view covered")])
+def test_why_hardly_a_pixel_is_usable(level: int, cause: str) -> None:
+    camera = PinholeCamera(8.0, 8.0, 3.5, 3.5, 8, 8)
+    rgb, valid = np.full((8, 8, 3), level, np.uint8), np.zeros((8, 8), bool)
+    found = unusable(Frame(0, 0.0, rgb, camera, valid))
+    assert (found.cause, found.reason[:8]) == (cause, "only 0% ")
+
+
 def test_what_follows_a_loss_without_a_fault_of_its_own_is_not_found_again() -> None:
-    searched = track("not searched: one of 3 lost frames is")
-    tracks = [track(REJECTED, 0.05), searched, track(REJECTED), track("", status="ok"), track(REJECTED)]
+    tracks = [track(REJECTED, 0.05), track(LossCause.OTHER), track(REJECTED), OK, track(REJECTED)]
     assert causes_of_loss(tracks) == ["fast motion", "not found again", "not found again", "", "view changed"]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import plane_scene
 import pytest
 import trimesh
+from front_door import said, warned
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
@@ -32,7 +33,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.reconstruction import DepthReader
 from scopemap.report.submap_summaries import submaps_in_time
 from scopemap.tracking.relocalisation import Relocaliser
-from scopemap.tracking.track import RELOCALISED, Track
+from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.climb.check import submission_problems
 from scopemap_bench.climb.submission import write_submission
@@ -85,7 +86,7 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_
     assert counts == expected
     assert result.records[0].track.reason == "tracked in maps/1"
     assert "keyframe" in result.records[FIRST].track.reason
-    note = next(text for text in result.provenance["warnings"] if "submaps" in text)
+    note = next(text for text in warned(result.provenance) if "submaps" in text)
     assert note.startswith("2 submaps")
     assert f"{SECOND - LOST_BEFORE_NEW} of {FIRST + SECOND - LOST_BEFORE_NEW} tracked frames are in the result" in note
 
@@ -205,7 +206,7 @@ def test_maps_of_the_same_place_are_merged() -> None:
     assert [backend.keyframes(number) for number in range(3)] == [5, 5, 0]
     correction = backend.adjust(0, tracked)
     assert sorted(correction.S_common_map) == [0, 1]
-    assert "2 maps merged" in correction.description
+    assert "2 maps merged" in correction.notice.text
     for frame, at_mm in zip(frames, places, strict=True):
         moved = corrected_frame(frame, correction)
         assert moved.T_world_camera is not None
@@ -259,17 +260,17 @@ def test_the_submap_with_most_frames_comes_first(monkeypatch: pytest.MonkeyPatch
         mapper = Mapper(MappingSettings(method=method), DisFlow())
         for index, number in enumerate(of_map):
             mapper.observe(Track(index, "ok", "", np.eye(4), 0, map=number))
-        submaps, warnings = mapper.submaps()
+        submaps, (notice,) = mapper.submaps()
         assert [(submap.maps, len(submap.frames)) for submap in submaps] == expected
-        assert f"{expected[0][1]} of 45 tracked frames are in the result" in warnings[0]
-        assert warnings[0].startswith("5 submaps" if method == "none" else "4 submaps")
+        counts = (notice.values["submaps"], notice.values["frames"], notice.values["tracked"])
+        assert counts == (5 if method == "none" else 4, expected[0][1], 45)
 
 
 @pytest.mark.parametrize(
-    ("elsewhere", "reason", "split"), [(True, "", True), (True, RELOCALISED, False), (False, "", False)]
+    ("elsewhere", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)]
 )
 def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(
-    elsewhere: bool, reason: str, split: bool
+    elsewhere: bool, found: bool, split: bool
 ) -> None:
     mapper = Mapper(MappingSettings(), DisFlow())
     for number in range(10):
@@ -280,12 +281,12 @@ def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(
             mapper.observe(Track(10 * number - 5, "lost", "blur", frame.T_world_camera, 30))
         # After the loss, too, the frame is aligned to the keyframe before it.
         keyframe = 10 * max(number - 1, 0)
-        track = Track(frame.index, "ok", reason if number == 4 else "", pose.T_world_camera, keyframe)
+        track = Track(frame.index, "ok", "", pose.T_world_camera, keyframe, relocalised=found and number == 4)
         mapper.add_keyframe(frame, track)
         mapper.observe(track)
-    submaps, warnings = mapper.submaps()
+    submaps, notices = mapper.submaps()
     assert sorted(submaps[0].frames) == ([*range(40, 100, 10)] if split else [*range(0, 100, 10)])
-    assert [text[:9] for text in warnings] == (["2 submaps"] if split else [])
+    assert [notice.values["submaps"] for notice in notices] == ([2] if split else [])
     assert submaps[0].main == int(split)
     if split:
         correction = submaps[0].correction
@@ -382,8 +383,8 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
         *["tracked backwards"] * LOST_BEFORE_NEW,
         "new map",
     ]
-    assert any("2 maps merged" in note for note in result.provenance["notes"])
-    assert not [text for text in result.provenance["warnings"] if "submaps" in text]
+    assert any("2 maps merged" in note for note in said(result.provenance))
+    assert not [text for text in warned(result.provenance) if "submaps" in text]
     np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
     report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
     assert report["ate_rmse_mm"] < 0.4

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from front_door import call, refused
+from front_door import call, refused, said
 from test_fusion import all_around, sphere_frame
 from tiny_phantom import SIZE, with_true_depth, write_tiny
 
@@ -94,7 +94,7 @@ def test_voxels_grow_until_the_surface_is_within_the_limit(at_end: bool, tmp_pat
             fusion.put(frame)
         found = fusion.fuse(fusion.store.frames(), {0})
         meshes.append(found.mesh)
-        counts.append((found.settings.voxel_mm, found.settings.truncation_mm, len(found.notes)))
+        counts.append((found.settings.voxel_mm, found.settings.truncation_mm, len(found.notices)))
     assert counts == [(0.5, 2.5, 0), (1.0, 5.0, 1), (4.0, 20.0, 1)] or counts[1][0] == 1.0 < counts[2][0]
     assert len(meshes[0].faces) > 3 * len(meshes[1].faces) > 9 * len(meshes[2].faces)
     for mesh, tolerance_mm in zip(meshes, (0.1, 0.2, 1.5), strict=True):
@@ -132,4 +132,4 @@ def test_a_limited_run_at_once_is_limited_too(folder: Path, monkeypatch: pytest.
     result = reconstruct(open_sequence(folder), config)
     assert result.config.fusion.voxel_mm is not None
     assert result.config.fusion.voxel_mm > 0.4
-    assert any("in place of 0.4 mm" in note for note in result.provenance["notes"])
+    assert any("in place of 0.4 mm" in note for note in said(result.provenance))

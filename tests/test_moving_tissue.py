@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from front_door import said
 from tiny_phantom import write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
@@ -209,7 +210,7 @@ def test_a_killed_run_of_a_camera_at_rest_ends_in_the_same_bytes(
     whole = reconstruct(open_sequence(pushed), config, out=tmp_path / "whole")
     for file in ("frames.csv", "mesh.ply", "trajectory.tum", "surfaces/000002.ply", "surfaces/000009.ply"):
         assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
-    assert any("as seen at second 0.3" in note for note in whole.provenance["notes"])
+    assert any("as seen at second 0.3" in note for note in said(whole.provenance))
 
 
 def test_motion_is_told_where_and_when_it_is(run: Path) -> None:

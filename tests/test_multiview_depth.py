@@ -167,7 +167,7 @@ def test_every_frame_gets_the_depth_of_the_keyframes_around_it(depths: KeyframeD
     found = [depths.depth(number, wrong_mm(number).depth_mm) for number in range(FRAMES)]
     depths.close()
     assert depths.triangulated == 3
-    assert "3 of 3 keyframes" in depths.description
+    assert "3 of 3 keyframes" in depths.notice.text
     assert all(one is not None for one in found)
     middle = found[MIDDLE]
     assert middle is not None

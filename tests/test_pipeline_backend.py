@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from front_door import said
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
@@ -122,13 +123,13 @@ def test_the_mesh_agrees_with_adjusted_poses_and_depth(run: _Run) -> None:
 
 
 def test_the_provenance_reports_the_adjustment(run: _Run) -> None:
-    notes = run.adjusted.provenance["notes"]
+    notes = said(run.adjusted.provenance)
     assert any("keyframes adjusted" in note for note in notes)
-    assert not any(note.startswith("mapping:") for note in run.tracked.provenance["notes"])
+    assert not any(note.startswith("mapping:") for note in said(run.tracked.provenance))
     assert run.adjusted.provenance["seconds"]["back end"] > 0
 
 
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:
     result = reconstruct(open_sequence(run.phantom), with_true_depth(run.phantom, **SETTINGS))
-    assert not any(note.startswith("mapping:") for note in result.provenance["notes"])
+    assert not any(note.startswith("mapping:") for note in said(result.provenance))
     assert len(result.mesh.faces) > 1000

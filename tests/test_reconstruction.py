@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from front_door import said, warned
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
@@ -270,7 +271,7 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
     last = LOST - 2
     told = json.loads((out / "provenance.json").read_text())
     assert told["interrupted_at_frame"] == result.records[-1].index == last
-    assert f"interrupted at frame {last}: the result is of the frames until then" in told["warnings"]
+    assert f"interrupted at frame {last}: the result is of the frames until then" in warned(told)
     assert [int(row["index"]) for row in _rows(out)] == list(range(last + 1))
     assert len(read_trajectory(out)) == last + 1
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) > 100
@@ -280,8 +281,8 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
 def test_a_result_of_few_frames_warns(run: _Run) -> None:
     config = with_true_depth(run.phantom, fusion__enabled=False)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 2)), config)
-    assert any(text.startswith("only 2 frames are in the result") for text in result.provenance["warnings"])
-    assert run.result.provenance["warnings"] == []
+    assert any(text.startswith("frames in the result: 2, too few") for text in said(result.provenance))
+    assert warned(run.result.provenance) == []
 
 
 def test_overwrite_takes_away_the_earlier_run_and_nothing_else(run: _Run, tmp_path: Path) -> None:
@@ -339,7 +340,7 @@ def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) ->
     depth = cv2.imread(str(tmp_path / "out" / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED) * scale_mm
     assert (depth > 0).mean() > 0.9
     assert np.median(depth) > 1000
-    assert not any("not fused" in text for text in result.provenance["warnings"])
+    assert not any("not fused" in text for text in warned(result.provenance))
     assert result.config.fusion.voxel_mm == pytest.approx(100 * run.result.config.fusion.voxel_mm, rel=0.1)
     assert np.ptp(result.mesh.vertices, axis=0).max() > 1000
 
@@ -347,7 +348,7 @@ def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) ->
 def test_what_is_too_far_for_a_stated_reach_is_told(run: _Run) -> None:
     config = with_true_depth(run.phantom, fusion__max_depth_mm=20.0)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
-    assert any("raise fusion.max_depth_mm and fusion.voxel_mm" in text for text in result.provenance["warnings"])
+    assert any("raise fusion.max_depth_mm and fusion.voxel_mm" in text for text in warned(result.provenance))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a full disk is played by /dev/full")

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from front_door import warned
 from tiny_phantom import write_tiny
 
 from scopemap import Config, OwnDepth, Reconstruction, Reconstructor, open_sequence, reconstruct
@@ -190,7 +191,7 @@ def test_limits_bound_what_is_kept(folder: Path) -> None:
     assert 0 < len(result.records) <= 4
     assert [step.track.status for step in steps] == ["initial"] + ["ok"] * (FRAMES - 1)
     assert (result.records[0].index, result.records[-1].index) == (0, FRAMES - 1)
-    assert "older frames are not in the result: it keeps 4" in " ".join(result.provenance["warnings"])
+    assert "older frames are not in the result: it keeps 4" in " ".join(warned(result.provenance))
     alone = Reconstructor(config, open_sequence(folder))
     alone.step(next(iter(alone.frames())))
     assert len(alone.surface().faces) == faces  # the first frame alone was fused

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 import trimesh
 from drawn_run import GOOD_SURFACE, tube
 
+from scopemap.notices import KINDS, Notice, fields_of_kind, notices_of
 from scopemap.report import verdict as rules
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptMap, KeptRun
 from scopemap.report.submap_summaries import doubt_words, most_doubtful, submaps_in_time
@@ -21,9 +24,7 @@ DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
 def run_of(place: list[int], *, mesh: trimesh.Trimesh | None = None, **facts: Any) -> KeptRun:
     provenance = {
-        "camera": {"source": "calibration file camera.yaml"},
-        "estimators": {"anchor": "millimetres as scopenet gives them"},
-        "notes": [],
+        "camera": {"source": "calibration file camera.yaml", "origin": "calibrated"},
         "surface": GOOD_SURFACE,
     } | facts
     maps = [KeptMap(np.arange(3), np.tile(np.eye(4), (3, 1, 1)), tube() if mesh is None else mesh)]
@@ -51,22 +52,27 @@ def test_what_a_result_may_be_used_for() -> None:
     assert verdict(run_of([0] * 5)).advice == "Do not use this result."
 
 
-def test_warnings_come_first_in_plain_words_and_once() -> None:
-    said_elsewhere = [
-        "10 submaps: the camera was lost, and nothing connects what it saw before and after; 77 of 181 tracked frames",
-        "interrupted at frame 30: the result is of the frames until then",
-    ]
-    other = "the video a.mp4 holds 3 damaged picture(s), which were left out"
-    warnings = [*said_elsewhere, other, other, "masks: 40 of 50 frames have none in masks; the last number in a mask's"]
-    found = verdict(run_of([0] * 40 + [LOST] * 10, warnings=warnings, interrupted_at_frame=30))
-    assert [(reason.level, reason.text) for reason in found.reasons[:3]] == [
-        ("doubtful", "The run was stopped at frame 30: the rest is missing."),
-        ("doubtful", "Most frames have no mask: instruments may be part of the surface."),
-        ("note", "The video a.mp4 holds 3 damaged picture(s), which were left out."),
+def notices(*found: Notice) -> dict[str, Any]:
+    return {"notices": [notice.as_json() for notice in found]}
+
+
+MASKS = Notice("masks-missing", {"missing": 40, "frames": 50, "folder": "masks"})
+
+
+def test_notices_come_first_in_plain_words_and_once() -> None:
+    counts = {"submaps": 10, "frames": 77, "tracked": 181, "saved": 2, "least": 5}
+    said_elsewhere = [Notice("submaps-apart", counts), Notice("input-interrupted", {"frame": 30})]
+    other = Notice("input-warning", {"text": "the video a.mp4 holds 3 damaged picture(s), which were left out"})
+    assumed = Notice("input-note", {"text": "time stamps: frame number / 30 s"})
+    facts = notices(*said_elsewhere, assumed, other, other, MASKS)
+    found = verdict(run_of([0] * 40 + [LOST] * 10, **facts, interrupted_at_frame=30))
+    assert [(reason.code, reason.level, reason.text) for reason in found.reasons[:3]] == [
+        ("interrupted", "doubtful", "The run was stopped at frame 30: the rest is missing."),
+        ("masks-missing", "doubtful", "Most frames have no mask: instruments may be part of the surface."),
+        ("input-warning", "note", "The video a.mp4 holds 3 damaged picture(s), which were left out."),
     ]
     assert any(reason.text.startswith("80 % of the frames until then are in the result") for reason in found.reasons)
-    assert not any("submaps" in reason.text or "interrupted" in reason.text for reason in found.reasons)
-    assert "damaged" not in " ".join(reason.text for reason in verdict(run_of([0] * 50)).reasons)
+    assert not {"submaps-apart", "input-interrupted", "input-note"} & {reason.code for reason in found.reasons}
 
 
 @pytest.mark.parametrize(
@@ -103,11 +109,11 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
-        ({"camera": {"source": "assumed: horizontal field of view 70 deg"}}, "lens is a guess"),
-        ({"notes": ["the scene is not rigid or the focal length is wrong: 0.98 px"]}, "one rigid shape"),
-        ({"notes": ["the camera is at rest while the tissue moves: errors"]}, "hardly moves"),
-        ({"notes": ["focal length: the lens has radial distortion, about 12% at half"]}, "bends straight lines"),
-        ({"warnings": ["the pictures are interlaced: their even and odd rows"]}, "is interlaced"),
+        ({"camera": {"origin": "assumed"}}, "lens is a guess"),
+        (notices(Notice("mapping-not-rigid", {"merged": "", "reason": "0.98 px"})), "one rigid shape"),
+        (notices(Notice("camera-at-rest")), "hardly moves"),
+        (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
+        (notices(Notice("input-interlaced")), "is interlaced"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],
 )
@@ -160,10 +166,11 @@ def test_frames_that_were_not_used_are_no_gap() -> None:
     assert "Longest gap: 5 frames" in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
 
 
-def test_scale_is_known_where_it_is_measured_or_anchored() -> None:
-    anchors = {"measured depth": True, "near-far 5:80 mm": True, "millimetres as scopenet gives them": False, "": False}
-    assert {anchor: scale_is_known({"estimators": {"anchor": anchor}}) for anchor in anchors} == anchors
-    assert "scale known" in verdict(run_of([0] * 50, estimators={"anchor": "measured depth"})).sentence
+def test_scale_is_known_where_the_run_says_so() -> None:
+    assert not scale_is_known({})
+    facts = {"scale": {"known": True, "measured": True, "source": "measured depth"}}
+    assert scale_is_known(facts)
+    assert "scale known" in verdict(run_of([0] * 50, **facts)).sentence
 
 
 def test_the_longest_segment() -> None:
@@ -180,31 +187,51 @@ def test_the_document_states_the_thresholds() -> None:
     assert f"fewer than {rules.LEAST_FRAMES} frames" in text
 
 
+AT_REST, MOMENT = Notice("camera-at-rest-stated"), Notice("fusion-at-one-moment", {"second": 3.0, "where": "nowhere"})
+
+
 @pytest.mark.parametrize(
-    ("notes", "expected"),
+    ("others", "expected"),
     [
-        ([], "there the surface is a mean. Tissue that moves as a whole looks like a moving camera."),
-        (
-            ["fusion: as seen at second 3 where tissue moves on its own"],
-            "there the surface is as seen at one moment. Tis",
-        ),
-        (["tracking: the camera is at rest, as stated: all motion is the tissue's"], "there the surface is a mean."),
+        ([], "There the surface is a mean. Tissue that moves as a whole looks like a moving camera."),
+        ([MOMENT], "There the surface is as seen at one moment. Tissue"),
+        ([AT_REST], "There the surface is a mean."),
     ],
 )
-def test_moving_tissue_is_said_and_does_not_change_the_word(notes: list[str], expected: str) -> None:
-    moving = "tissue: in 41 of 62 frames more than 10% of the picture moves on its own; most in frame 47: 94%"
-    found = verdict(run_of([0] * 62, notes=[moving, *notes]))
-    said = [reason for reason in found.reasons if "moves on its own in 41 of 62 frames" in reason.text]
-    assert [reason.level for reason in said] == ["note"]
-    assert expected in said[0].text
+def test_moving_tissue_is_said_and_does_not_change_the_word(others: list[Notice], expected: str) -> None:
+    counts = {"frames": 41, "measured": 62, "threshold": 0.1}
+    moving = Notice("tissue-moves", counts | {"most": 47, "share": 0.94, "x": 0.5, "y": 0.5})
+    found = verdict(run_of([0] * 62, **notices(moving, *others)))
+    (said,) = [reason for reason in found.reasons if reason.code == "tissue-moves"]
+    assert said.level == "note"
+    assert f"moves on its own in 41 of 62 frames. {expected}" in said.text
     assert found.word == "good"
-    assert ("looks like a moving camera" in said[0].text) == (not any("as stated" in note for note in notes))
+    assert ("looks like a moving camera" in said.text) == (AT_REST not in others)
 
 
 def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
-    of_the_data = "the camera is at rest while the tissue moves: errors of the path say little here"
-    stated = "tracking: the camera is at rest, as stated: all motion is the tissue's"
-    assert verdict(run_of([0] * 62, notes=[of_the_data])).word == "doubtful"
-    found = verdict(run_of([0] * 62, notes=[of_the_data, stated]))
+    of_the_data = Notice("camera-at-rest")
+    assert verdict(run_of([0] * 62, **notices(of_the_data))).word == "doubtful"
+    found = verdict(run_of([0] * 62, **notices(of_the_data, AT_REST)))
     assert found.word == "good"
-    assert any("stated to be at rest" in reason.text for reason in found.reasons)
+    assert any(reason.code == "camera-at-rest-stated" for reason in found.reasons)
+
+
+@pytest.mark.parametrize("code", KINDS)
+def test_every_notice_has_words_and_survives_json(code: str) -> None:
+    formatted = f"{KINDS[code].text}{KINDS[code].plain or ''}"
+    values = {name: 0.5 if re.search(rf"{{{name}:", formatted) else f"<{name}>" for name in fields_of_kind(code)}
+    notice = Notice(code, values)
+    assert all(str(value) in notice.text for value in values.values() if isinstance(value, str))
+    assert "{" not in f"{notice.text}{notice.plain}"
+    assert notice.plain.endswith(".") == (KINDS[code].plain != "")
+    (found,) = notices_of(json.loads(json.dumps(notices(notice, notice))))
+    assert found == notice
+    with pytest.raises(ValueError, match=code):
+        Notice(code, values | {"more": 1})
+
+
+def test_the_documents_list_every_code() -> None:
+    table = (DOCUMENT.parent / "formats.md").read_text(encoding="utf-8").split("### Notices")[1].split("\n## ")[0]
+    listed = dict(re.findall(r"^\| `([a-z-]+)` \| (\w+) \|", table, flags=re.MULTILINE))
+    assert listed == {code: kind.level for code, kind in KINDS.items()}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from front_door import call, refused
+from front_door import call, refused, warned
 from tiny_phantom import FRAMES, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
@@ -254,9 +254,9 @@ def test_an_input_that_changes_while_it_is_read_is_told(folder: Path, tmp_path: 
 
     for observers, told in (((), False), ((grow,), True)):
         result = _run(source, tmp_path / "run", "realtime", observers=observers, overwrite=True)
-        assert any("changed while it was read" in text for text in result.provenance["warnings"]) == told
-        kept = json.loads((tmp_path / "run" / "provenance.json").read_text())["warnings"]
-        assert kept == result.provenance["warnings"]
+        assert any("changed while it was read" in text for text in warned(result.provenance)) == told
+        kept = warned(json.loads((tmp_path / "run" / "provenance.json").read_text()))
+        assert kept == warned(result.provenance)
 
 
 def test_two_inputs_without_a_checksum_are_two(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_videos import encode
+from front_door import said
 from tiny_phantom import only_images, write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
@@ -102,8 +103,8 @@ def test_stereo_and_fields_by_option(
     facts = json.loads((out / "provenance.json").read_text())
     assert (facts["camera"]["width"], facts["camera"]["height"]) == (width, height)
     assert facts["camera"]["fx"] == pytest.approx(0.8 * width)
-    assert any(note.startswith("stereo, top-bottom: the upper half") for note in facts["notes"])
-    assert any(note.startswith("deinterlaced") for note in facts["notes"])
+    assert any(note.startswith("stereo, top-bottom: the upper half") for note in said(facts))
+    assert any(note.startswith("deinterlaced") for note in said(facts))
     read = Config.load(file=out / "config.toml").input
     assert (read.stereo, read.deinterlace, read.camera_fit) == ("top-bottom", True, "scale")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from numba.core.event import TimingListener, register
 
 from scopemap.config import Config
-from scopemap.depth.anchor import MEASURED, max_depth_mm
+from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.create import create_anchor, create_depth, files_folder
 from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.depth.files import FilesDepth
@@ -107,11 +107,12 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
 
 
 def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
-    """Return `known`, whether the scale of a run is measured or anchored, and its `source` in words."""
+    """Return `known`, whether the scale of a run is measured or anchored, `measured`, and its `source` in words."""
     depth, anchor = estimators.depth, estimators.anchor
-    guessed = isinstance(depth, FilesDepth) and anchor.description == MEASURED and not depth.scale_is_known
+    guessed = isinstance(depth, FilesDepth) and anchor.is_measured and not depth.scale_is_known
     source = anchor.description + (" of unknown unit" if guessed else "")
-    return {"known": anchor.scale_is_known and not guessed, "source": source}
+    known = anchor.scale_is_known and not guessed
+    return {"known": known, "measured": known and anchor.is_measured, "source": source}
 
 
 def estimators_provenance(estimators: Estimators) -> dict[str, str]:

@@ -33,11 +33,12 @@ from scopemap.fusion.volume import SurfaceFusion
 from scopemap.geometry.warp import resampled
 from scopemap.mapping.submaps import Mapper
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
+from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.tracking.relocalisation import RotationFollower
 from scopemap.tracking.sharpness import PictureQuality
 from scopemap.tracking.smoothing import create_smoother
-from scopemap.tracking.track import FrameTracker, Track, motion_between
+from scopemap.tracking.track import FrameTracker, LossCause, Track, TrackingLoss, motion_between
 from scopemap.tracking.tracker import Tracker
 
 _MOST_FAULTS, _MOST_FAULTS_SHARE = 3, 0.05  # frames that may fail; more are no accident
@@ -63,7 +64,7 @@ class PreprocessedFrame:
     """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale.
 
     small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth.downscale`.
-    depth_note : that most of its depth is beyond the limit; else "". fault : why the frame could not be processed, "".
+    depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
     """
 
     frame: Frame
@@ -72,7 +73,7 @@ class PreprocessedFrame:
     correspondence: DenseCorrespondence | None
     anchored: bool
     depth_note: str = ""
-    fault: str = ""
+    fault: TrackingLoss | None = None
 
 
 @dataclass(frozen=True)
@@ -135,16 +136,16 @@ class Pipeline:
         self._depth_faults, self._flow_faults, self._tracking_faults = map(_Faults, ("depth", "flow", "tracking"))
 
     @property
-    def warnings(self) -> list[str]:
+    def notices(self) -> list[Notice]:
         """What could not be processed so far."""
-        return _warnings((self._depth_faults, self._flow_faults, self._tracking_faults))
+        return _notices((self._depth_faults, self._flow_faults, self._tracking_faults))
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
         try:
             return self._estimate(frame)
         except Exception as error:
-            fault = self._depth_faults.noted(frame.index, error)
+            fault = TrackingLoss(LossCause.OTHER, self._depth_faults.noted(frame.index, error))
             blind = _blind(frame)
             small = _blind(blind.downscaled(depth_downscale(self.config.depth, max(frame.valid.shape))))
             return PreprocessedFrame(blind, small, "measured", None, False, fault=fault)
@@ -160,7 +161,7 @@ class Pipeline:
         estimate = self.estimators.depth.estimate(shown)
         if usable and estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self._depth_faults.has_no_depth(frame.index)
-        fault, instruments = "", self._masker.instruments(estimate.instruments)
+        fault, instruments = None, self._masker.instruments(estimate.instruments)
         if instruments is not None:
             # An instrument's depth is of no use, and what is behind it is not known.
             unknown = np.where(instruments, np.float32(np.nan), np.float32(1))
@@ -169,7 +170,7 @@ class Pipeline:
             frame, small, shown = (without_instruments(seen, instruments) for seen in (frame, small, shown))
             if usable and frame.valid.mean() < self.config.tracking.min_valid_share:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
-                fault = f"{left}: instruments cover {instruments.mean():.0%}"
+                fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
         raw = self.estimators.anchor.metric(estimate, shown)
         small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
         frame, fitted = _with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
@@ -182,7 +183,8 @@ class Pipeline:
         try:
             return replace(estimated, correspondence=self._matcher.match(frame.rgb, frame.valid, wanted=wanted))
         except Exception as error:
-            return replace(estimated, fault=self._flow_faults.noted(frame.index, error))
+            fault = TrackingLoss(LossCause.OTHER, self._flow_faults.noted(frame.index, error))
+            return replace(estimated, fault=fault)
 
     def preprocess(self, frame: Frame) -> PreprocessedFrame:
         """Estimate and match: all that needs no motion."""
@@ -223,7 +225,7 @@ class Pipeline:
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
         if preprocessed.fault and track.status == "lost":
-            track = replace(track, reason=preprocessed.fault)
+            track = replace(track, cause=preprocessed.fault.cause, reason=preprocessed.fault.reason)
         return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
 
     def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
@@ -231,9 +233,10 @@ class Pipeline:
         self._reset()
         frame, last = preprocessed.frame, self._last_track
         if last is None:
-            track = Track(frame.index, "lost", reason, np.eye(4), frame.index)
+            track = Track(frame.index, "lost", reason, np.eye(4), frame.index, cause=LossCause.OTHER)
         else:
             track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
+            track = replace(track, cause=LossCause.OTHER)
         blind, unknown_mm = _blind(frame), np.asarray(_blind(preprocessed.small).depth_mm)
         return Step(blind, track, np.asarray(blind.depth_mm), RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm))
 
@@ -292,8 +295,8 @@ class Pipeline:
         if inserted and kind != "measured":  # with measured depth tracking alone is better
             self.mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not inserted:
-            unknown = preprocessed.depth_note or "too little of its depth is known to start from"
-            return replace(track, status="lost", reason=unknown)
+            unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
+            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER)
         return track
 
 
@@ -338,15 +341,15 @@ class _Faults:
         return reason
 
 
-def _warnings(stages: tuple[_Faults, ...]) -> list[str]:
-    """Return in words what the stages could not process."""
+def _notices(stages: tuple[_Faults, ...]) -> list[Notice]:
+    """Return what the stages could not process."""
     failed, blind, found = sum(faults.failed for faults in stages), sum(faults.without_depth for faults in stages), []
     if failed:
-        first = "frame {}, {}".format(*min(faults.first for faults in stages if faults.failed))
-        found.append(f"{failed} frame(s) could not be processed whole (first: {first})")
+        index, reason = min(faults.first for faults in stages if faults.failed)
+        found.append(Notice("frames-failed", {"frames": failed, "first": index, "reason": reason}))
     if blind:
         first_blind = next(faults.first_without_depth for faults in stages if faults.without_depth)
-        found.append(f"{blind} frame(s) got no depth from the network (first: frame {first_blind})")
+        found.append(Notice("frames-without-depth", {"frames": blind, "first": first_blind}))
     return found
 
 

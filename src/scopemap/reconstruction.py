@@ -32,6 +32,7 @@ from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.decoding import read_decoded, write_encoded
 from scopemap.io.frame_choice import SkippedFrame
+from scopemap.notices import Notice
 from scopemap.pipeline import Step
 from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
@@ -136,16 +137,15 @@ def frame_counts(records: list[FrameRecord]) -> dict[str, int]:
     return {"frames": len(records), "tracked": tracked} | lost | {"in_other_maps": status[OTHER_MAP]}
 
 
-def warnings_of_frames(records: list[FrameRecord], interrupted_at: int | None) -> list[str]:
-    """Return a warning where the run was interrupted, by the last frame's number, and one where few are tracked."""
+def notices_of_frames(records: list[FrameRecord], interrupted_at: int | None) -> list[Notice]:
+    """Return a notice where the run was interrupted, by the last frame's number, and one where few are tracked."""
     tracked = frame_counts(records)["tracked"]
-    warnings = []
+    found = []
     if interrupted_at is not None:
-        warnings.append(f"interrupted at frame {interrupted_at}: the result is of the frames until then")
+        found.append(Notice("input-interrupted", {"frame": interrupted_at}))
     if tracked < _FEW_FRAMES:
-        frames = "1 frame is" if tracked == 1 else f"{tracked} frames are"
-        warnings.append(f"only {frames} in the result: too few to judge it by; the surface is a glimpse from one place")
-    return warnings
+        found.append(Notice("frames-few", {"frames": tracked}))
+    return found
 
 
 def scale_words(scale: dict[str, Any]) -> str:

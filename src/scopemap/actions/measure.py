@@ -155,11 +155,11 @@ def _at(values: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[in
 
 def _drawn(folder: Path, run: ExportedRun) -> _Errors:
     facts: dict[str, Any] = read_run(folder).provenance
-    camera, source = facts["camera"], str((facts.get("scale") or {}).get("source", ""))
+    camera, scale = facts["camera"], facts.get("scale") or {}
     focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
-    if str(camera.get("source", "")).startswith("assumed"):
+    if camera.get("origin") == "assumed":
         focal = max(focal, _ASSUMED_FOCAL_ERROR)
-    kind: Literal["measured", "calibrated"] = "measured" if source.startswith("measured") else "calibrated"
+    kind: Literal["measured", "calibrated"] = "measured" if scale.get("measured") else "calibrated"
     generator = np.random.default_rng(0)
     normal = generator.standard_normal((3, _DRAWS))
     return _Errors(normal[0], 1 + focal * normal[1], np.exp(_SCALE_ERROR[kind] * normal[2]), generator)

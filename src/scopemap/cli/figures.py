@@ -157,3 +157,12 @@ def _short(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def print_warnings(provenance: Mapping[str, Any]) -> None:
+    """Print the notices of a run that are more than an assumption, one a line, to the standard error."""
+    from scopemap.notices import notices_of
+
+    for notice in notices_of(provenance):
+        if notice.level != "info":
+            typer.echo(f"warning: {notice}", err=True)

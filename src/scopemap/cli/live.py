@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.cli.figures import print_json
+from scopemap.cli.figures import print_json, print_warnings
 from scopemap.cli.interruption import Interruption
 from scopemap.cli.options import AsJson, CameraFile, Quiet, SetPairs, parse_near_far, parse_settings, parse_size
 from scopemap.cli.terminal_keys import terminal_keys
@@ -215,8 +215,7 @@ def _write_report(out: Path, pictures: FramePictures) -> None:
 
 
 def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) -> None:
-    for warning in provenance["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+    print_warnings(provenance)
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
     typer.echo(_line(state))
     if out is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from scopemap.cli.figures import print_json
+from scopemap.cli.figures import print_json, print_warnings
 from scopemap.cli.interruption import Interruption
 from scopemap.cli.options import (
     AsJson,
@@ -24,6 +24,7 @@ from scopemap.cli.options import (
     parse_size,
 )
 from scopemap.cli.progress import run_progress
+from scopemap.notices import notices_of
 
 if TYPE_CHECKING:
     from scopemap.config import Config
@@ -201,8 +202,8 @@ def run(
 
 def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
     provenance = result.provenance
-    for warning in [] if quiet else provenance["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+    if not quiet:
+        print_warnings(provenance)
     if as_json:
         print_json(provenance | {"out": str(out), "preset": config.preset, "mesh_faces": len(result.mesh.faces)})
     elif not quiet:
@@ -240,7 +241,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
     lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
         lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter segments, see frames.csv")
-    return lines + [f"note: {note}" for note in facts["notes"]]
+    return lines + [f"note: {notice}" for notice in notices_of(facts) if notice.level == "info"]
 
 
 def _time_words(result: Reconstruction) -> str:

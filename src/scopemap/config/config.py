@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import re
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
@@ -28,34 +27,6 @@ from scopemap.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.errors import SettingsError
 
 Preset = Literal["default", "paper", "paper-strict", "realtime"]
-RENAMED_GROUPS = {"odometry": "tracking", "backend": "mapping"}
-RENAMED = {
-    "mapping.depth_share": "mapping.advanced.depth_sigma_share",
-    "mapping.gaps": "mapping.advanced.keyframe_gaps",
-    "mapping.loop_landmarks": "mapping.min_loop_inliers",
-    "mapping.turn_sigma_deg": "mapping.advanced.rotation_sigma_deg",
-    "mapping.way_sigma_share": "mapping.advanced.translation_sigma_share",
-    "tracking.corner_depth_share": "tracking.advanced.corner_depth_sigma",
-    "tracking.depth_share": "tracking.advanced.depth_weight",
-    "tracking.keyframe_agreement": "tracking.advanced.min_keyframe_agreement",
-    "tracking.least_detail": "tracking.min_sharpness",
-    "tracking.remembered_keyframes": "tracking.relocalisation_keyframes",
-}
-"""Settings of earlier versions by their present name, with the group's new name on both sides. A setting that only
-moved within its stage (to `advanced` or `paper`) needs no entry."""
-REMOVED = {
-    *("mapping.cell_px", "mapping.consistency_px"),
-    *("mask.border_px", "mask.bright_level", "mask.highlight_grow_px", "mask.highlight_ratio"),
-    "networks.flow_iterations",
-    *("tracking.depth_sigma_share", "tracking.doubtful_inlier_share", "tracking.flow_contradiction"),
-    *("tracking.flow_least_share", "tracking.grey_share", "tracking.least_depth_sigma", "tracking.least_landmarks"),
-    *("tracking.min_side_px", "tracking.normalise_sigma_px", "tracking.radius"),
-}
-"""Settings of earlier versions that are constants now or that nothing reads: a file may still name them, the command
-line may not."""
-REMOVED_VALUES = {"networks.flow": "auto", "networks.keyframe_flow": "auto", "networks.perceptual": "auto"}
-"""Values of earlier versions that depended on the weights of the machine: in a file they mean what the preset names."""
-
 _QUOTED = 80  # characters of a value that an error repeats
 
 
@@ -95,7 +66,7 @@ class Config(Settings):
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}
-        in_file = {} if file is None else _of_earlier_versions(_read_toml(file))
+        in_file = {} if file is None else _read_toml(file)
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
@@ -133,23 +104,6 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def new_name(setting: str) -> str:
-    """Return the current name of a setting of an earlier version: renamed, or moved into a group of its stage."""
-    group, dot, name = setting.partition(".")
-    setting = RENAMED_GROUPS.get(group, group) + dot + name
-    setting = RENAMED.get(setting, setting)
-    stage, *middle = setting.split(".")
-    names = setting_names()
-    moved = [other for other in names if len(middle) == 1 and re.fullmatch(rf"{stage}\.\w+\.{middle[0]}", other)]
-    return moved[0] if setting not in names and len(moved) == 1 else setting
-
-
-def _of_earlier_versions(flat: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a file by their present names, without removed ones: an old config.toml stays valid."""
-    renamed = {new_name(key): value for key, value in flat.items()}
-    return {key: value for key, value in renamed.items() if key not in REMOVED and REMOVED_VALUES.get(key) != value}
-
-
 def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a preset and of other sources, of which later ones win.
 
@@ -168,12 +122,8 @@ def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
 
 
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    names, present = setting_names(), new_name(dotted)
+    names = setting_names()
     if dotted not in names:
-        if present in REMOVED:
-            raise SettingsError(f"setting '{dotted}' no longer exists: it is a constant now")
-        if present != dotted:
-            raise SettingsError(f"setting '{dotted}' is now called '{present}'")
         nearest = _nearest(dotted, names)
         raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{nearest}'?" if nearest else ""))
     *groups, name = dotted.split(".")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from scopemap.config.settings import Settings
 
 
 class DepthAdvanced(Settings):
-    """Constants of the metric anchor, of shading depth and of the power law."""
+    """Constants of the metric anchor and of shading depth."""
 
     reanchor_every: int = Field(
         0,
@@ -19,9 +19,6 @@ class DepthAdvanced(Settings):
     )
     shading_exponent: float = Field(
         0.6, gt=0, le=1, description="inert unless depth is from shading: distance = k * brightness^-exponent"
-    )
-    exponent_frames: int = Field(
-        80, ge=2, description="inert unless exponent = fit: number of frames at the start that are used"
     )
 
 
@@ -84,24 +81,8 @@ class DepthSettings(Settings):
         description="estimate depth and make it consistent at the working size over this, inert for depth from files; "
         "unset: scopenet at about its training size, the longest side 160 to 319 px, others at the full one",
     )
-    exponent: float | Literal["fit"] = Field(
-        1.0,
-        description="power law of predicted depth about its median, distance^exponent; fit: from flow, before the run",
-    )
     advanced: DepthAdvanced = DepthAdvanced()
     paper: DepthPaper = DepthPaper()
-
-    @field_validator("exponent", mode="before")
-    @classmethod
-    def _number_or_fit(cls, value: Any) -> Any:
-        """Refuse with one sentence; for a union pydantic would name every member."""
-        try:
-            possible = value == "fit" or 0.25 <= float(value) <= 4
-        except (TypeError, ValueError):
-            possible = False
-        if not possible:
-            raise ValueError("must be 'fit' or a number from 0.25 to 4")
-        return value
 
 
 class MapisAdvanced(Settings):

@@ -6,19 +6,17 @@ changes from frame to frame is estimated by the consistency stage (mapis.py), wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate, DepthEstimator
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
-from scopemap.errors import InputError, SettingsError, check_shape
+from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 
-MEASURED = "measured depth"
 """The source of the scale where depth is measured."""
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
@@ -77,8 +75,7 @@ class AnchoredDepth:
     prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if given, else the estimate's own
     millimetres, else shading. Measured depth is not changed.
 
-    `settings.exponent` applies a power law to predicted depth first; its pivot is the median distance along the ray of
-    the first usable frame. `settings.advanced.reanchor_every` repeats the fit to the reference, which bounds drift.
+    `settings.advanced.reanchor_every` repeats the fit to the reference, which bounds drift.
 
     reference : metric estimator for anchors other than the range and the estimate itself.
     Raises `SettingsError` where `near-far` is chosen without a valid range.
@@ -90,9 +87,8 @@ class AnchoredDepth:
         self._reference = reference
         self._conversion: AffineDisparity | DepthScale | None = None
         self._description = "not anchored: no usable frame yet"
-        self._is_known = False
+        self._is_known = self._is_measured = False
         self._frames_held = 0
-        self._pivot: float | None = None
 
     @property
     def description(self) -> str:
@@ -106,6 +102,11 @@ class AnchoredDepth:
         What a network without an anchor, the shading prior or a factor says is a guess.
         """
         return self._is_known
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether depth is measured, and so needs no anchor."""
+        return self._is_measured
 
     @property
     def reference(self) -> DepthEstimator:
@@ -131,9 +132,8 @@ class AnchoredDepth:
 
         Sigma is scaled with depth; it is None for disparity, and where the anchor's depth replaces the estimate.
         Predicted depth beyond `max_depth_mm` is NaN. All is NaN until a frame had enough usable pixels. Raises
-        `InputError` if the estimate contradicts the anchor, `SettingsError` for an exponent without predicted depth.
+        `InputError` if the estimate contradicts the anchor.
         """
-        estimate = self._after_power_law(estimate, frame)
         self._frames_held += 1
         first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
         if self._conversion is None:
@@ -154,31 +154,6 @@ class AnchoredDepth:
             return share, ""
         limit = f"depth.max_depth_mm = {limit_mm:g}"
         return share, f"{share:.0%} of its depth is beyond {limit} (median {np.median(positive_mm):.0f} mm)"
-
-    def _after_power_law(self, estimate: DepthEstimate, frame: Frame) -> DepthEstimate:
-        """Return the estimate after the power law; its relative error is multiplied by the exponent."""
-        exponent = self._settings.exponent
-        if exponent == "fit":
-            raise SettingsError("depth.exponent=fit is resolved by a run before it starts; give a number here")
-        if exponent == 1.0:
-            return estimate
-        if estimate.kind != "depth":
-            raise SettingsError(
-                f"depth.exponent={exponent:g} is for predicted depth; depth.backend={self._settings.backend} gives "
-                f"{estimate.kind}: leave it at 1"
-            )
-        if self._pivot is None:
-            distance = estimate.values * ray_lengths(frame.camera)
-            seen = distance[frame.valid & (distance > 0)]
-            if seen.size < _MIN_SHARE * distance.size:
-                return estimate
-            self._pivot = float(np.median(seen))
-        values = apply_power_law(estimate.values, frame.camera, exponent, self._pivot)
-        if estimate.sigma is None:
-            return replace(estimate, values=values)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sigma = (estimate.sigma * np.float32(exponent) * values / estimate.values).astype(np.float32)
-        return replace(estimate, values=values, sigma=sigma)
 
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self._conversion is None:
@@ -218,7 +193,8 @@ class AnchoredDepth:
         self._frames_held = 0
         self._description = self._describe(source, estimate, frame) + details
         network = self._settings.backend if source == "own" else self._reference.name if source == "reference" else ""
-        self._is_known = estimate.kind == "measured" or source == "near-far" or network == "depth-pro"
+        self._is_measured = estimate.kind == "measured"
+        self._is_known = self._is_measured or source == "near-far" or network == "depth-pro"
         return first_mm, ""
 
     def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
@@ -257,7 +233,7 @@ class AnchoredDepth:
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
         if estimate.kind == "measured":
-            return MEASURED
+            return "measured depth"
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
@@ -299,22 +275,6 @@ def depth_downscale(settings: DepthSettings, longest_px: int) -> int:
             )
         return settings.downscale
     return max(longest_px // _SCOPENET_PX, 1) if settings.backend == "scopenet" else 1
-
-
-def apply_power_law(depth_mm: np.ndarray, camera: PinholeCamera, exponent: float, pivot_mm: float) -> np.ndarray:
-    """Return depth (H, W) float32 after the power law pivot * (r / pivot)^exponent on the distance r along the ray.
-
-    depth_mm : (H, W), NaN = unknown; values <= 0 become NaN. pivot_mm : distance that the law keeps, same unit.
-    """
-    check_shape("depth_mm", depth_mm, (camera.height, camera.width))
-    along = ray_lengths(camera)
-    distance = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) * along
-    return (pivot_mm * (distance / pivot_mm) ** exponent / along).astype(np.float32)
-
-
-def ray_lengths(camera: PinholeCamera) -> np.ndarray:
-    """Return the ratio of distance along the ray to depth, (H, W) float32, at least 1."""
-    return np.linalg.norm(camera.rays, axis=-1)
 
 
 def _check_range(settings: DepthSettings) -> None:

@@ -13,6 +13,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.frame import Frame
 from scopemap.fusion.moving import STEP_PX, MovingTissue, block_keys
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.notices import Notice
 
 _WINDOW_S = 0.5  # standard deviation of the weights
 _CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -59,10 +60,10 @@ class SeenAt:
             self._gap_s[seen] = np.minimum(self._gap_s[seen], view.gap_s)
 
     @property
-    def note(self) -> str:
-        """What was done, in words."""
+    def notice(self) -> Notice:
+        """What was done."""
         where = f"{len(self._keys)} blocks of {self._edge_mm:.3g} mm" if len(self._keys) else "nowhere"
-        return f"fusion: as seen at second {self._at_s:g} where tissue moves on its own, {where}"
+        return Notice("fusion-at-one-moment", {"second": self._at_s, "where": where})
 
     def weighted(self, frame: Frame) -> Frame:
         """Return a frame with depth and pose with the weights of its pixels."""

@@ -29,6 +29,7 @@ from scopemap.fusion.tsdf import (
 )
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.uncertainty import depth_trust
+from scopemap.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
 _MIN_COSINE = 0.05
@@ -57,12 +58,10 @@ class TsdfParameters(NamedTuple):
     max_depth_mm: float
 
     @property
-    def description(self) -> str:
-        """A note on parameters that follow the scene, and how to set others."""
-        return (
-            f"fusion: voxels of {self.voxel_mm:g} mm, 1/{VOXELS_PER_MEDIAN_DEPTH} of the clip's median depth, and "
-            f"depth up to {self.max_depth_mm:g} mm; set fusion.voxel_mm for others"
-        )
+    def notice(self) -> Notice:
+        """That the parameters follow the scene, and how to set others."""
+        values = {"voxel_mm": self.voxel_mm, "max_depth_mm": self.max_depth_mm}
+        return Notice("fusion-scaled", values | {"divisor": VOXELS_PER_MEDIAN_DEPTH})
 
 
 def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = None) -> TsdfParameters:
@@ -191,11 +190,11 @@ def _paint_masked(picture: np.ndarray, masked: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class FusedSurface:
-    """A surface, world mm, may be empty; the settings with the TSDF parameters that were used, and notes on these."""
+    """A surface, world mm, may be empty; the settings with the TSDF parameters that were used; notices about these."""
 
     mesh: trimesh.Trimesh
     settings: FusionSettings
-    notes: list[str]
+    notices: list[Notice]
 
 
 class SurfaceFusion:
@@ -267,22 +266,19 @@ class SurfaceFusion:
                 self._coarsen([volume])
         if volume is None:
             return FusedSurface(trimesh.Trimesh(), settings, [])
-        notes = [] if settings.voxel_mm is not None else [volume.parameters.description]
+        notices = [] if settings.voxel_mm is not None else [volume.parameters.notice]
         if volume.parameters.voxel_mm > (finest := choose_parameters(settings, median_mm)).voxel_mm:
-            wanted = f"{volume.parameters.voxel_mm:g} mm in place of {finest.voxel_mm:g} mm"
-            notes = [f"fusion: voxels of {wanted}, so that the surface is within run.memory_mb"]
+            sizes = {"voxel_mm": volume.parameters.voxel_mm, "finest_mm": finest.voxel_mm}
+            notices = [Notice("fusion-coarsened", sizes)]
         used = settings.model_copy(update=volume.parameters._asdict())
-        return FusedSurface(volume.extract_mesh(), used, notes)
+        return FusedSurface(volume.extract_mesh(), used, notices)
 
 
-def depth_warnings(medians_mm: list[float], settings: FusionSettings) -> list[str]:
-    """Return a warning where most of the scene, by its frames' median depths, is beyond the depth that is fused."""
+def depth_notices(medians_mm: list[float], settings: FusionSettings) -> list[Notice]:
+    """Return a notice where most of the scene, by its frames' median depths, is beyond the depth that is fused."""
     if not settings.enabled or not medians_mm or settings.max_depth_mm is None:
         return []
     median_mm = float(np.median(medians_mm))
     if median_mm <= settings.max_depth_mm:
         return []
-    return [
-        f"most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm "
-        f"{settings.max_depth_mm:g}; raise fusion.max_depth_mm and fusion.voxel_mm"
-    ]
+    return [Notice("fusion-too-far", {"median_mm": median_mm, "max_depth_mm": settings.max_depth_mm})]

@@ -128,7 +128,7 @@ def inspect(
     clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection)
     findings = [
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
-        *_of_source(sequence.warnings),
+        *_of_source(list(map(str, sequence.warnings))),
         *(check_container(container) if container else []),
         *checks.check_timing(clip, container["length_s"] if container else None),
         *checks.check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),

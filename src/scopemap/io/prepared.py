@@ -21,6 +21,7 @@ from scopemap.io.source import Source, SourceFrame
 from scopemap.io.video import VideoFile
 from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
+from scopemap.notices import Notice
 
 UNKNOWN_MAKE = ("video", "images", "dicom")
 """Readers without a data set: stereo packing and interlacing are detected, repeated frames are skipped."""
@@ -61,10 +62,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
     samples = [redacted(rgb, settings.redact) for rgb in samples]
     packed, note = _packing(source, settings, samples)
     if not settings.deinterlace and is_interlaced(samples):
-        source.warnings.append(
-            "the pictures are interlaced: their even and odd rows were taken at two times, and edges that move look "
-            "like combs; --deinterlace (input.deinterlace=true) uses one field of each"
-        )
+        source.warnings.append(Notice("input-interlaced"))
     if note:
         source.notes.append(note)
     if packed is None and not (settings.deinterlace or settings.redact):

@@ -6,6 +6,7 @@ from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera
@@ -15,6 +16,9 @@ from scopemap.frame import Frame, Truth
 from scopemap.io.frame_choice import FrameChoice, SkippedFrame
 from scopemap.io.source import Source, SourceFrame, assumed_camera
 from scopemap.io.waiting import HangingError, in_time
+from scopemap.notices import Notice
+
+CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class Sequence:
     camera_source : how the camera is known, one phrase.
     size_source : where the working size comes from, one phrase.
     calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
-    focal_is_stated : whether the field of view was given, not assumed.
+    focal_is_stated : whether the field of view was given, not assumed. is_estimated : whether `with_focal` found it.
     selection : slice over the input's frames.
     depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
     focal_sigma_px : standard deviation of an estimated focal length at the working size, None where none is known.
@@ -46,6 +50,7 @@ class Sequence:
     size_source: str
     calibrated: bool
     focal_is_stated: bool = False
+    is_estimated: bool = False
     selection: slice = field(default_factory=lambda: slice(None))
     depth_scale_mm: float | None = None
     focal_sigma_px: float | None = None
@@ -60,6 +65,13 @@ class Sequence:
     def camera(self) -> PinholeCamera:
         """The working camera, which every frame carries."""
         return self.rectifier.target
+
+    @property
+    def camera_origin(self) -> CameraOrigin:
+        """How the camera is known: by a calibration, the stated field of view, an estimate, or not at all."""
+        if self.calibrated:
+            return "calibrated"
+        return "estimated" if self.is_estimated else "stated" if self.focal_is_stated else "assumed"
 
     @cached_property
     def depth_rectifier(self) -> Rectifier:
@@ -81,12 +93,12 @@ class Sequence:
         return [frame for _, frame in sorted(self.choice.skipped.items())]
 
     @property
-    def notes(self) -> list[str]:
+    def notes(self) -> list[str | Notice]:
         """What had to be assumed about the input."""
         return [*self.source.notes, *([] if self.calibrated else [f"camera {self.camera_source}"])]
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[str | Notice]:
         """What was found wrong while reading, so far."""
         return list(self.source.warnings)
 
@@ -156,4 +168,5 @@ class Sequence:
         if fisheye:
             camera = FisheyeCamera(camera.central, fisheye)
         target = working_camera(camera, (self.camera.width, self.camera.height))
-        return replace(self, rectifier=Rectifier(camera, target), camera_source=source, focal_sigma_px=sigma_px)
+        changed = replace(self, rectifier=Rectifier(camera, target), camera_source=source, is_estimated=True)
+        return replace(changed, focal_sigma_px=sigma_px)

@@ -14,6 +14,7 @@ from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import TruthQuality
+from scopemap.notices import Notice
 
 ASSUMED_RATE_HZ = 30.0
 """Frames per s of inputs that state none."""
@@ -102,8 +103,8 @@ class Source:
         self.path = path
         self.poses: dict[int, np.ndarray] = {}
         self.times_s: dict[int, float] = {}
-        self.notes: list[str] = []
-        self.warnings: list[str] = []
+        self.notes: list[str | Notice] = []
+        self.warnings: list[str | Notice] = []
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -146,7 +147,7 @@ class Source:
                 "needs frames of one size"
             )
 
-    def _warn(self, message: str) -> None:
+    def _warn(self, message: str | Notice) -> None:
         if message not in self.warnings:
             self.warnings.append(message)
 

@@ -30,7 +30,7 @@ from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
-from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, Refusal, TrackedPose
 from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
 from scopemap.tracking.features import FeatureDetector
 
@@ -319,10 +319,10 @@ class Backend:
 
     def _judged(
         self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
-    ) -> tuple[str, tuple[DepthCorrectionField, ...]]:
-        """Return why a solution is refused, "" where it is not, and its depth correction fields."""
-        if refused := contradiction(problem.points, found, self.settings):
-            return f"the scene is not rigid or the focal length is wrong: {refused}", ()
+    ) -> tuple[Refusal | None, tuple[DepthCorrectionField, ...]]:
+        """Return why a solution is refused, None where it is not, and its depth correction fields."""
+        if reason := contradiction(problem.points, found, self.settings):
+            return Refusal("mapping-not-rigid", {"reason": reason}), ()
         fields: tuple[DepthCorrectionField, ...] = ()
         if (step_sigma := self.settings.depth_step_sigma) > 0:
             assert self._camera is not None
@@ -338,8 +338,8 @@ class Backend:
         found: BundleSolution,
         fields: tuple[DepthCorrectionField, ...],
         worlds: Mapping[int, Similarity],
-    ) -> str:
-        """Return that the depths of keyframes agree less than as tracked, "" where they agree."""
+    ) -> Refusal | None:
+        """Return that the depths of keyframes agree less than as tracked, None where they agree."""
         assert self._camera is not None
         grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
         before = [np.float32(worlds[self._tracked[k].map].scale) * grids[k] for k in chosen]
@@ -353,8 +353,8 @@ class Backend:
         tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-                return f"depths of keyframes would disagree by {100 * now:.0f} %, as tracked by {100 * was:.0f} %"
-        return ""
+                return Refusal("mapping-depth-disagrees", {"adjusted": float(now), "tracked": float(was)})
+        return None
 
 
 def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
@@ -368,7 +368,7 @@ def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
     return min(least, default=0)
 
 
-def _no_correction(index: np.ndarray, found: BundleSolution, refused: str) -> FrameCorrection:
+def _no_correction(index: np.ndarray, found: BundleSolution, refused: Refusal | None) -> FrameCorrection:
     """Return the correction that changes nothing."""
     identity = np.tile(np.eye(4), (len(index), 1, 1))
     return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)

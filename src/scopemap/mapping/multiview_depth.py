@@ -29,6 +29,7 @@ from scopemap.mapping.triangulation import (
     parallax_px,
     project,
 )
+from scopemap.notices import Notice
 
 # Displacements in px per unit of ln depth that are aimed at: the median of all pixels, and that of the farthest fifth.
 # Less is noise, more is hard to match.
@@ -207,11 +208,12 @@ class KeyframeDepths:
         self._worker.shutdown(cancel_futures=True)
 
     @property
-    def description(self) -> str:
-        """A note on how many keyframes were triangulated; complete after the last frame."""
+    def notice(self) -> Notice:
+        """How many keyframes were triangulated; complete after the last frame."""
         rest = "; the others keep the predicted depth: views disagree (moving tissue, uncertain poses) or are too few"
-        text = f"depth: {self.triangulated} of {len(self.keyframes)} keyframes triangulated against frames around them"
-        return text + (rest if self.triangulated < len(self.keyframes) else "")
+        rest = " against frames around them" + (rest if self.triangulated < len(self.keyframes) else "")
+        counts = {"triangulated": self.triangulated, "keyframes": len(self.keyframes)}
+        return Notice("depth-triangulated", counts | {"rest": rest})
 
     def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
         rgb, depth_mm = view(index)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.mapping.depth_correction import DepthCorrectionField
+from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
 
@@ -28,6 +29,13 @@ class TrackedPose(NamedTuple):
     segment: int = 0
 
 
+class Refusal(NamedTuple):
+    """Why an adjustment is refused: the code of a `Notice`, and its values but `merged`."""
+
+    code: str
+    values: dict[str, Any]
+
+
 @dataclass(frozen=True)
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
@@ -37,16 +45,16 @@ class FrameCorrection:
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
     robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,
-    "" where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's depth;
-    (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as
-    tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
+    None where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's
+    depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked :
+    poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
     """
 
     index: np.ndarray
     T_world_world: np.ndarray
     log_scale: np.ndarray
     sigma_px: float = float("nan")
-    refused: str = ""
+    refused: Refusal | None = None
     loops: int = 0
     depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
@@ -54,23 +62,23 @@ class FrameCorrection:
     depth_mm: float = 1.0
 
     @property
-    def description(self) -> str:
-        """One sentence for the provenance: what was adjusted and how well it fits, or why nothing was."""
+    def notice(self) -> Notice:
+        """What was adjusted and how well it fits, or why nothing was."""
         if not np.isfinite(self.sigma_px):
-            return f"mapping: poses are as tracked; the {len(self.index)} keyframes have no common observations"
+            return Notice("mapping-without-observations", {"keyframes": len(self.index)})
         if self.refused:
             merged = len(self.S_common_map)
             by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
-            return f"mapping: poses are as tracked{by_loops}; {self.refused}"
+            return Notice(self.refused.code, self.refused.values | {"merged": by_loops})
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
-        text = f"mapping: {len(self.index)} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg"
+        text = f"{len(self.index)} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg"
         text += f", {self.loops} loops closed" if self.loops else ""
         text += f", {len(self.S_common_map)} maps merged" if len(self.S_common_map) > 1 else ""
         text += f"; reprojection errors {self.sigma_px:.2f} px (robust standard deviation)"
         if self.depth_fields:
             typical = np.median([np.abs(depth_field.values).mean() for depth_field in self.depth_fields])
             text += f"; depth corrected by {100 * np.expm1(typical):.0f} % on average"
-        return text
+        return Notice("mapping-adjusted", {"text": text})
 
     def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
         """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""

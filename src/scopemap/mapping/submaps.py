@@ -20,8 +20,9 @@ from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.map_merging import Part
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
-from scopemap.tracking.track import RELOCALISED, Track
+from scopemap.tracking.track import Track
 
 TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
 """Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
@@ -92,7 +93,7 @@ class Mapper:
         part = self._pose(track)
         self._last = track.index, part
         self._rows.append(np.array([(track.index, *part)], _TRACKED))
-        if track.reason == RELOCALISED and (found_in := self._poses().get(track.keyframe)) is not None:
+        if track.relocalised and (found_in := self._poses().get(track.keyframe)) is not None:
             self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
 
     @property
@@ -149,8 +150,8 @@ class Mapper:
             observed = self._last is not None and self._last[0] == track.index
             self._backend.add(keyframe, self._last[1] if self._last and observed else self._pose(track))
 
-    def submaps(self) -> tuple[list[Submap], list[str]]:
-        """Return the submaps, most frames first, and warnings about frames that are not in the first.
+    def submaps(self) -> tuple[list[Submap], list[Notice]]:
+        """Return the submaps, most frames first, and a notice of frames that are not in the first.
 
         All keyframes are adjusted together here: poses and depths that were handed on before need the submap's
         correction. Small submaps, but for the first, are left out.
@@ -173,11 +174,8 @@ class Mapper:
         kept = found[:1] + [submap for submap in found[1:] if len(submap.frames) >= LEAST_FRAMES]
         if len(found) < 2:
             return kept, []
-        return kept, [
-            f"{len(found)} submaps: the camera was lost, and nothing connects what it saw before and after; "
-            f"{len(kept[0].frames)} of {len(self._tracked)} tracked frames are in the result; the relative pose of the "
-            f"others is unknown; {len(kept) - 1} with at least {LEAST_FRAMES} frames are saved in maps/"
-        ]
+        counts = {"submaps": len(found), "frames": len(kept[0].frames), "tracked": len(self._tracked)}
+        return kept, [Notice("submaps-apart", counts | {"saved": len(kept) - 1, "least": LEAST_FRAMES})]
 
     def _split_maps(self) -> set[int]:
         """Give parts of maps that nothing ties to the others numbers of their own; return these."""

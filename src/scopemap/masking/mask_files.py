@@ -14,6 +14,7 @@ from scopemap.config import MaskSettings
 from scopemap.errors import InputError, SettingsError
 from scopemap.io.decoding import read_decoded
 from scopemap.masking.masker import disc
+from scopemap.notices import Notice
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
@@ -86,15 +87,13 @@ class MaskFiles:
         return {"masks": found}
 
     @property
-    def warnings(self) -> list[str]:
-        """A warning where most frames have no mask, since wrong numbers in the names look the same."""
+    def notices(self) -> list[Notice]:
+        """A notice where most frames have no mask, since wrong numbers in the names look the same."""
         missing = len(self._asked - set(self._files))
         if 2 * missing <= len(self._asked):
             return []
-        return [
-            f"masks: {missing} of {len(self._asked)} frames have none in {self._folder}; the last number in a mask's "
-            "name must be the frame's"
-        ]
+        values = {"missing": missing, "frames": len(self._asked), "folder": str(self._folder)}
+        return [Notice("masks-missing", values)]
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:

@@ -11,6 +11,7 @@ import numpy as np
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant, percentiles
 from scopemap.masking.overlays import OverlayFinder
+from scopemap.notices import Notice
 
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
 _NEIGHBOURHOOD_SHARE = 0.09
@@ -76,8 +77,8 @@ class StoredMasks(Protocol):
     """Masks of pixels that show no tissue, made by others: `mask_files.MaskFiles`."""
 
     @property
-    def warnings(self) -> list[str]:
-        """Warnings about the masks read so far."""
+    def notices(self) -> list[Notice]:
+        """What is to be said about the masks read so far."""
         ...
 
     def covered(self, index: int) -> np.ndarray | None:

@@ -144,4 +144,4 @@ def _outside(row: Mapping[str, str]) -> int:
         return NOT_USED
     if row["status"] == ROTATION_ONLY:
         return ROTATED
-    return LOST if row["status"] == "lost" and "another" not in row["reason"] else OTHER_MAP
+    return LOST if row["status"] == "lost" else OTHER_MAP

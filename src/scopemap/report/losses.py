@@ -1,4 +1,4 @@
-"""The segments of a video in which the camera was lost: when, why, and what the one who films can do about it."""
+"""The segments of a video in which the camera was lost: when, why, and what the operator can do about it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from scopemap.report.kept_run import LOST, NOT_USED, ROTATED, KeptRun
-from scopemap.trajectory.causes import ADVICE, NOT_FOUND_AGAIN
+from scopemap.trajectory.causes import ADVICE, LossCause
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class LostSegment:
     begin_s: float
     end_s: float
     frames: int
-    cause: str
+    cause: LossCause
 
     @property
     def advice(self) -> str:
-        """What the one who films can do about it; "" where a run of an earlier version kept no cause."""
-        return ADVICE.get(self.cause, "")
+        """What the operator can do about it."""
+        return ADVICE[self.cause]
 
     @property
     def size(self) -> str:
@@ -51,7 +51,7 @@ def losses(run: KeptRun) -> list[LostSegment]:
 
 def in_words(found: list[LostSegment]) -> str:
     """Return what most of the lost frames were lost by, with the advice; "" where nothing is known of it."""
-    frames: Counter[str] = Counter()
+    frames: Counter[LossCause] = Counter()
     for loss in found:
         if loss.cause:
             frames[loss.cause] += loss.frames
@@ -61,8 +61,8 @@ def in_words(found: list[LostSegment]) -> str:
     return f"Mostly by this: {cause}. Next time: {ADVICE[cause]}."
 
 
-def _main_cause(run: KeptRun, rows: list[int]) -> str:
+def _main_cause(run: KeptRun, rows: list[int]) -> LossCause:
     """Return the cause of most frames; what began the loss counts, not that the camera is not found again later."""
-    causes = Counter(run.rows[row].get("cause", "") for row in rows)
-    began = {cause: count for cause, count in causes.items() if cause != NOT_FOUND_AGAIN}
+    causes = Counter(LossCause(run.rows[row].get("cause", "")) for row in rows)
+    began = {cause: count for cause, count in causes.items() if cause is not LossCause.NOT_FOUND_AGAIN}
     return max(began or causes, key=lambda cause: causes[cause])

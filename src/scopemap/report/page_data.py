@@ -15,6 +15,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.geometry.align import align_trajectories
 from scopemap.io.reference import read_reference
+from scopemap.notices import notices_of
 from scopemap.report.frame_pictures import mask_of
 from scopemap.report.kept_run import NOT_USED, KeptRun
 from scopemap.report.losses import losses
@@ -71,7 +72,7 @@ def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", sh
         "verdict": asdict(found) | {"word": found.word},
         "scale_known": scale_is_known(run.provenance),
         "scale_source": scale_source(run.provenance),
-        "notes": list(map(str, run.provenance.get("notes", []))),
+        "notes": [notice.text for notice in notices_of(run.provenance) if notice.level == "info"],
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run),
         "depth_range": [near_mm, far_mm],

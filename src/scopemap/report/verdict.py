@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from scopemap.notices import notices_of
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, ROTATED, KeptRun
 from scopemap.report.losses import in_words, losses
 from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
-Level = Literal["good", "doubtful", "bad", "note"]
+Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
 
 LEAST_FRAMES = 10
@@ -23,23 +23,12 @@ GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
 GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
 
-_PLAIN_WORDS: list[tuple[str, Level, str]] = [
-    ("^[0-9]+ submaps: the camera was lost", "note", ""),
-    ("^interrupted at frame", "note", ""),
-    ("^the camera is unknown", "note", ""),
-    ("in the result: too few to judge it by", "note", ""),
-    ("most of the scene is not fused", "doubtful", "Most of what was seen is too far away to be in the surface"),
-    ("^masks: .* frames have none", "doubtful", "Most frames have no mask: instruments may be part of the surface"),
-    ("pictures are interlaced", "doubtful", "The video is interlaced: what moves has combed edges (see --deinterlace)"),
-    ("burned into the images", "note", "Text is burned into the images, perhaps a patient's name: hand none on"),
-]
-"""A part of a run's warning, its level, and how it is put to a reader; "" where another reason says the same."""
-
 
 @dataclass(frozen=True)
 class Reason:
-    """One fact of a verdict: its level ("note": it does not change the word), and a sentence."""
+    """One fact of a verdict: a stable code, its level ("note": it does not change the word), and a sentence."""
 
+    code: str
     level: Level
     text: str
 
@@ -49,7 +38,7 @@ class Verdict:
     """The verdict on a run.
 
     level : the worst of its reasons. advice : what the result may be used for. sentence : the main facts.
-    reasons : the worst first; the run's warnings are among them, in plain words, unless another reason says the same.
+    reasons : the worst first; the run's notices are among them, but for those of level info.
     """
 
     level: Level
@@ -65,7 +54,7 @@ class Verdict:
 
 def verdict(run: KeptRun) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
-    found = [*_of_end(run), *_of_warnings(run), _of_frames(run), *_of_maps(run), *_of_surface(run), *_of_camera(run)]
+    found = [*_of_end(run), *_of_notices(run), _of_frames(run), *_of_maps(run), *_of_surface(run), *_of_camera(run)]
     order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
     reasons = sorted(found, key=lambda reason: order.index(reason.level))
     level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
@@ -79,15 +68,12 @@ def frames_in_result(run: KeptRun) -> tuple[int, int]:
 
 def scale_is_known(provenance: dict[str, Any]) -> bool:
     """Return whether sizes were measured or anchored to a given range; predicted millimetres are a guess."""
-    if "scale" in provenance:
-        return bool(provenance["scale"]["known"])
-    return scale_source(provenance).startswith(("measured", "near-far"))  # a run of an earlier version
+    return bool((provenance.get("scale") or {}).get("known"))
 
 
 def scale_source(provenance: dict[str, Any]) -> str:
     """Return what the scale comes from, in words."""
-    scale = provenance.get("scale") or {"source": provenance.get("estimators", {}).get("anchor", "unknown")}
-    return str(scale["source"])
+    return str((provenance.get("scale") or {}).get("source", "unknown"))
 
 
 def longest_segment(outside: np.ndarray) -> int:
@@ -121,12 +107,12 @@ def _of_frames(run: KeptRun) -> Reason:
     inside, used = frames_in_result(run)
     share = inside / max(used, 1)
     if inside < LEAST_FRAMES:
-        return Reason("bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
+        return Reason("frames-too-few", "bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
     lost_in_a_row = longest_segment(run.place[run.place != NOT_USED] != 0)
     longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
     until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
     text = f"{_percent(share)} of the frames{until} are in the result ({inside} of {used}).{longest}"
-    return Reason(_level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
+    return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 
 def _of_maps(run: KeptRun) -> list[Reason]:
@@ -138,74 +124,66 @@ def _of_maps(run: KeptRun) -> list[Reason]:
         kept = len(run.maps) - 1
         shown = f"; {kept} {'submap is' if kept == 1 else 'submaps are'} shown below" if kept else ""
         text = f"After losses {other} more frames form submaps of their own: where they belong is unknown{shown}."
-        found.append(Reason("note", text))
+        found.append(Reason("submaps", "note", text))
     doubt = doubt_words(submaps_in_time(run))
     if doubt:
-        found.append(Reason("note", f"Most doubtful of the submaps is {doubt}."))
+        found.append(Reason("submap-doubtful", "note", f"Most doubtful of the submaps is {doubt}."))
     if lost:
         how = f" but for its rotation in {rotated}" if rotated else " at all"
         words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(run))}"
-        found.append(Reason("note", words.rstrip()))
+        found.append(Reason("frames-lost", "note", words.rstrip()))
     return found
 
 
 def _of_surface(run: KeptRun) -> list[Reason]:
     if not len(run.maps[0].mesh.faces):
-        return [Reason("bad", "There is no surface.")]
+        return [Reason("surface-missing", "bad", "There is no surface.")]
     surface, found = run.provenance.get("surface") or {}, []
     if "coverage_mean" in surface:
         coverage = float(surface["coverage_mean"])
         text = f"The surface covers {_percent(coverage)} of what its frames show"
         text += f" (worst frame: {_percent(float(surface['coverage_least']))})."
-        found.append(Reason(_level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
+        found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
     if "depth_error" in surface:
         error = float(surface["depth_error"])
         level = _level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)
         words = {"good": "fits", "doubtful": "fits only roughly", "bad": "contradicts"}[level]
         text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median)."
-        found.append(Reason(level, text))
+        found.append(Reason("surface-depth", level, text))
     return found
 
 
 def _of_camera(run: KeptRun) -> list[Reason]:
-    found, facts = [], run.provenance
-    source = str(facts.get("camera", {}).get("source", ""))
-    if source.startswith("assumed"):
-        text = "The lens is a guess (no calibration): depth against width may be wrong."
-        found.append(Reason("doubtful", text))
-    notes = " ".join(map(str, facts.get("notes", [])))
-    if "the scene is not rigid or the focal length is wrong" in notes:
-        text = "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed."
-        found.append(Reason("doubtful", text))
-    if "the camera is at rest, as stated" in notes:
-        text = "The camera was stated to be at rest: each frame has a surface of its own. Had it moved, all were wrong."
-        found.append(Reason("note", text))
-    elif "the camera is at rest while the tissue moves" in notes:
-        found.append(Reason("doubtful", "The camera hardly moves while the tissue does: the path means little."))
-    if moving := re.search(r"tissue: in (\d+) of (\d+) frames", notes):
-        shown = "as seen at one moment" if "fusion: as seen at second" in notes else "a mean"
-        text = f"Tissue moves on its own in {moving[1]} of {moving[2]} frames: there the surface is {shown}."
-        whole = "" if "as stated" in notes else " Tissue that moves as a whole looks like a moving camera."
-        found.append(Reason("note", text + whole))
-    if "the lens has radial distortion" in notes:
-        found.append(Reason("doubtful", "The lens bends straight lines: shapes are bent, too. A calibration mends it."))
-    return found
+    if run.provenance.get("camera", {}).get("origin") != "assumed":
+        return []
+    text = "The lens is a guess (no calibration): depth against width may be wrong."
+    return [Reason("camera-assumed", "doubtful", text)]
 
 
-def _of_warnings(run: KeptRun) -> list[Reason]:
-    """Return the run's warnings, each once; those without a plainer wording here as the run worded them."""
-    found = []
-    for warning in dict.fromkeys(map(str, run.provenance.get("warnings", []))):
-        known = (plain for plain in _PLAIN_WORDS if re.search(plain[0], warning))
-        _, level, words = next(known, (warning, "note", warning))
-        if words:
-            found.append(Reason(level, f"{words[0].upper()}{words[1:].rstrip('.')}."))
-    return found
+def _of_notices(run: KeptRun) -> list[Reason]:
+    """Return what the run says about itself, each once, unless another reason says the same."""
+    found = [notice for notice in notices_of(run.provenance) if notice.level != "info" and notice.plain]
+    codes = {notice.code for notice in notices_of(run.provenance)}
+    if "camera-at-rest-stated" in codes:
+        found = [notice for notice in found if notice.code != "camera-at-rest"]
+    more = {"tissue-moves": _moving_words(codes)}
+    return [Reason(notice.code, notice.level, notice.plain + more.get(notice.code, "")) for notice in found]
+
+
+def _moving_words(codes: set[str]) -> str:
+    """Return what moving tissue means for the surface and the path."""
+    shown = "as seen at one moment" if "fusion-at-one-moment" in codes else "a mean"
+    whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
+    return f" There the surface is {shown}.{whole}"
 
 
 def _of_end(run: KeptRun) -> list[Reason]:
     last = run.provenance.get("interrupted_at_frame")
-    return [] if last is None else [Reason("doubtful", f"The run was stopped at frame {last}: the rest is missing.")]
+    return (
+        []
+        if last is None
+        else [Reason("interrupted", "doubtful", f"The run was stopped at frame {last}: the rest is missing.")]
+    )
 
 
 def _level(value: float, good: float, bad: float) -> Level:

@@ -14,7 +14,7 @@ import numpy as np
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.pipeline import Pipeline
-from scopemap.tracking.track import RELOCALISED, Track
+from scopemap.tracking.track import Track
 
 BACKWARDS = "tracked backwards"
 """Reason of the track of such a frame."""
@@ -103,4 +103,4 @@ def _moved(track: Track, start: Track, last: Track, T_earlier_own: np.ndarray) -
     if track.map != start.map or track.status == "lost":
         return track
     moved = replace(track, map=last.map, T_world_camera=T_earlier_own @ track.T_world_camera)
-    return replace(moved, status="ok", reason=RELOCALISED) if track.index == start.index else moved
+    return replace(moved, status="ok", reason="relocalised", relocalised=True) if track.index == start.index else moved

@@ -14,6 +14,7 @@ from scopemap.io.checkpoint import CHECKPOINT, SavedState, is_committed
 from scopemap.io.checksums import input_checksum
 from scopemap.io.result_folder import UNFINISHED
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
 
 # A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
@@ -136,13 +137,13 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
     )
 
 
-def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path) -> list[str]:
-    """Return a warning where an input with this content, as `input_checksum` has it, is not that of an identity.
+def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path) -> list[Notice]:
+    """Return a notice where an input with this content, as `input_checksum` has it, is not that of an identity.
 
     identity : {}: that is not known.
     """
     before = {name: value for name, value in identity.get("input", content).items() if name != "path"}
-    return [] if before == content else [f"the input {path} changed while it was read: this may be a part of it"]
+    return [] if before == content else [Notice("input-changed", {"path": str(path)})]
 
 
 def can_resume(folder: Path, identity: dict[str, Any]) -> bool:

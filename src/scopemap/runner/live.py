@@ -18,6 +18,7 @@ from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.live import LiveSource
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice
 from scopemap.pipeline import Step
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner.preparation import Progress
@@ -202,6 +203,6 @@ def finished(reconstructor: Reconstructor, source: LiveSource) -> Reconstruction
     """Return a session's result, its provenance with the frames that were dropped."""
     result = reconstructor.result()
     if source.dropped:
-        facts = f"live: {source.dropped} of {source.read} frames were dropped, because newer ones were there"
-        result.provenance["notes"].append(facts)
+        dropped = Notice("frames-dropped", {"dropped": source.dropped, "read": source.read})
+        result.provenance["notices"].append(dropped.as_json())
     return result

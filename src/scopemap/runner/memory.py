@@ -13,6 +13,7 @@ from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.backend import MOST_OBSERVATIONS
+from scopemap.notices import Notice
 
 _MB = 1_000_000
 # Python with its libraries, the embedded network, kernels; with kernels that are compiled.
@@ -38,12 +39,12 @@ class MemoryPlan:
     blocks: int | None = None
 
     @property
-    def notes(self) -> list[str]:
-        """What was chosen, in words; [] without a limit."""
+    def notices(self) -> list[Notice]:
+        """What was chosen; [] without a limit."""
         if self.blocks is None:
             return []
-        chosen = f"{self.observations} observations adjusted, {self.blocks} blocks of 8^3 voxels"
-        return [f"memory: at most {chosen}, stages {self.ahead} frame(s) ahead (run.memory_mb)"]
+        values = {"observations": self.observations, "blocks": self.blocks, "ahead": self.ahead}
+        return [Notice("memory-limited", values)]
 
 
 def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:

@@ -1,4 +1,4 @@
-"""What comes before the first frame of a run: estimators, an unknown focal length, a fitted exponent of depth."""
+"""What comes before the first frame of a run: estimators, an unknown focal length."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 from scopemap.calibration.focal_length.estimate import with_focal_from_motion
 from scopemap.config import Config
 from scopemap.depth.estimate import DepthEstimator
-from scopemap.depth.power_law import fit_exponent
 from scopemap.estimators import OwnEstimators, create_estimators
 from scopemap.frame import is_constant
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice
 from scopemap.pipeline import Estimators
 
 Progress = Callable[[str, int, int], None]
@@ -22,31 +22,27 @@ Timed = Callable[..., Any]
 
 def prepare(
     sequence: Sequence, config: Config, timed: Timed, progress: Progress, own: OwnEstimators | None = None
-) -> tuple[Sequence, Config, Estimators, list[str]]:
-    """Return a sequence with a focal length, resolved settings, the estimators, and notes on what was estimated."""
+) -> tuple[Sequence, Config, Estimators, list[Notice]]:
+    """Return a sequence with a focal length, resolved settings, the estimators, and notices of what was estimated."""
     progress("preparing", 0, 0)
     estimators = timed("prepare", create_estimators, config, sequence, own)
     if not sequence.calibrated:
         progress("estimating the focal length", 0, 0)
-    sequence, camera_notes = _with_estimated_focal(sequence, config, estimators, timed)
-    config, exponent_notes = _with_exponent(sequence, config, estimators, timed)
-    if exponent_notes:
-        # Some estimators remember the first frame that they saw, and the anchor holds the settings.
-        estimators = create_estimators(config, sequence, own)
-    return sequence, config, estimators, camera_notes + exponent_notes
+    sequence, camera_notices = _with_estimated_focal(sequence, config, estimators, timed)
+    return sequence, config, estimators, camera_notices
 
 
 def _with_estimated_focal(
     sequence: Sequence, config: Config, estimators: Estimators, timed: Timed
-) -> tuple[Sequence, list[str]]:
-    """Give an unknown camera the focal length by `input.focal`, with notes on the estimation."""
+) -> tuple[Sequence, list[Notice]]:
+    """Give an unknown camera the focal length by `input.focal`, with notices of the estimation."""
     is_stated = config.input.focal == "auto" and sequence.focal_is_stated
     if sequence.calibrated or is_stated or config.input.focal == "assume":
         return sequence, []
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if config.input.focal == "auto" and network is not None:
         return _with_networks_focal(sequence, network), []
-    estimated: tuple[Sequence, list[str]] = timed("focal length", with_focal_from_motion, sequence, config)
+    estimated: tuple[Sequence, list[Notice]] = timed("focal length", with_focal_from_motion, sequence, config)
     return estimated
 
 
@@ -57,13 +53,3 @@ def _with_networks_focal(sequence: Sequence, network: DepthEstimator) -> Sequenc
     if first is None or focal_px is None:
         return sequence
     return sequence.with_focal(focal_px, f"estimated: Depth Pro on frame {first.index}")
-
-
-def _with_exponent(
-    sequence: Sequence, config: Config, estimators: Estimators, timed: Timed
-) -> tuple[Config, list[str]]:
-    """Put a number where the settings ask for a fitted exponent, with a note on the fit; else change nothing."""
-    if config.depth.exponent != "fit":
-        return config, []
-    fit = timed("depth exponent", fit_exponent, sequence, config, estimators.depth)
-    return fit.applied(config), [fit.describe(config.depth.advanced.exponent_frames)]

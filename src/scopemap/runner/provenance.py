@@ -13,6 +13,7 @@ from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.estimators import estimators_provenance, package_versions, scale_facts
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice, of_input
 from scopemap.pipeline import Estimators
 from scopemap.reconstruction import FrameRecord, frame_counts
 
@@ -33,21 +34,17 @@ class Limits:
     blocks: int | None = None
 
 
-def motion_notes(records: list[FrameRecord], config: Config) -> list[str]:
+def motion_notices(records: list[FrameRecord], config: Config) -> list[Notice]:
     """Return whether the camera was stated to be at rest, and where and how often tissue moves on its own."""
-    at_rest = ["tracking: the camera is at rest, as stated: all motion is the tissue's"]
-    found = at_rest if config.tracking.camera_at_rest else []
+    found = [Notice("camera-at-rest-stated")] if config.tracking.camera_at_rest else []
     measured = [(record.index, *record.track.moving) for record in records if record.T_world_camera is not None]
     measured = [one for one in measured if not math.isnan(one[1])]
     moving = [one for one in measured if one[1] > _MOVING_SHARE]
     if not moving:
         return found
     index, share, x, y = max(moving, key=lambda one: one[1])
-    return [
-        *found,
-        f"tissue: in {len(moving)} of {len(measured)} frames more than {_MOVING_SHARE:.0%} of the picture moves on its "
-        f"own; most in frame {index}: {share:.0%}, around {x:.2f} of the width and {y:.2f} of the height",
-    ]
+    counts = {"frames": len(moving), "measured": len(measured), "threshold": _MOVING_SHARE}
+    return [*found, Notice("tissue-moves", counts | {"most": index, "share": share, "x": x, "y": y})]
 
 
 def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
@@ -70,6 +67,7 @@ def provenance_of(
         "skipped": dict(Counter(frame.kind for frame in sequence.skipped)),
         "camera": {
             "source": sequence.camera_source,
+            "origin": sequence.camera_origin,
             "width": camera.width,
             "height": camera.height,
             "fx": camera.fx,
@@ -81,8 +79,7 @@ def provenance_of(
         },
         "scale": scale_facts(estimators),
         "estimators": estimators_provenance(estimators),
-        "notes": list(sequence.source.notes),
-        "warnings": sequence.warnings,
+        "notices": [notice.as_json() for notice in of_input(sequence.source.notes, sequence.warnings)],
         "seconds": {part: round(seconds, 3) for part, seconds in seconds.items()},
         "versions": package_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",

@@ -45,7 +45,7 @@ class Reconstructor:
     limits : of memory, for runs without an end; beyond them results are no longer those of `reconstruct`.
 
     Raises `WeightsError`, `InputError` and `SettingsError` as `reconstruct` does, `SettingsError` for a depth or a flow
-    that is none, and for `depth.exponent=fit` without a sequence.
+    that is none.
     """
 
     def __init__(
@@ -62,11 +62,9 @@ class Reconstructor:
             raise SettingsError("depth is no estimator: state the kind of your function's values, OwnDepth(f, kind)")
         config, clock = _with_own(config or Config(), depth=depth is not None, flow=flow is not None), Clock()
         self._pushed = not isinstance(source, Sequence)
-        if self._pushed and config.depth.exponent == "fit":
-            raise SettingsError("depth.exponent=fit reads the start of a sequence: give a number")
         sequence = source if isinstance(source, Sequence) else _sequence_of(source, config)
         own = OwnEstimators(depth, None if flow is None else OwnFlow(flow))
-        self._sequence, self.config, estimators, self._notes = prepare(sequence, config, clock.timed, progress, own)
+        self._sequence, self.config, estimators, self._notices = prepare(sequence, config, clock.timed, progress, own)
         self._store = FrameStore()
         self._pipeline = Pipeline(self.config, estimators, self._store)
         self._run = Run(self._sequence, self.config, self._pipeline, clock, None, progress)
@@ -134,7 +132,7 @@ class Reconstructor:
         """
         self._refuse_closed()
         try:
-            return self._run.result(self._notes)
+            return self._run.result(self._notices)
         finally:
             self.close()
 

@@ -13,8 +13,8 @@ from scopemap.errors import InputError
 from scopemap.frame import REGIONS, RowTable
 from scopemap.mapping.submaps import Submap
 from scopemap.reconstruction import FrameRecord
-from scopemap.tracking.track import WALL, Status, Track
-from scopemap.trajectory.causes import causes_of_loss
+from scopemap.tracking.track import Status, Track
+from scopemap.trajectory.causes import LossCause, causes_of_loss
 from scopemap.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
 
 _OF_TRACK = (
@@ -30,10 +30,11 @@ _RECORD = np.dtype(
         ("rotation", np.float64, (3, 3)),
         *((name, np.float64, (4, 4)) for name in ("T_tracked", "T_world_camera")),
         ("has_pose", np.int64),
-        ("sizes", np.int64, (3,)),
+        ("relocalised", np.int64),
+        ("sizes", np.int64, (4,)),
     ]
 )
-"""A record; `text` is where name, status and reason begin, `sizes` are their bytes."""
+"""A record; `text` is where name, status, reason and cause begin, `sizes` are their bytes."""
 
 
 class FrameRecords:
@@ -59,12 +60,15 @@ class FrameRecords:
             row[name] = getattr(track, name)
         row["depth_scale"], row["warped_share"] = record.depth_scale, record.warped_share
         row["T_tracked"] = track.T_world_camera
+        row["relocalised"] = track.relocalised
         row["nonrigidity"] = np.nan if track.nonrigidity is None else track.nonrigidity
         row["rotation"] = np.nan if track.rotation is None else track.rotation
         if record.T_world_camera is not None:
             row["has_pose"], row["T_world_camera"] = True, record.T_world_camera
         # A file's name may hold bytes that are no UTF-8.
-        texts = [text.encode("utf-8", "surrogateescape") for text in (record.name, track.status, track.reason)]
+        texts = [
+            text.encode("utf-8", "surrogateescape") for text in (record.name, track.status, track.reason, track.cause)
+        ]
         row["sizes"] = [len(text) for text in texts]
         self._texts.append(np.frombuffer(b"".join(texts), np.uint8))
         self._rows.append(row)
@@ -88,13 +92,12 @@ def check_tracked(records: list[FrameRecord], path: Path) -> None:
     """Raise `InputError` where no frame of the input at a path was tracked."""
     if all(record.track.status == "lost" for record in records):
         reason = records[0].track.reason if records else "interrupted before the first"
-        guess = "" if "max_depth_mm" in reason else " (black or constant?)"
-        raise InputError(f"no frame of {path} could be used: {reason}{guess}")
+        raise InputError(f"no frame of {path} could be used: {reason}")
 
 
 def _record(row: np.void, texts: bytes) -> FrameRecord:
     ends = (row["text"] + np.cumsum([0, *row["sizes"]])).tolist()
-    name, status, reason = (texts[a:b].decode("utf-8", "surrogateescape") for a, b in pairwise(ends))
+    name, status, reason, cause = (texts[a:b].decode("utf-8", "surrogateescape") for a, b in pairwise(ends))
     track = Track(
         int(row["index"]),
         cast(Status, status),
@@ -113,6 +116,8 @@ def _record(row: np.void, texts: bytes) -> FrameRecord:
         float(row["quality"]),
         row["nonrigidity"].copy(),
         rotation=None if np.isnan(row["rotation"]).any() else row["rotation"].copy(),
+        cause=LossCause(cause),
+        relocalised=bool(row["relocalised"]),
     )
     pose = row["T_world_camera"] if row["has_pose"] else None
     scale, share = float(row["depth_scale"]), float(row["warped_share"])
@@ -157,7 +162,7 @@ def _with_rotations(records: list[FrameRecord]) -> list[FrameRecord]:
         group = list(segment)
         if not is_lost:
             T_world_last = group[-1].T_world_camera
-        elif T_world_last is not None and any(WALL in record.track.reason for record in group):
+        elif T_world_last is not None and any(record.track.cause is LossCause.CONTACT for record in group):
             group = [_rotated(record, T_world_last) for record in group]
         out += group
     return out

@@ -26,25 +26,26 @@ from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.moving import MovingTissue, block_edge_mm
 from scopemap.fusion.seen_at import SeenAt
-from scopemap.fusion.volume import FusedSurface, depth_warnings
+from scopemap.fusion.volume import FusedSurface, depth_notices
 from scopemap.io.checksums import input_checksum, write_checksums
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.multiview_depth import KeyframeDepths
 from scopemap.mapping.submaps import FinalFrames, Submap
+from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline, Step
 from scopemap.reconstruction import (
     DepthWriter,
     FrameRecord,
     Reconstruction,
-    warnings_of_frames,
+    notices_of_frames,
 )
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import Progress, prepare
-from scopemap.runner.provenance import Limits, motion_notes, provenance_of, refuse_own_input
+from scopemap.runner.provenance import Limits, motion_notices, provenance_of, refuse_own_input
 from scopemap.runner.records import FrameRecords, check_tracked, records_of
 from scopemap.tracking.track import FrameTracker, Track
 
@@ -71,7 +72,7 @@ def reconstruct(
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
     result. Observers are resumed with it that are methods of an object with an attribute `NOT_IN_CHECKPOINT`.
 
-    The settings in the result are the resolved ones: a fitted `depth.exponent` and the TSDF parameters are numbers.
+    The settings in the result are the resolved ones: the TSDF parameters are numbers.
     Of several submaps the one with most frames is the result, and `others` holds the others.
     Raises `InputError` where no frame could be tracked, and what the estimators raise for missing weights.
 
@@ -96,7 +97,7 @@ def reconstruct(
     identity = {} if out is None else identity_of(sequence, config, tracker)
     with result_folder(out, overwrite=overwrite, can_resume=partial(can_resume, identity=identity)) as folder:
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
-        sequence, config, estimators, notes = prepare(sequence, config, clock.timed, progress)
+        sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
         write = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
         with closing(store):
             run = Run(sequence, config, Pipeline(config, estimators, store, tracker), clock, write, progress)
@@ -106,8 +107,9 @@ def reconstruct(
                 run.track(observers)
             else:
                 _track_with_checkpoints(run, observers, folder, identity)
-            result = run.result(notes)
-        result.provenance["warnings"] += input_changes(identity, result.provenance["input_content"], sequence.path)
+            result = run.result(notices)
+        changes = input_changes(identity, result.provenance["input_content"], sequence.path)
+        result.provenance["notices"] += [notice.as_json() for notice in changes]
         del run  # with its keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write is not None:
             progress("writing", 0, 0)
@@ -207,27 +209,28 @@ class Run:
                 return
             yield frame
 
-    def result(self, notes: list[str]) -> Reconstruction:
+    def result(self, prepared: list[Notice]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         records = self.records.read()
         check_tracked(records, self.sequence.path)
         records = self.clock.timed("track backwards", self._after_going_back, records)
         self.progress("adjusting keyframes", 0, 0)
-        submaps, warnings = self.clock.timed("back end", self.pipeline.mapper.submaps)
+        submaps, notices = self.clock.timed("back end", self.pipeline.mapper.submaps)
         self.final_frames = sum(len(submap.frames) for submap in submaps)
-        results = [self._fuse_submap(records_of(n, submaps, records), submaps[n], notes) for n in range(len(submaps))]
+        results = [
+            self._fuse_submap(records_of(n, submaps, records), submaps[n], prepared) for n in range(len(submaps))
+        ]
         submapped = {index for submap in submaps for index in submap.frames}
         for frame in self.pipeline.fusion.store.frames({r.index for r in records if r.index not in submapped}):
             self._write_depth(frame)  # as tracked
         last = self.records.last_index if self.interrupted else None
-        warnings = self.pipeline.warnings + warnings + warnings_of_frames(results[0].records, last)
-        results[0].provenance["warnings"] += warnings
+        notices = self.pipeline.notices + notices + notices_of_frames(results[0].records, last)
         results[0].provenance["interrupted_at_frame"] = last
         results[0].provenance["resumed_after_frame"] = self.resumed_after
         results[0].provenance["input_content"] = self.clock.timed("hash input", input_checksum, self.sequence.path)
         if self.forgotten:
-            few = f"{self.forgotten} of the older frames are not in the result: it keeps {self.limits.frames}"
-            results[0].provenance["warnings"].append(few)
+            notices.append(Notice("frames-forgotten", {"frames": self.forgotten, "kept": self.limits.frames}))
+        results[0].provenance["notices"] += [notice.as_json() for notice in notices]
         return replace(results[0], others=results[1:])
 
     def _after_going_back(self, records: list[FrameRecord]) -> list[FrameRecord]:
@@ -238,7 +241,7 @@ class Run:
             for record, track in zip(records, tracks, strict=True)
         ]
 
-    def _fuse_submap(self, records: list[FrameRecord], submap: Submap, notes: list[str]) -> Reconstruction:
+    def _fuse_submap(self, records: list[FrameRecord], submap: Submap, notices: list[Notice]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap, whose records these are."""
         sequence, pipeline = self.sequence, self.pipeline
         store = pipeline.fusion.store
@@ -261,14 +264,13 @@ class Run:
         checked = self.checked.pop(submap.main, _SpreadFrames()).frames
         agreement = self.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked)
         provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, records)
-        correction = [] if submap.correction is None else [submap.correction.description]
-        depth_notes = [] if depths is None else [depths.description]
-        motion = motion_notes(records, self.config) + ([] if seen_at is None else [seen_at.note])
-        provenance["notes"] += notes + self.plan.notes + motion + correction + depth_notes + fused.notes
+        found = notices + self.plan.notices + motion_notices(records, self.config)
+        found += [part.notice for part in (seen_at, submap.correction, depths) if part is not None] + fused.notices
         masks = pipeline.estimators.masks
-        provenance["warnings"] += [] if masks is None else masks.warnings
+        found += [] if masks is None else masks.notices
         medians_mm = self.median_depths_mm.read().tolist() if median_mm is None else [median_mm]
-        provenance["warnings"] += depth_warnings(medians_mm, fused.settings)
+        found += depth_notices(medians_mm, fused.settings)
+        provenance["notices"] += [notice.as_json() for notice in found]
         provenance["surface"] = agreement
         config = self.config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
+from scopemap.trajectory.causes import LossCause
 
 Status = Literal["initial", "ok", "lost", "other-map", "rotation-only"]
 
-TOO_DARK, TOO_BRIGHT = ", it is too dark", ", it is overexposed"
 _DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
-WALL = "the wall fills the picture"
-"""In the reason of a lost frame that shows nothing but one near wall."""
-UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
-"""Reason of a lost frame after such ones."""
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
-RELOCALISED = "relocalised"
-"""Reason of the track of a frame where features found the lost camera again."""
+
+class TrackingLoss(NamedTuple):
+    """Why a frame is lost: the cause, and one phrase with its figures."""
+
+    cause: LossCause
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Track:
     status : "initial" for the frame that fixes the world of its map, "ok", or "lost". Trackers do not give
         "other-map" and "rotation-only": in the records of a result these mark frames that were tracked in another
         submap, and lost ones whose rotation was followed.
-    reason : one phrase; for a lost frame, what was wrong.
+    reason : one phrase; for a lost frame, what was wrong. cause : of the loss, as the tracker judged it.
+    relocalised : whether features found the lost camera again in this frame.
     T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose.
     keyframe : number of the frame it was aligned to.
     residual : robust standard deviation of the photometric residual, NaN if there was none.
@@ -69,6 +70,8 @@ class Track:
     nonrigidity: np.ndarray | None = None
     depth_ratio: float = float("nan")
     rotation: np.ndarray | None = None
+    cause: LossCause = LossCause.NONE
+    relocalised: bool = False
 
     @property
     def moving(self) -> tuple[float, float, float]:
@@ -86,10 +89,15 @@ class Track:
         return share, float(x), float(y)
 
 
-def exposure_words(frame: Frame) -> str:
-    """Return in words that most of an image is dark or overexposed; "" where it is neither."""
+def unusable(frame: Frame) -> TrackingLoss:
+    """Return why hardly a pixel of an image is usable: it is dark, overexposed, or something covers the view."""
     low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
-    return TOO_DARK if middle < _DARK_LEVEL else TOO_BRIGHT if low > _BRIGHT_LEVEL else ""
+    reason = f"only {frame.valid.mean():.0%} of the image is usable"
+    if middle < _DARK_LEVEL:
+        return TrackingLoss(LossCause.TOO_DARK, f"{reason}, it is too dark")
+    if low > _BRIGHT_LEVEL:
+        return TrackingLoss(LossCause.OVEREXPOSED, f"{reason}, it is overexposed")
+    return TrackingLoss(LossCause.VIEW_COVERED, reason)
 
 
 class FrameTracker(Protocol):

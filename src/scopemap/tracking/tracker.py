@@ -11,7 +11,8 @@ from scopemap.config import TrackingSettings
 from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
+from scopemap.geometry.se3 import inverse, mean_near, orthonormalised
+from scopemap.tracking.acceptance import MIN_TEXTURE, LastPose, is_obscured, rejection
 from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes, Relocaliser, depth_ratio, is_wall
@@ -19,12 +20,10 @@ from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondence
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
-from scopemap.tracking.track import RELOCALISED, UNCONFIRMED, WALL, Status, Track, exposure_words
+from scopemap.tracking.track import Status, Track, TrackingLoss, unusable
+from scopemap.trajectory.causes import LossCause
 
-_MIN_TEXTURE = 0.5  # of a wall that shows nothing but noise; tissue: 0.65 and more
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
-_DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost, unless so many features match: by chance 20 at most
-_CLEAR_MATCHES = 40
 _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
@@ -32,6 +31,7 @@ _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyfram
 _SEEN_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
 _CLEAR, _PATIENCE = 0.8, 3  # of the best quality since the keyframe: below it the next one waits so many frames more
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
+_UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
 class Tracker:
@@ -75,41 +75,40 @@ class Tracker:
         usable = float(frame.valid.mean())
         if usable < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
-            return replace(
-                self._lost(frame, f"only {usable:.0%} of the image is usable{exposure_words(frame)}"), usable=usable
-            )
+            return replace(self._lost(frame, unusable(frame)), usable=usable)
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
 
     def _track(self, frame: Frame, sharpness: float) -> Track:
         self._is_unsharp = sharpness < self.settings.min_sharpness
-        unsharp = f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid"
+        unsharp = TrackingLoss(LossCause.UNSHARP, f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid")
         if self._keyframe is None:
             if self._is_unsharp:
                 return self._lost(frame, unsharp)
             return Track(frame.index, "initial", "first frame of the map", np.eye(4), frame.index, map=self._map)
         if self._frames_lost > _MAX_EXTRAPOLATION and self._frames_lost % self.settings.search_every:
             self._sharp_frames_lost += not self._is_unsharp
-            return self._lost(frame, f"not searched: one of {self.settings.search_every} lost frames is")
+            skipped = f"not searched: one of {self.settings.search_every} lost frames is"
+            return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
         alignment, pyramid = self._align(self._keyframe, frame)
         if (
             self._is_due([alignment.agreement])
             and not self._frames_lost
-            and not self._reject_reason(self._keyframe, alignment)
+            and not self._rejection(self._keyframe, alignment)
         ):
             alignment = self._seen_again(frame, alignment)
-        obscured = self._is_obscured(sharpness, alignment)
-        rejected, reason = self._reject_reason(self._keyframe, alignment), ""
+        obscured = is_obscured(sharpness, alignment, self.settings.min_sharpness)
+        rejected, relocalised = self._rejection(self._keyframe, alignment), False
         failed, is_weak = obscured or bool(rejected), self._coverage < _WEAK_COVERAGE
         if failed and is_wall(frame, self._keyframe):
-            self._met_wall, unsharp, rejected = True, f"{WALL}, {unsharp}", rejected and f"{WALL}, {rejected}"
+            self._met_wall, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
         elif self._met_wall and not failed and self.settings.relocalisation_keyframes:
-            failed, rejected = True, UNCONFIRMED
+            failed, rejected = True, TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED)
         if failed or is_weak or self._frames_lost:
             found = self._found(frame, pyramid, sharpness, failed=failed)
             if found is not None and (failed or found[1].agreement > alignment.agreement):
-                reason = "" if found[0].map == self._map and not self._frames_lost else RELOCALISED
-                obscured, rejected = False, ""
+                relocalised = found[0].map != self._map or self._frames_lost > 0
+                obscured, rejected = False, None
                 alignment = self._aligned_to(*found)
         if obscured:
             self._sharp_frames_lost = 0
@@ -119,8 +118,8 @@ class Tracker:
             after = self.settings.new_map_after * (2 if self._met_wall else 1)
             if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
                 return self._new_map(frame)
-            return self._lost(frame, f"rejected: {rejected}", alignment)
-        return self._accept(frame, self._keyframe, alignment, reason)
+            return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
+        return self._accept(frame, self._keyframe, alignment, relocalised)
 
     def remember(self, frame: Frame) -> None:
         """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
@@ -222,8 +221,8 @@ class Tracker:
                 self._is_accepted(keyframe, alignment)
                 and alignment.overlap >= _FOUND_OVERLAP
                 # Of many keyframes one always fits a wall without texture.
-                and (keyframe.measured or alignment.texture >= _MIN_TEXTURE)
-                and not self._is_obscured(sharpness, alignment)
+                and (keyframe.measured or alignment.texture >= MIN_TEXTURE)
+                and not is_obscured(sharpness, alignment, self.settings.min_sharpness)
             ),
             near=near,
             recent=failed or self._frames_lost > 0,
@@ -298,44 +297,15 @@ class Tracker:
             return [self._T_world_last, self._T_world_last @ np.linalg.matrix_power(self._T_step, steps)]
         return [keyframe.T_world_camera if self.settings.paper.start == "identity" else self._T_world_last]
 
-    def _is_obscured(self, sharpness: float, alignment: Alignment) -> bool:
-        """Whether an image is too unsharp for its alignment to be reliable."""
-        least = self.settings.min_sharpness
-        # Pixels of smoke fit smoke; its features match by chance alone. Below half of it neither is evidence.
-        is_evident = alignment.inlier_share >= _DOUBTFUL_INLIER_SHARE or alignment.matches >= _CLEAR_MATCHES
-        return sharpness < (least / 2 if is_evident else least)
-
     def _is_accepted(self, keyframe: Keyframe, alignment: Alignment) -> bool:
-        return not self._reject_reason(keyframe, alignment)
+        return not self._rejection(keyframe, alignment)
 
-    def _reject_reason(self, keyframe: Keyframe, alignment: Alignment) -> str:
-        """Return why a pose is rejected, or ""."""
-        settings, T_world_camera = self.settings.advanced, _T_world_camera(keyframe, alignment)
-        if not np.isfinite(T_world_camera).all():
-            return "the alignment diverged"
-        if alignment.overlap < self.settings.min_valid_share:
-            return f"overlap {alignment.overlap:.0%} with the keyframe"
-        if alignment.inlier_share < settings.min_inlier_share and not alignment.is_supported:
-            return f"inlier share {alignment.inlier_share:.0%} with the keyframe"
-        # Measured depth constrains a pose by shape alone.
-        by_shape = keyframe.measured and settings.depth_weight > 0
-        if alignment.correlation < settings.min_correlation and not by_shape:
-            if alignment.texture < _MIN_TEXTURE:
-                return "weakly constrained, hardly any texture"
-            # A supported pose may be a pixel off, which decorrelates fine texture.
-            if alignment.correlation < settings.min_correlation / 3 or not alignment.is_supported:
-                return f"correlation {alignment.correlation:.2f} with the keyframe"
-        # A cut may turn the view by any angle: so many features do not match by chance.
-        if keyframe.map != self._map or alignment.matches >= _CLEAR_MATCHES:
-            return ""
-        T_step = inverse(self._T_world_last) @ T_world_camera
-        rotation_rad = float(rotation_angle_rad(T_step[:3, :3]))
-        translation = float(np.linalg.norm(T_step[:3, 3])) / keyframe.depth_mm
-        if max(rotation_rad, translation) > settings.max_step * (1 + self._frames_lost):
-            return f"jump of {np.degrees(rotation_rad):.0f} deg and {translation:.2f} mean depths"
-        return ""
+    def _rejection(self, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
+        """Return why a pose is rejected, or None."""
+        last = LastPose(self._map, self._T_world_last, self._frames_lost)
+        return rejection(keyframe, alignment, _T_world_camera(keyframe, alignment), last, self.settings)
 
-    def _accept(self, frame: Frame, keyframe: Keyframe, alignment: Alignment, reason: str) -> Track:
+    def _accept(self, frame: Frame, keyframe: Keyframe, alignment: Alignment, relocalised: bool) -> Track:
         T_world_camera = _T_world_camera(keyframe, alignment)
         if keyframe.map != self._map:
             # The last pose is in another world.
@@ -349,14 +319,18 @@ class Tracker:
         self._T_world_last, self._frames_lost, self._sharp_frames_lost = T_world_camera, 0, 0
         self._frames_of_map[self._map] += 1
         self._agreement.append(alignment.agreement)
-        return replace(_track_of(frame.index, "ok", reason, T_world_camera, keyframe, alignment), depth_ratio=ratio)
+        reason = "relocalised" if relocalised else ""
+        track = _track_of(frame.index, "ok", reason, T_world_camera, keyframe, alignment)
+        return replace(track, depth_ratio=ratio, relocalised=relocalised)
 
-    def _lost(self, frame: Frame, reason: str, alignment: Alignment | None = None) -> Track:
+    def _lost(self, frame: Frame, loss: TrackingLoss, alignment: Alignment | None = None) -> Track:
         self._frames_lost += 1
         if self._keyframe is None or alignment is None:
             keyframe = self._keyframe.frame.index if self._keyframe else frame.index
-            return Track(frame.index, "lost", reason, self._T_world_last, keyframe, map=self._map)
-        return _track_of(frame.index, "lost", reason, self._T_world_last, self._keyframe, alignment)
+            track = Track(frame.index, "lost", loss.reason, self._T_world_last, keyframe, map=self._map)
+        else:
+            track = _track_of(frame.index, "lost", loss.reason, self._T_world_last, self._keyframe, alignment)
+        return replace(track, cause=loss.cause)
 
     def _new_map(self, frame: Frame) -> Track:
         """Begin a new map with this frame; its relative pose to the other maps is unknown."""
@@ -370,6 +344,11 @@ class Tracker:
         self._passed.clear()
         self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
+
+
+def _in_contact(loss: TrackingLoss) -> TrackingLoss:
+    """Return a loss as that of a frame in which a close-up without structure fills the picture."""
+    return TrackingLoss(LossCause.CONTACT, f"the wall fills the picture, {loss.reason}")
 
 
 def _T_world_camera(keyframe: Keyframe, alignment: Alignment) -> np.ndarray:

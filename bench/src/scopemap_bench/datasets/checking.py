@@ -67,7 +67,7 @@ def check_reading(survey: Survey) -> list[Finding]:
         found += _when(count < 2, "error", "frame-few", f"{count} readable frame(s), two are needed")
     warnings = survey.sequence.warnings
     more_warnings = [f"and {len(warnings) - _NAMED} more warnings of the reader"] * (len(warnings) > _NAMED)
-    return found + [Finding("warning", "source", warning) for warning in warnings[:_NAMED] + more_warnings]
+    return found + [Finding("warning", "source", str(warning)) for warning in warnings[:_NAMED] + more_warnings]
 
 
 def check_numbers(survey: Survey) -> list[Finding]:
@@ -215,7 +215,7 @@ def check_agreement(survey: Survey) -> list[Finding]:
 
 def check_assumptions(survey: Survey) -> list[Finding]:
     """What the reader assumed."""
-    return [Finding("info", "assumed", note) for note in survey.sequence.notes]
+    return [Finding("info", "assumed", str(note)) for note in survey.sequence.notes]
 
 
 CHECKS = (

@@ -15,6 +15,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.images import ImageFolder, image_files, numbered_images
+from scopemap.notices import Notice
 from scopemap.trajectory.formats.poses import rigid
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
@@ -76,7 +77,7 @@ class EndoNerfFolder(ImageFolder):
         else:
             self.notes.append(f"poses in {file.name} start at the identity: taken as they are, camera to world, in mm")
         if np.abs(poses - poses[0]).max() < _REST_TOLERANCE:
-            self.notes.append("the camera is at rest while the tissue moves: errors of the path say little here")
+            self.notes.append(Notice("camera-at-rest"))
         if len(rows) != len(self.numbers):
             raise InputError(
                 f"reading {file}: it holds {len(rows)} rows for {len(self.numbers)} images, in their order"

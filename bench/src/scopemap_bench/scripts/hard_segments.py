@@ -87,7 +87,9 @@ def loop(folder: Path) -> list[str]:
             poses = result.trajectory.T_world_camera
             off = inverse(poses[0]) @ poses[-1]
             report = pose_report(match(result.trajectory, read_trajectory(source), "sim3"))
-            told = next((note for note in result.provenance["notes"] if "loops closed" in note), "0 loops closed")
+            told = next(
+                (notice["text"] for notice in result.provenance["notices"] if notice["code"] == "mapping-adjusted"), ""
+            )
             closed = told.split(" loops closed")[0].split()[-1]
             rows.append(
                 f"| {scene}, {name} | {closed} | {np.linalg.norm(off[:3, 3]):.2f} / "

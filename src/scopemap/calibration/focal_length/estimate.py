@@ -23,6 +23,7 @@ from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, window
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice
 
 FOV_RANGE_DEG = (30.0, 150.0)
 """Horizontal fields of view that endoscopes have."""
@@ -67,8 +68,8 @@ class FocalEstimate:
         return bool(abs(math.log(self.focal_px / focal_px)) >= _SIGNIFICANT * self.share)
 
 
-def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[str]]:
-    """Return a sequence of unknown camera with the focal length estimated from its motion, and notes on the lens.
+def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[Notice]]:
+    """Return a sequence of unknown camera with the focal length estimated from its motion, and notices about the lens.
 
     Where the estimate is not taken the focal length stays, and `camera_source` says why.
 
@@ -102,17 +103,12 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         if is_unknown:
             kept += "; " + _undecided(tried) if adjusts else ""
             default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
-            sequence.source.warnings.append(
-                f"{default}; a calibration (--camera) or the field of view (--fov) mends it"
-            )
+            sequence.source.warnings.append(Notice("camera-unknown", {"reason": default}))
     if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
-    distorted = (
-        f"focal length: the lens has radial distortion, about {abs(estimate.distortion):.0%} at half the image's width "
-        "from the centre; only a calibration corrects it (--camera)"
-    )
+    distorted = Notice("camera-distorted", {"share": abs(estimate.distortion)})
     source = f"estimated: from the motion of {min(sequence.count or MAX_FRAMES, MAX_FRAMES)} frames, {described}"
     return sequence.with_focal(estimate.focal_px, source, estimate.sigma_px), [distorted] * bends
 

@@ -20,6 +20,7 @@ from scopemap.io.datasets.dicom_files import EncapsulatedVideo, Header, images, 
 from scopemap.io.decoding import first_bytes
 from scopemap.io.images import image_files, numeric_order
 from scopemap.io.source import Source, SourceFrame
+from scopemap.notices import Notice
 
 _PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
 # The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
@@ -111,7 +112,7 @@ class Dicom(Source):
         if first.missing:
             self._warn(f"it claims {first.frames + first.missing} images, {first.frames} are there; these were used")
         if any(str(header.fields.get("BurnedInAnnotation", "")).upper() == "YES" for header in self._headers):
-            self._warn("by its header notes, perhaps a patient's name, are burned into the images")
+            self._warn(Notice("input-text-burned-in"))
 
     def _in_folder(self, path: Path) -> list[Header]:
         """Return the headers of the one series in a folder, sorted."""
