@@ -16,6 +16,7 @@ from scopemap.config import Config
 from scopemap.frame import Frame
 from scopemap.geometry.rendering import render_mesh
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.notices import of_input
 from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.tracking.track import Track
@@ -66,8 +67,7 @@ def drawn_result(name: str = "video.mp4", **facts: Any) -> Reconstruction:
         | {"source": "calibration file camera.yaml"},
         "estimators": {"depth": "scopenet", "flow": "dis"},
         "scale": {"known": False, "source": "millimetres as scopenet gives them"},
-        "notes": ["a note"],
-        "warnings": ["a warning"],
+        "notices": [notice.as_json() for notice in of_input(["a note"], ["a warning"])],
         "seconds": {"total": 3.0},
         "versions": {"scopemap": "0.1.0"},
         "surface": GOOD_SURFACE,

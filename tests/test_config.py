@@ -40,7 +40,7 @@ def _write(tmp_path: Path, text: str) -> Path:
 
 
 def test_precedence(tmp_path: Path) -> None:
-    file = _write(tmp_path, "[tracking]\nhuber = 2.5\nkeyframe_every = 7\n[smoothing]\nmethod = 'none'\n")
+    file = _write(tmp_path, "[tracking]\nadvanced.huber = 2.5\nkeyframe_every = 7\n[smoothing]\nmethod = 'none'\n")
     names = {"tracking.advanced.huber": 3.5}
     assert Config.load().tracking.keyframe_every == 10
     assert Config.load("paper").tracking.keyframe_every == 2
@@ -220,7 +220,7 @@ def test_a_preset_named_in_a_file_is_applied(tmp_path: Path) -> None:
 
 
 def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> None:
-    file = _write(tmp_path, 'preset = "paper"\n[tracking]\nhuber = 2.5\n')
+    file = _write(tmp_path, 'preset = "paper"\n[tracking]\nadvanced.huber = 2.5\n')
     realtime = Config.load("realtime", settings={"tracking.advanced.huber": 2.5})
     assert Config.load(settings={"preset": "paper"}) == Config.load("paper")
     assert Config.load("realtime", file) == realtime

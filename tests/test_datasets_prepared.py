@@ -19,6 +19,7 @@ from scopemap.io import prepared
 from scopemap.io.frame_choice import is_repeat, mean_difference
 from scopemap.io.opening import open_sequence
 from scopemap.io.video_format.interlacing import combing
+from scopemap.notices import Notice
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]
@@ -143,9 +144,7 @@ def test_the_calibration_beside_stereo_images_is_that_of_one_view(tmp_path: Path
 def test_interlaced_material_is_told_and_undone(tmp_path: Path) -> None:
     file = _video(tmp_path / "v.mp4", lambda number: woven(2 * number))
     told = open_sequence(file)
-    assert len(told.warnings) == 1
-    assert "interlaced" in told.warnings[0]
-    assert "--deinterlace" in told.warnings[0]
+    assert told.warnings == [Notice("input-interlaced")]
     undone = open_sequence(file, settings=InputSettings(deinterlace=True))
     assert undone.warnings == []
     assert any("deinterlaced" in note for note in undone.notes)

@@ -266,16 +266,12 @@ def test_the_submap_with_most_frames_comes_first(monkeypatch: pytest.MonkeyPatch
         assert counts == (5 if method == "none" else 4, expected[0][1], 45)
 
 
-@pytest.mark.parametrize(
-    ("elsewhere", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)]
-)
-def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(
-    elsewhere: bool, found: bool, split: bool
-) -> None:
+@pytest.mark.parametrize(("far", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)])
+def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(far: bool, found: bool, split: bool) -> None:
     mapper = Mapper(MappingSettings(), DisFlow())
     for number in range(10):
         after = number >= 4
-        at_mm = ((40.0 if elsewhere and after else -60.0) + 2 * number, 0.0, 0.0)
+        at_mm = ((40.0 if far and after else -60.0) + 2 * number, 0.0, 0.0)
         frame, pose = _keyframe(number, at_mm, Similarity.identity(), 1.0)
         if number == 4:
             mapper.observe(Track(10 * number - 5, "lost", "blur", frame.T_world_camera, 30))

@@ -108,7 +108,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return draw_run(tmp_path_factory.mktemp("measure") / "run", scale={"known": True, "source": "measured depth"})
+    return draw_run(
+        tmp_path_factory.mktemp("measure") / "run", scale={"known": True, "measured": True, "source": "measured depth"}
+    )
 
 
 def measured(capfd: pytest.CaptureFixture[str], run: Path, points: str, *more: object) -> dict[str, Any]:
@@ -169,7 +171,9 @@ def test_what_is_less_certain_has_a_wider_interval(
     camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     scale = {"known": True, "source": "near-far 5:80 mm"}
     stated = draw_run(tmp_path / "stated", scale=scale)
-    assumed = draw_run(tmp_path / "assumed", scale=scale, camera=camera | {"source": "assumed: 70 deg"})
+    assumed = draw_run(
+        tmp_path / "assumed", scale=scale, camera=camera | {"source": "assumed: 70 deg", "origin": "assumed"}
+    )
     assert width(known) < width(stated) < width(assumed)
     near = ((0.3, 30.0), (0.5, 30.0))  # two pixels apart
     assert width(known, pixels(*near)) > 2 * width(known)

@@ -1,7 +1,7 @@
 """Every setting of every stage, with unit and source; presets `default`, `paper`, `paper-strict`, `realtime`.
 
-Order of precedence: defaults < preset < TOML file < single settings (`--set tracking.huber=2`); the preset itself may
-be named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
+Order of precedence: defaults < preset < TOML file < single settings (`--set fusion.every=2`); the preset itself may be
+named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
 one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
 that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its constants (section "WEMA-RTDL"),
 so values are ours: those of the tracker were chosen by trial on the sequences of BENCHMARK.md; tau, the filter's
@@ -62,7 +62,7 @@ class Config(Settings):
     ) -> Config:
         """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
 
-        `settings` maps names such as "tracking.huber" to values or to their text. The preset is the one that they
+        `settings` maps names such as "fusion.every" to values or to their text. The preset is the one that they
         name, else `preset`, else the one that the file names. Raises `SettingsError`.
         """
         settings = settings or {}

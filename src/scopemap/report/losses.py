@@ -24,7 +24,7 @@ class LostSegment:
     @property
     def advice(self) -> str:
         """What the operator can do about it."""
-        return ADVICE[self.cause]
+        return ADVICE.get(self.cause, "")
 
     @property
     def size(self) -> str:
