@@ -15,7 +15,7 @@ from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
-from scopemap.pipeline import Estimators
+from scopemap.preprocessing import Estimators
 
 
 class SpyDepth:

@@ -18,7 +18,7 @@ from scopemap.cli.interruption import Interruption
 from scopemap.frame import Frame
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.submaps import Mapper, Submap
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.trajectory.formats.opening import read_trajectory
 
 STOPPED = FRAMES - 3

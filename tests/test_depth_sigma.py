@@ -26,7 +26,8 @@ from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3
 from scopemap.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
-from scopemap.pipeline import Estimators, Step
+from scopemap.odometry import Step
+from scopemap.preprocessing import Estimators
 from scopemap_bench.phantom.spec import PhantomSpec
 
 SHAPE = (48, 64)

@@ -22,7 +22,19 @@ SOURCE = ROOT / "src" / "scopemap"
 LAYERS = (
     *("errors", "notices", "plugins", "config", "cameras", "frame", "geometry", "trajectory", "io", "report"),
     *("masking", "flow", "depth", "tracking", "mapping", "fusion", "calibration"),
-    *("pipeline", "estimators", "reconstruction", "runner", "evaluation", "inspection", "actions", "cli"),
+    *(
+        "faults",
+        "preprocessing",
+        "odometry",
+        "pipeline",
+        "estimators",
+        "reconstruction",
+        "runner",
+        "evaluation",
+        "inspection",
+        "actions",
+        "cli",
+    ),
 )
 STAGES = {"masking", "flow", "depth", "tracking", "mapping", "fusion"}
 MAY_NOT_IMPORT = {"evaluation": STAGES | {"pipeline", "runner", "reconstruction"}}
@@ -176,7 +188,7 @@ CEILINGS = {
     "tests": (lambda: _total(TESTS), 40_700),
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 170),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 26_000),
-    "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 360),
+    "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 150),
     "settings": (lambda: len(setting_names()), 115),
 }
 
@@ -210,7 +222,7 @@ def test_nobody_but_the_front_door_imports_the_command_line() -> None:
 
 def test_the_layers_are_the_packages() -> None:
     assert {module.room for module in MODULES} == {*LAYERS, "__init__", "__main__"}
-    assert len(LAYERS) <= 25
+    assert len(LAYERS) <= 28
 
 
 def test_networks_are_imported_by_their_adapters_alone() -> None:
@@ -275,7 +287,7 @@ def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
     # With the typed notices and the causes of losses.
-    assert len(closure) <= 64, "\n".join(sorted(closure))
+    assert len(closure) <= 67, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

@@ -24,7 +24,8 @@ from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker, without_instruments
-from scopemap.pipeline import Pipeline, Step
+from scopemap.odometry import Step
+from scopemap.pipeline import Pipeline
 from scopemap.report.frame_pictures import FramePictures
 from training.export import export, read_network
 from training.network import ScopeNet

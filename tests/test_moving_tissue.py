@@ -24,7 +24,7 @@ from scopemap.fusion.seen_at import SeenAt
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3_exp
 from scopemap.io.decoding import read_decoded
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.runner.provenance import motion_notes
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.reprojection import nonrigidity

@@ -31,7 +31,7 @@ from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.rtdl import align
 from scopemap.tracking.tracker import Tracker

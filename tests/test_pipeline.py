@@ -24,7 +24,8 @@ from scopemap.errors import InputError, SettingsError, WeightsError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
-from scopemap.pipeline import Estimators, Step
+from scopemap.odometry import Step
+from scopemap.preprocessing import Estimators
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 from scopemap.trajectory.formats.opening import read_trajectory

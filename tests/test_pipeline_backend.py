@@ -15,7 +15,8 @@ from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.pipeline import Estimators, Step
+from scopemap.odometry import Step
+from scopemap.preprocessing import Estimators
 from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14

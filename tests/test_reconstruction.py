@@ -24,7 +24,7 @@ from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
 from scopemap.io.sequence import Sequence
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, FrameRecord
 from scopemap.trajectory.formats.opening import read_trajectory
 

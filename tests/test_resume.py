@@ -21,7 +21,8 @@ from scopemap.estimators import create_estimators
 from scopemap.io import result_folder
 from scopemap.io.checkpoint import CHECKPOINT
 from scopemap.io.result_folder import LOCK, UNFINISHED
-from scopemap.pipeline import Pipeline, Step
+from scopemap.odometry import Step
+from scopemap.pipeline import Pipeline
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.runner.checkpoints import Checkpoints, check_resumable, discard_unfinished, identity_of
 from scopemap.runner.run import Clock, Run
@@ -198,8 +199,8 @@ def test_frames_that_fail_between_the_states_of_two_stages_are_counted(
     checkpoints = Checkpoints(tmp_path, {}, runs[0])
     estimated = pipeline.estimate(frame)
     checkpoints.keep("preprocess")
-    monkeypatch.setattr(pipeline._matcher, "match", lambda *_, **__: 1 / 0)
-    monkeypatch.setattr(pipeline._tracker, "track", lambda _: 1 / 0)
+    monkeypatch.setattr(pipeline.matching._matcher, "match", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(pipeline.odometry._tracker, "track", lambda _: 1 / 0)
     matched = pipeline.match(estimated)
     checkpoints.keep("match")
     pipeline.track(matched)

@@ -26,7 +26,7 @@ from scopemap.io import weights
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.masking.mask_files import create_masks
-from scopemap.pipeline import Estimators
+from scopemap.preprocessing import Estimators
 from scopemap.tracking.alike import AlikeFeatures
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.features import FeatureDetector, SiftFeatures

@@ -33,7 +33,7 @@ from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.decoding import read_decoded, write_encoded
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.notices import Notice
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
 from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
 from scopemap.report.losses import LostSegment, losses

@@ -22,7 +22,7 @@ from scopemap.evaluation.poses import MatchedTrajectories, match, pose_report
 from scopemap.io.opening import open_sequence
 from scopemap.io.result_folder import check_result_folder
 from scopemap.io.sequence import Sequence
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.depth_figures import draw_depths
 from scopemap.report.frame_pictures import FramePictures

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from scopemap.pipeline import Step
+    from scopemap.odometry import Step
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

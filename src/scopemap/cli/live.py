@@ -19,7 +19,7 @@ from scopemap.cli.options import AsJson, CameraFile, Quiet, SetPairs, parse_near
 from scopemap.cli.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
-    from scopemap.pipeline import Step
+    from scopemap.odometry import Step
     from scopemap.report.frame_pictures import FramePictures
     from scopemap.runner.live import LiveSession
     from scopemap.runner.reconstructor import Reconstructor

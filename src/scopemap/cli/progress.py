@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 if TYPE_CHECKING:
-    from scopemap.pipeline import Step
+    from scopemap.odometry import Step
 
     _Show = Callable[[str, int, int | None, str, str], None]
     """Takes what is done, items done, all items or None, text after the bar, line where there is no terminal."""

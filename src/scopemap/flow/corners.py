@@ -77,7 +77,7 @@ class KeyframeMatcher:
     """
 
     def __init__(self, flow: FlowEstimator) -> None:
-        self._flow = flow
+        self.flow = flow
         self._keyframe: Frame | None = None
         self._flows: FlowPair | None = None
         self._patterns = np.zeros((0, 0), np.uint8)
@@ -109,7 +109,7 @@ class KeyframeMatcher:
         """Return the corners of the keyframe that are matched in a frame; None where the keyframe has none."""
         if self._keyframe is None or not len(self._corners):
             return None
-        enough_px = self._flow.enough_px
+        enough_px = self.flow.enough_px
         downscale = 1 if enough_px is None else max(1, max(frame.valid.shape) // enough_px)
         matched = np.zeros(0, int)
         if downscale > 1 and self._usual_coverage >= _SMALL_COVERAGE:
@@ -129,7 +129,7 @@ class KeyframeMatcher:
         size = (width // downscale, height // downscale)
         start = None if self._flows is None else (_flow_at(self._flows[0], size), _flow_at(self._flows[1], size))
         keyframe, current = _resized(self._keyframe.rgb, size), _resized(frame.rgb, size)
-        self._flows = self._flow.estimate_checked(keyframe, current, start)
+        self._flows = self.flow.estimate_checked(keyframe, current, start)
         whole = (_flow_at(self._flows[0], (width, height)), _flow_at(self._flows[1], (width, height)))
         return match_corners(self._corners, whole, frame.valid, _CONSISTENCY_PX)
 

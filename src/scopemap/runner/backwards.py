@@ -58,7 +58,7 @@ def _tracked_from(pipeline: Pipeline, start: Track, earlier: list[Track]) -> Ite
 
     It ends with some frames of an earlier map, or where frames of the same one come.
     """
-    tracker, store = pipeline.new_tracker(), pipeline.fusion.store
+    tracker, store = pipeline.odometry.new_tracker(), pipeline.fusion.store
     if tracker is None:
         return
     # The tracker's world is the first frame's camera.

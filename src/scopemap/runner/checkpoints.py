@@ -76,16 +76,16 @@ class Checkpoints:
         """Write the state after all frames, when no stage is at work; that of a short run is not worth it."""
         if time.perf_counter() < self._first_s:
             return
-        for stage in self._run.pipeline.STATES:
+        for stage in self._run.pipeline.stages:
             self.keep(stage)
         self.commit(last, complete=True)
 
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
         pipeline, facts = self._run.pipeline, self._file.facts
-        for stage in pipeline.STATES:
+        for stage, owner in pipeline.stages.items():
             for name, value in self._file.restore(stage, self._stage(stage)).items():
-                setattr(pipeline, name, value)
+                setattr(owner, name, value)
         found = self._file.restore("run", self._rest())
         for name in _RUN:
             setattr(self._run, name, found[name])
@@ -101,7 +101,8 @@ class Checkpoints:
         self._file.close()
 
     def _stage(self, stage: str) -> dict[str, Any]:
-        return {name: getattr(self._run.pipeline, name) for name in self._run.pipeline.STATES[stage]}
+        owner = self._run.pipeline.stages[stage]
+        return {name: getattr(owner, name) for name in owner.STATE}
 
     def _rest(self) -> dict[str, Any]:
         sequence = self._run.sequence

@@ -11,7 +11,7 @@ from scopemap.estimators import scale_facts
 from scopemap.frame import Frame
 from scopemap.fusion.frame_surface import frame_surface
 from scopemap.fusion.mesh_files import save_mesh
-from scopemap.pipeline import Estimators
+from scopemap.preprocessing import Estimators
 from scopemap.reconstruction import scale_words
 
 SURFACES = "surfaces"

@@ -19,7 +19,7 @@ from scopemap.fusion.mesh_files import save_mesh
 from scopemap.io.live import LiveSource
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner.preparation import Progress
 from scopemap.runner.provenance import Limits

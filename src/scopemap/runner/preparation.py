@@ -12,7 +12,7 @@ from scopemap.estimators import OwnEstimators, create_estimators
 from scopemap.frame import is_constant
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
-from scopemap.pipeline import Estimators
+from scopemap.preprocessing import Estimators
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""

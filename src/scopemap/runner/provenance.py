@@ -14,7 +14,7 @@ from scopemap.errors import InputError
 from scopemap.estimators import estimators_provenance, package_versions, scale_facts
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice, of_input
-from scopemap.pipeline import Estimators
+from scopemap.preprocessing import Estimators
 from scopemap.reconstruction import FrameRecord, frame_counts
 
 _MOVING_SHARE = 0.1  # of the picture: less may be chance, such as a few false matches

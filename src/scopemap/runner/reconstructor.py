@@ -20,7 +20,8 @@ from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import ASSUMED_RATE_HZ, Source
-from scopemap.pipeline import Pipeline, Step
+from scopemap.odometry import Step
+from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner.preparation import Progress, prepare
 from scopemap.runner.provenance import Limits

@@ -33,7 +33,8 @@ from scopemap.io.sequence import Sequence
 from scopemap.mapping.multiview_depth import KeyframeDepths
 from scopemap.mapping.submaps import FinalFrames, Submap
 from scopemap.notices import Notice
-from scopemap.pipeline import Pipeline, Step
+from scopemap.odometry import Step
+from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import (
     DepthWriter,
     FrameRecord,

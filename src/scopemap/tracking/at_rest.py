@@ -9,10 +9,10 @@ from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.tracking.reprojection import nonrigidity
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import FrameTracker, Track
 
 
-class CameraAtRest:
+class CameraAtRest(FrameTracker):
     """A `FrameTracker` that gives every frame the first pose, and measures where tissue moves.
 
     A frame is lost where too little of it is usable alone. flow : of the keyframe's corners; "none": motion is not

@@ -166,7 +166,7 @@ class Relocaliser:
     """Recent keyframes of the current map and of other maps, in which a lost camera is searched."""
 
     def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
-        self.settings, self._detector = settings, detector
+        self.settings, self.detector = settings, detector
         self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
         self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
@@ -203,7 +203,7 @@ class Relocaliser:
         """
         if self.settings.relocalisation_keyframes == 0:
             return None
-        current = self._detector.detect(replace(frame, depth_mm=None))
+        current = self.detector.detect(replace(frame, depth_mm=None))
         own = {keyframe.frame.index: keyframe for keyframe in (*(self._keyframes if recent else ()), *near)}
         groups = [own.values(), self._of_other_maps if other_maps else ()]
         searched = {keyframe.frame.index for group in groups for keyframe in group}
@@ -224,5 +224,5 @@ class Relocaliser:
         """Return the features of a keyframe, detected on first use: most clips never need them."""
         index = keyframe.frame.index
         if index not in self._features:
-            self._features[index] = self._detector.detect(keyframe.frame)
+            self._features[index] = self.detector.detect(keyframe.frame)
         return self._features[index]

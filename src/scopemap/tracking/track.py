@@ -101,7 +101,7 @@ def unusable(frame: Frame) -> TrackingLoss:
 
 
 class FrameTracker(Protocol):
-    """Protocol of trackers, which take frames in order: `Tracker` and the baselines' trackers."""
+    """Protocol of trackers, which take frames in order: `Tracker`, and those that derive from it, as baselines do."""
 
     def track(self, frame: Frame) -> Track:
         """Return the pose of a frame, whose `depth_mm` is its raw depth, or the reason why it is lost.
@@ -114,6 +114,14 @@ class FrameTracker(Protocol):
 
     def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Make a tracked frame, with its refined depth and its pose, the reference; False where it cannot be one."""
+
+    def remember(self, frame: Frame) -> bool:
+        """Take the last tracked frame, which is no keyframe; return whether later ones may be tracked against it."""
+        return False
+
+    def another(self) -> FrameTracker | None:
+        """Return a tracker that has seen no frame, to track lost frames anew; None where that is not possible."""
+        return None
 
 
 def motion_between(previous: Track | None, current: Track) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondence
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
 from scopemap.tracking.sharpness import SharpnessMonitor
-from scopemap.tracking.track import Status, Track, TrackingLoss, unusable
+from scopemap.tracking.track import FrameTracker, Status, Track, TrackingLoss, unusable
 from scopemap.trajectory.causes import LossCause
 
 _MAX_EXTRAPOLATION = 5  # frames for which the last motion is extrapolated after a loss
@@ -34,7 +34,7 @@ _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
-class Tracker:
+class Tracker(FrameTracker):
     """Tracks frames against keyframes.
 
     The first usable frame fixes the world. The pose is the one of the least reprojection error of the keyframe's
@@ -121,13 +121,19 @@ class Tracker:
             return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
         return self._accept(frame, self._keyframe, alignment, relocalised)
 
-    def remember(self, frame: Frame) -> None:
+    def remember(self, frame: Frame) -> bool:
         """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
 
         Where tissue moves further than flow follows, features still match successive frames. `Track.keyframe` is then
         the number of this frame, which is a keyframe from there on.
         """
         self._last = None if self._is_unsharp else frame
+        return True
+
+    def another(self) -> Tracker:
+        """Return a tracker with the same parts that has seen no frame."""
+        flow = None if self._matcher is None else self._matcher.flow
+        return Tracker(self.settings, flow, self._relocaliser.detector)
 
     def needs_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a keyframe."""

@@ -13,7 +13,7 @@ from scopemap.config import Config
 from scopemap.errors import SettingsError
 from scopemap.estimators import missing_weights
 from scopemap.io.sequence import Sequence
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.runner.run import reconstruct
 from scopemap.tracking.track import FrameTracker
 from scopemap_bench.methods.endo_depth_and_motion import create_endo_depth_and_motion

@@ -20,7 +20,7 @@ import numpy as np
 
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import FrameTracker, Track
 
 UNIT_MM = 100.0
 """Length of one Open3D unit, mm."""
@@ -53,7 +53,7 @@ class _Prepared(NamedTuple):
     data: Any
 
 
-class Open3dTracker:
+class Open3dTracker(FrameTracker):
     """A `FrameTracker` that aligns each frame to the last tracked one by an odometry of Open3D.
 
     Masked pixels and pixels of unknown depth are not used. Two runs agree to rounding, not to the last bit: Open3D's

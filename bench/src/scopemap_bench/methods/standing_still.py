@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.frame import Frame
-from scopemap.tracking.track import Track
+from scopemap.tracking.track import FrameTracker, Track
 
 _MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
 
 
-class StandingStill:
+class StandingStill(FrameTracker):
     """A `FrameTracker` that returns the first pose for every frame.
 
     Frames with too few usable pixels are lost, as they are for the other methods, so that coverage is comparable. A

@@ -25,7 +25,7 @@ from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.io.reference import read_reference
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.trajectory.trajectory import Trajectory
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

@@ -22,7 +22,8 @@ from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence
-from scopemap.pipeline import Pipeline, Step
+from scopemap.odometry import Step
+from scopemap.pipeline import Pipeline
 from scopemap.tracking.track import FrameTracker
 
 LEAST_SHARE = 0.1

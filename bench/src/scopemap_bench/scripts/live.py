@@ -23,7 +23,7 @@ import numpy as np
 from scopemap.config import Config
 from scopemap.io.live import LiveSource
 from scopemap.io.opening import open_sequence, sequence_of
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.runner.live import LiveSession, finished
 from scopemap.runner.reconstructor import Reconstructor
 

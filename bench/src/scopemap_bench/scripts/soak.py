@@ -25,7 +25,7 @@ import numpy as np
 from scopemap.config import Config
 from scopemap.io.checkpoint import SavedState
 from scopemap.io.opening import open_sequence
-from scopemap.pipeline import Step
+from scopemap.odometry import Step
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.runner.run import reconstruct
 

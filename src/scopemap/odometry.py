@@ -1,0 +1,157 @@
+"""Poses frame by frame: tracking against the keyframe (RTDL), depth refined with the motion known (MAPIS), keyframes.
+
+The preset `paper` refines before it tracks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from scopemap.config import Config
+from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.mapis import Mapis, RefinedDepth
+from scopemap.faults import StageFaults
+from scopemap.frame import Frame
+from scopemap.mapping.submaps import Mapper
+from scopemap.preprocessing import PreprocessedFrame, with_depth, without_depth
+from scopemap.tracking.relocalisation import RotationFollower
+from scopemap.tracking.smoothing import create_smoother
+from scopemap.tracking.track import FrameTracker, Track, motion_between
+from scopemap.trajectory.causes import LossCause
+
+
+@dataclass(frozen=True)
+class Step:
+    """All results for a frame; `frame` has refined depth and, unless it is lost, its pose as tracked.
+
+    raw_mm : of the frame's size. refined : of the size of the depth estimate.
+    """
+
+    frame: Frame
+    track: Track
+    raw_mm: np.ndarray
+    refined: RefinedDepth
+
+
+class Odometry:
+    """Tracks frames, in order, each once, and hands keyframes to the mapper."""
+
+    STATE: ClassVar = (
+        *("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame"),
+        *("faults", "_rotation"),
+    )
+    """What changes from frame to frame."""
+
+    def __init__(self, config: Config, tracker: FrameTracker, mapper: Mapper) -> None:
+        self._config, self._tracker, self.mapper = config, tracker, mapper
+        self._mapis = Mapis(config.mapis)
+        self._smooth = create_smoother(config.smoothing)
+        self._rotation = RotationFollower()
+        self._last_track: Track | None = None
+        self._last_frame: tuple[Frame, Track] | None = None
+        self.faults = StageFaults("tracking")
+
+    def track(self, preprocessed: PreprocessedFrame) -> Step:
+        """Track a frame, refine its depth, make it a keyframe where one is due; one with which that fails is lost."""
+        self.faults.frames += 1
+        try:
+            step = self._track(preprocessed)
+        except Exception as error:
+            step = self._lost(preprocessed, self.faults.noted(preprocessed.frame.index, error))
+        motion, quality = _motion(preprocessed.correspondence), preprocessed.frame.quality
+        track = replace(step.track, motion=motion, quality=quality)
+        track = self._rotation.follow(track, preprocessed.small, preprocessed.correspondence)
+        step = replace(step, track=track)
+        self.mapper.observe(step.track)
+        self._last_track = step.track
+        return step
+
+    def _track(self, preprocessed: PreprocessedFrame) -> Step:
+        refined = self._refine(preprocessed, None) if self._config.mapis.paper.order == "refine-first" else None
+        track, last = self._tracker.track(preprocessed.frame), self._last_track
+        if track.status == "lost" or (last is not None and last.map != track.map):
+            self._reset()
+        if np.isfinite(track.depth_ratio):
+            self._mapis.rescale(track.depth_ratio)
+        refined = refined or self._refine(preprocessed, motion_between(last, track))
+        frame = with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
+        frame = replace(frame, nonrigidity=track.nonrigidity)
+        if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
+            frame = replace(frame, depth_scale=refined.scale)
+        self._add_last_keyframe(track)
+        track = self._with_keyframe(track, frame, preprocessed)
+        if track.status == "lost":
+            self._reset()
+        else:
+            frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
+        if preprocessed.fault and track.status == "lost":
+            track = replace(track, cause=preprocessed.fault.cause, reason=preprocessed.fault.reason)
+        return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
+
+    def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
+        """Return the step of a frame that could not be tracked, without depth."""
+        self._reset()
+        frame, last = preprocessed.frame, self._last_track
+        if last is None:
+            track = Track(frame.index, "lost", reason, np.eye(4), frame.index, cause=LossCause.OTHER)
+        else:
+            track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
+            track = replace(track, cause=LossCause.OTHER)
+        blind, unknown_mm = without_depth(frame), np.asarray(without_depth(preprocessed.small).depth_mm)
+        return Step(blind, track, np.asarray(blind.depth_mm), RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm))
+
+    def new_tracker(self) -> FrameTracker | None:
+        """Return a tracker that has seen no frame, to track lost frames anew; None where the tracker cannot."""
+        return self._tracker.another()
+
+    def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
+        raw = preprocessed.small
+        return self._mapis.refine(
+            np.asarray(raw.depth_mm),
+            preprocessed.kind,
+            raw.camera,
+            preprocessed.correspondence,
+            T_current_previous,
+            sigma_mm=raw.depth_sigma_mm,
+            anchored=preprocessed.anchored,
+        )
+
+    def _reset(self) -> None:
+        """Forget earlier frames: their relative pose is unknown."""
+        self._mapis.reset()
+        self._smooth.reset()
+
+    def _add_last_keyframe(self, track: Track) -> None:
+        """Hand on the frame that was tracked last where the tracker made it the keyframe of this one."""
+        if track.status == "ok" and self._last_frame is not None and self._last_frame[1].index == track.keyframe:
+            self.mapper.add_keyframe(*self._last_frame)
+            self._last_frame = None
+
+    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> Track:
+        """Make a frame the keyframe where one is due; the first one of a map that cannot be one is lost."""
+        if track.status == "lost":
+            return track
+        keyframe, kind = replace(frame, T_world_camera=track.T_world_camera), preprocessed.kind
+        if not self._tracker.needs_keyframe():
+            if kind != "measured" and self._tracker.remember(keyframe):
+                self._last_frame = keyframe, track
+            return track
+        measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
+        inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
+        if inserted and kind != "measured":  # with measured depth tracking alone is better
+            self.mapper.add_keyframe(keyframe, track)
+        if track.status == "initial" and not inserted:
+            unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
+            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER)
+        return track
+
+
+def _motion(correspondence: DenseCorrespondence | None) -> float:
+    """Return the median flow since the frame before, share of the width."""
+    if correspondence is None:
+        return float("nan")
+    flow = correspondence.to_previous[::4, ::4]
+    return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / correspondence.to_previous.shape[1]

@@ -1,0 +1,138 @@
+"""What needs no motion: masks, raw metric depth, and the correspondence with the previous frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from scopemap.config import Config
+from scopemap.depth.anchor import AnchoredDepth, depth_downscale
+from scopemap.depth.correspondence import DenseCorrespondence, DenseMatcher
+from scopemap.depth.estimate import DepthEstimator, DepthKind, PerceptualDistance
+from scopemap.depth.mapis import Mapis
+from scopemap.faults import StageFaults
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.frame import Frame
+from scopemap.geometry.warp import resampled
+from scopemap.masking.masker import Masker, StoredMasks, without_instruments
+from scopemap.tracking.features import FeatureDetector, SiftFeatures
+from scopemap.tracking.sharpness import PictureQuality
+from scopemap.tracking.track import FrameTracker, TrackingLoss
+from scopemap.trajectory.causes import LossCause
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """The interchangeable parts that look at images; a flow is not thread-safe, so each thread has its own."""
+
+    depth: DepthEstimator
+    anchor: AnchoredDepth
+    flow: FlowEstimator  # between successive frames
+    corner_flow: FlowEstimator  # of the keyframe's corners, in tracking
+    keyframe_flow: FlowEstimator  # between keyframes, in mapping
+    perceptual: PerceptualDistance
+    masks: StoredMasks | None = None
+    features: FeatureDetector = field(default_factory=SiftFeatures)
+    tracker: Callable[[], FrameTracker] | None = None  # makes what tracks in place of `Tracker`
+
+
+@dataclass(frozen=True)
+class PreprocessedFrame:
+    """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale.
+
+    small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth.downscale`.
+    depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
+    """
+
+    frame: Frame
+    small: Frame
+    kind: DepthKind
+    correspondence: DenseCorrespondence | None
+    anchored: bool
+    depth_note: str = ""
+    fault: TrackingLoss | None = None
+
+
+class Preprocessing:
+    """Masks frames and estimates their raw depth, in order, each once."""
+
+    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults")
+    """What changes from frame to frame."""
+
+    def __init__(self, config: Config, estimators: Estimators) -> None:
+        self._config, self.estimators = config, estimators
+        self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
+        self.faults = StageFaults("depth")
+
+    def estimate(self, frame: Frame) -> PreprocessedFrame:
+        """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
+        try:
+            return self._estimate(frame)
+        except Exception as error:
+            fault = TrackingLoss(LossCause.OTHER, self.faults.noted(frame.index, error))
+            blind = without_depth(frame)
+            small = without_depth(blind.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape))))
+            return PreprocessedFrame(blind, small, "measured", None, False, fault=fault)
+
+    def _estimate(self, frame: Frame) -> PreprocessedFrame:
+        self.faults.frames += 1
+        frame = self._masker(frame)
+        frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
+        # A frame that the tracker refuses must not fix the scale of depth.
+        usable = frame.valid.mean() >= self._config.tracking.min_valid_share
+        small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
+        shown = small if usable else replace(small, valid=np.zeros_like(small.valid))
+        estimate = self.estimators.depth.estimate(shown)
+        if usable and estimate.kind != "measured" and not np.isfinite(estimate.values).any():
+            self.faults.has_no_depth(frame.index)
+        fault, instruments = None, self._masker.instruments(estimate.instruments)
+        if instruments is not None:
+            # An instrument's depth is of no use, and what is behind it is not known.
+            unknown = np.where(instruments, np.float32(np.nan), np.float32(1))
+            sigma = None if estimate.sigma is None else estimate.sigma * unknown
+            estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
+            frame, small, shown = (without_instruments(seen, instruments) for seen in (frame, small, shown))
+            if usable and frame.valid.mean() < self._config.tracking.min_valid_share:
+                left = f"only {frame.valid.mean():.0%} of the image is usable"
+                fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
+        raw = self.estimators.anchor.metric(estimate, shown)
+        small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
+        frame, fitted = with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
+        return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
+
+
+class Matching:
+    """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
+
+    STATE: ClassVar = ("_matcher", "faults")
+    """What changes from frame to frame."""
+
+    def __init__(self, config: Config, estimators: Estimators) -> None:
+        self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
+        self._needs_previous = Mapis(config.mapis).needs_previous
+        self.faults = StageFaults("flow")
+
+    def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:
+        """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""
+        frame, wanted = estimated.small, self._needs_previous(estimated.kind)
+        self.faults.frames += 1
+        try:
+            return replace(estimated, correspondence=self._matcher.match(frame.rgb, frame.valid, wanted=wanted))
+        except Exception as error:
+            fault = TrackingLoss(LossCause.OTHER, self.faults.noted(frame.index, error))
+            return replace(estimated, fault=fault)
+
+
+def without_depth(frame: Frame) -> Frame:
+    """Return a frame without a usable pixel, and with unknown depth."""
+    nowhere, unknown_mm = np.zeros_like(frame.valid), np.full(frame.valid.shape, np.nan, np.float32)
+    return replace(frame, valid=nowhere, depth_mm=unknown_mm, depth_sigma_mm=None)
+
+
+def with_depth(frame: Frame, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> Frame:
+    """Return a frame with depth, and its standard deviation where there is one, from any size to the frame's."""
+    sigma_mm = None if sigma_mm is None else resampled(sigma_mm, frame.camera)
+    return replace(frame, depth_mm=resampled(depth_mm, frame.camera), depth_sigma_mm=sigma_mm)
