@@ -23,7 +23,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping.submaps import Submap
 from scopemap.reconstruction import FrameRecord, frame_counts
-from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
+from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun, run_of
 from scopemap.report.losses import losses
 from scopemap.report.verdict import verdict
 from scopemap.runner.records import records_of
@@ -196,7 +196,7 @@ def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.status, result.trajectory.status)
     np.testing.assert_allclose(found.T_world_camera, result.trajectory.T_world_camera, atol=2e-6)
     assert found.tracked.tolist() == [True] * 3 + [False] * 3 + [True, False]
-    assert result.kept().place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
+    assert run_of(result).place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
 
 
 def test_the_report_tells_them_from_other_lost_frames() -> None:

@@ -16,7 +16,7 @@ from scopemap.cli.app import app
 from scopemap.config import PRESETS, setting_names
 from scopemap.io.opening import readers
 from scopemap.io.weights import REGISTRY
-from scopemap.reconstruction import _COLUMNS
+from scopemap.reconstruction import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")])
@@ -85,7 +85,7 @@ def test_reproducing_names_plans_and_weights_that_exist() -> None:
 
 def test_the_columns_of_frames_csv_are_documented() -> None:
     table = _text("docs/formats.md").split("### frames.csv")[1].split("## What goes in")[0]
-    assert re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) == list(_COLUMNS)
+    assert re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE) == list(COLUMNS)
 
 
 def test_every_data_set_is_documented() -> None:

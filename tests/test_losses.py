@@ -12,6 +12,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.frame import Frame
 from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
+from scopemap.report.kept_run import run_of as run_of_result
 from scopemap.report.losses import in_words, losses
 from scopemap.tracking.track import Status, Track, unusable
 from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
@@ -89,7 +90,7 @@ def test_black_frames_of_a_phantom_are_too_dark_and_motion_is_measured(tmp_path:
     spec = PhantomSpec(frames=8, width=96, height=80, seed=3, events=parse_events("black:4-5"))
     write_phantom(spec, tmp_path / "phantom")
     result = reconstruct(open_sequence(tmp_path / "phantom"), Config.load(settings={"mapping.method": "none"}))
-    (loss,) = result.losses
+    (loss,) = losses(run_of_result(result))
     assert (loss.first, loss.last, loss.cause) == (4, 5, "too dark")
     seen = [record.track for record in result.records]
     assert all(0.0 < one.motion < 0.05 and 0.3 < one.sharpness < 3 for one in seen[1:4])

@@ -31,6 +31,7 @@ from scopemap.mapping.map_merging import split_maps
 from scopemap.mapping.reprojection import BundleProblem
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.reconstruction import DepthReader
+from scopemap.report.kept_run import run_of
 from scopemap.report.submap_summaries import submaps_in_time
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
@@ -133,7 +134,7 @@ def test_the_summary_has_the_maps_in_order_of_time(result: Reconstruction) -> No
     assert line.index("maps/1 with") < line.index("the result with")
     assert f"maps/1 with {FIRST} frames (0 to {FIRST - 1}, " in line
     doubtful = next(line for line in summary_lines(result) if line.startswith("most doubtful map"))
-    submaps = {submap.name: submap.inlier_share for submap in submaps_in_time(result.kept())}
+    submaps = {submap.name: submap.inlier_share for submap in submaps_in_time(run_of(result))}
     assert doubtful.startswith(f"most doubtful map: {min(submaps, key=lambda name: submaps[name])}, frames ")
 
 

@@ -25,7 +25,7 @@ from scopemap.fusion.volume import TsdfVolume
 from scopemap.geometry.se3 import se3_exp
 from scopemap.io.decoding import read_decoded
 from scopemap.odometry import Step
-from scopemap.runner.provenance import motion_notes
+from scopemap.runner.provenance import motion_notices
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.reprojection import nonrigidity
 from scopemap.tracking.track import MOVING_SIGMAS, Track
@@ -241,8 +241,9 @@ def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
 
 
 def test_notes_say_that_the_camera_was_stated_to_be_at_rest() -> None:
-    assert motion_notes([], Config()) == []
-    assert "at rest, as stated" in motion_notes([], Config.load(settings={"tracking.camera_at_rest": True}))[0]
+    assert motion_notices([], Config()) == []
+    (notice,) = motion_notices([], Config.load(settings={"tracking.camera_at_rest": True}))
+    assert notice.code == "camera-at-rest-stated"
 
 
 def _states() -> list[Frame]:
@@ -277,7 +278,7 @@ def test_the_surface_as_seen_at_a_second_has_no_other_state(at_s: float, expecte
     assert len(right) > 1000
     np.testing.assert_allclose(np.percentile(right, [1, 99]), expected_mm, atol=1.0)
     np.testing.assert_allclose(left, 60.0, atol=0.2)
-    assert f"second {at_s:g}" in seen_at.note
+    assert f"second {at_s:g}" in seen_at.notice.text
     # All frames count where nothing moves, and without a time the states are all there.
     assert all(frame.weight is None or frame.weight[120, 40] == 1.0 for frame in weighted)
     assert np.ptp(_fused(frames)[:, 2]) > 15.0
@@ -287,4 +288,4 @@ def test_where_nothing_moves_every_frame_counts() -> None:
     still = [replace(frame, nonrigidity=np.zeros(REGIONS, np.float32)) for frame in _states()]
     seen_at = SeenAt(still, 9.0, 8.0)
     assert all(seen_at.weighted(frame).weight is None for frame in still)
-    assert "nowhere" in seen_at.note
+    assert "nowhere" in seen_at.notice.text

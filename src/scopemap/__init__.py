@@ -124,4 +124,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'scopemap' has no attribute '{name}'")
     from importlib import import_module
 
+    if name in ("Reconstruction", "Reconstructor", "reconstruct"):
+        import_module("scopemap.report.notebook")  # results then show their verdict
+
     return getattr(import_module(f"scopemap.{_HOMES[name]}"), name)

@@ -9,15 +9,12 @@ out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frame
 from __future__ import annotations
 
 import csv
-import html
 import json
 import math
-from base64 import b64encode
 from collections import Counter
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -34,12 +31,6 @@ from scopemap.io.decoding import read_decoded, write_encoded
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.notices import Notice
 from scopemap.odometry import Step
-from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun
-from scopemap.report.kept_run import OTHER_MAP as OTHER_PLACE
-from scopemap.report.losses import LostSegment, losses
-from scopemap.report.page_data import shown_meshes
-from scopemap.report.summary_picture import summary_picture
-from scopemap.report.verdict import verdict
 from scopemap.tracking.track import Track
 from scopemap.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, TRACKED, Trajectory, write_tum
 
@@ -51,13 +42,13 @@ _FEW_FRAMES = 5
 _PREVIEW_SHARES = (0.01, 0.99)  # of all known depth, at the ends of the colours
 # Standard deviations in 8 bits: shares of depth from 0.1 % to 180 % in steps of 3 %; 0 = unknown.
 _LEAST_SIGMA, _SIGMA_STEP = 0.001, 1.03
-_SHOWN_FACES = 100_000
-_COLUMNS = [
+COLUMNS = [
     *("index", "time_s", "name", "status", "reason", "map", "keyframe", "residual", "inlier_share", "correlation"),
     *("overlap", "iterations"),
     *("depth_scale", "warped_share", "usable", "sharpness", "motion", "quality", "cause", "orientation"),
     *("moving_share", "moving_x", "moving_y"),
 ]
+"""The columns of frames.csv."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +115,7 @@ def _quaternion(R: np.ndarray) -> str:
 def _skipped_row(frame: SkippedFrame) -> list[str]:
     """Return the columns of frames.csv as text for a frame that was not used."""
     known = [str(frame.index), f"{frame.time_s:.6f}", frame.name, SKIPPED, frame.reason]
-    return known + [""] * (len(_COLUMNS) - len(known))
+    return known + [""] * (len(COLUMNS) - len(known))
 
 
 def frame_counts(records: list[FrameRecord]) -> dict[str, int]:
@@ -157,6 +148,20 @@ def scale_words(scale: dict[str, Any]) -> str:
     return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"
 
 
+class ResultView(Protocol):
+    """How a result shows itself."""
+
+    def sentence(self, result: Reconstruction) -> str:
+        """Return the result in one line."""
+
+    def html(self, result: Reconstruction) -> str:
+        """Return the result for a notebook."""
+
+
+VIEWS: list[ResultView] = []
+"""The last one shows results; the reports add one (`scopemap.report.notebook`), since a result knows no page."""
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """The result of a run.
@@ -186,33 +191,15 @@ class Reconstruction:
     others: list[Reconstruction] = field(default_factory=list)
 
     def __repr__(self) -> str:
-        return f"<Reconstruction, {verdict(self.kept()).word}: {verdict(self.kept()).sentence}>"
+        if VIEWS:
+            return VIEWS[-1].sentence(self)
+        counts = frame_counts(self.records)
+        return (
+            f"<Reconstruction, {counts['tracked']} of {counts['frames']} frames tracked, {len(self.mesh.faces)} faces>"
+        )
 
-    def _repr_html_(self) -> str:
-        """Return the summary picture for a notebook."""
-        kept, file = self.kept(), BytesIO()
-        summary_picture(kept, shown_meshes(kept, _SHOWN_FACES)).save(file, "JPEG", quality=88)
-        picture, words = b64encode(file.getvalue()).decode(), html.escape(repr(self))
-        return f'<p>{words}</p><img alt="{words}" src="data:image/jpeg;base64,{picture}" style="max-width: 100%">'
-
-    def kept(self) -> KeptRun:
-        """Return this result in the form that reports are made from."""
-        maps = []
-        for result in (self, *self.others):
-            known = result.trajectory.rows(result.trajectory.tracked)
-            maps.append(KeptMap(known.indices, known.T_world_camera, result.mesh))
-        outside = {"lost": LOST, ROTATION_ONLY: ROTATED, OTHER_MAP: OTHER_PLACE}
-        # A submap is the result of its own report, whatever its number.
-        tracked = [record.T_world_camera is not None for record in self.records]
-        elsewhere = [record.map or outside.get(record.track.status, 0) for record in self.records]
-        places = np.where(tracked, 0, elsewhere)
-        rows = [dict(zip(_COLUMNS, record.row(), strict=True)) for record in self.records]
-        return KeptRun(None, rows, maps, places.astype(np.int64), self.provenance)
-
-    @property
-    def losses(self) -> list[LostSegment]:
-        """The segments of lost frames, with their causes."""
-        return losses(self.kept())
+    def _repr_html_(self) -> str | None:
+        return VIEWS[-1].html(self) if VIEWS else None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -251,7 +238,7 @@ class Reconstruction:
             rows = [*map(FrameRecord.row, self.records), *map(_skipped_row, self.skipped)]
             # A file's name may hold bytes that are no UTF-8.
             with (folder / "frames.csv").open("w", newline="", encoding="utf-8", errors="replace") as file:
-                csv.writer(file).writerows([_COLUMNS, *sorted(rows, key=lambda row: int(row[0]))])
+                csv.writer(file).writerows([COLUMNS, *sorted(rows, key=lambda row: int(row[0]))])
             (folder / "config.toml").write_text(self.config.toml(), encoding="utf-8")
             provenance = json.dumps(self.provenance, indent=2) + "\n"
             (folder / "provenance.json").write_text(provenance, encoding="utf-8")

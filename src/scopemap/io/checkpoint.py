@@ -15,6 +15,7 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from enum import Enum
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -168,6 +169,8 @@ class _Writer:
     def tree(self, value: Any) -> Any:
         if value is None or type(value) in (bool, int, float, str):
             return value
+        if isinstance(value, Enum):
+            return {"member": value.value, "of": _name_of(type(value))}
         if isinstance(value, np.generic):
             return {"scalar": value.dtype.str, "hex": value.tobytes().hex()}
         if isinstance(value, type):
@@ -216,6 +219,8 @@ class _Reader:
             return now
         if "again" in tree:
             return self._met[tree["again"]]
+        if "member" in tree:
+            return _class_of(tree["of"])(tree["member"])
         if "scalar" in tree:
             return np.frombuffer(bytes.fromhex(tree["hex"]), tree["scalar"])[0]
         if "class" in tree:

@@ -15,9 +15,11 @@ import trimesh
 
 from scopemap.errors import InputError, reporting
 from scopemap.io.decoding import read_decoded
+from scopemap.reconstruction import COLUMNS, Reconstruction
 from scopemap.report.frame_pictures import picture_file, pictured_frames, read_measures
 from scopemap.trajectory.formats.folders import submap_folders
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.trajectory import OTHER_MAP as TRACKED_ELSEWHERE
 from scopemap.trajectory.trajectory import ROTATION_ONLY, SKIPPED, Trajectory
 
 LOST, OTHER_MAP, NOT_USED, ROTATED = -1, -2, -3, -4
@@ -87,6 +89,21 @@ class KeptRun:
         with reporting(f"cannot read {description}"):
             scale_mm = np.float32(json.loads(description.read_text(encoding="utf-8"))["scale_mm"])
         return np.where(image > 0, image * scale_mm, np.float32(np.nan))
+
+
+def run_of(result: Reconstruction) -> KeptRun:
+    """Return a result in memory in the form that reports are made from."""
+    maps = []
+    for one in (result, *result.others):
+        known = one.trajectory.rows(one.trajectory.tracked)
+        maps.append(KeptMap(known.indices, known.T_world_camera, one.mesh))
+    outside = {"lost": LOST, ROTATION_ONLY: ROTATED, TRACKED_ELSEWHERE: OTHER_MAP}
+    # A submap is the result of its own report, whatever its number.
+    tracked = [record.T_world_camera is not None for record in result.records]
+    elsewhere = [record.map or outside.get(record.track.status, 0) for record in result.records]
+    places = np.where(tracked, 0, elsewhere)
+    rows = [dict(zip(COLUMNS, record.row(), strict=True)) for record in result.records]
+    return KeptRun(None, rows, maps, places.astype(np.int64), result.provenance)
 
 
 def is_run(folder: Path) -> bool:
