@@ -350,7 +350,7 @@ def test_few_frames_are_held_and_compared_over_three_lags() -> None:
 
 
 def test_the_documents_name_every_code() -> None:
-    room = ROOT / "src" / "scopemap" / "io" / "datasets"
+    room = ROOT / "bench" / "src" / "scopemap_bench" / "datasets"
     text = "".join((room / name).read_text() for name in ("checking.py", "pose_depth.py"))
     heads = "camera|depth|frame|number|pose|poses|reading|time|truth"
     codes = set(re.findall(rf'"((?:{heads})-[a-z-]+)"', text)) | {"refused", "source", "assumed"}

@@ -130,7 +130,7 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
     done = corrected_frame(frame, correction)
     assert done.depth_sigma_mm is not None
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
-    assert "corrected by 22 %" in correction.notice.text
+    assert "corrected by 22%" in correction.notice.text
 
 
 def _bent(number: int) -> Frame:

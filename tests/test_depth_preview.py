@@ -74,7 +74,11 @@ def test_without_depth_there_is_no_preview(tmp_path: Path) -> None:
 
 
 def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out: Path) -> None:
-    assert result.provenance["scale"] == {"known": False, "source": "millimetres as scopenet gives them"}
+    assert result.provenance["scale"] == {
+        "known": False,
+        "measured": False,
+        "source": "millimetres as scopenet gives them",
+    }
     assert scale_words(result.provenance["scale"]) == UNKNOWN
     lines = summary_lines(result)
     assert lines[0].endswith("(scale unknown)")
@@ -112,4 +116,4 @@ def test_what_is_anchored_is_known(images: Sequence, settings: dict[str, object]
 def test_depth_of_a_run_of_unknown_scale_is_not_measured(images: Sequence, result: Reconstruction, out: Path) -> None:
     settings = {"input.focal": "assume", "fusion.enabled": False, "depth.backend": f"files:{out / 'depth'}"}
     facts = reconstruct(images, Config.load(settings=settings)).provenance["scale"]
-    assert facts == {"known": False, "source": "measured depth of unknown unit"}
+    assert facts == {"known": False, "measured": False, "source": "measured depth of unknown unit"}

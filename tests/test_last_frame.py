@@ -15,6 +15,7 @@ from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.tracking.acceptance import is_obscured
 from scopemap.tracking.alike import AlikeFeatures
 from scopemap.tracking.rtdl import Alignment, Motion
 from scopemap.tracking.track import Track
@@ -82,7 +83,7 @@ def test_flow_is_searched_from_the_guessed_motion() -> None:
 )
 def test_features_that_match_tell_a_bare_wall_from_smoke(sharpness: float, matches: int, obscured: bool) -> None:
     alignment = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 1.0, 0.5, 0.3, 1.0, 0.9, 5, matches=matches)
-    assert Tracker(SETTINGS)._is_obscured(sharpness, alignment) == obscured
+    assert is_obscured(sharpness, alignment, SETTINGS.min_sharpness) == obscured
 
 
 def test_unknown_depth_gives_no_start() -> None:

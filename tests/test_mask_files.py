@@ -73,14 +73,14 @@ def test_a_frame_without_a_mask_has_none(tmp_path: Path) -> None:
 
 def test_masks_that_fit_no_frame_are_told(tmp_path: Path) -> None:
     masks = MaskFiles(write_masks(tmp_path / "masks", {"900.png": left_half(), "2.png": left_half()}), RECTIFIER)
-    assert masks.warnings == []
+    assert masks.notices == []
     for index in (0, 1, 2):
         masks.covered(index)
     assert masks.provenance()["masks"].endswith("; 1 of 3 frames have one")
-    (warning,) = masks.warnings
-    assert "2 of 3 frames have none" in warning
+    (notice,) = masks.notices
+    assert (notice.code, notice.values["missing"], notice.values["frames"]) == ("masks-missing", 2, 3)
     masks.covered(900)
-    assert masks.warnings == []
+    assert masks.notices == []
 
 
 def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_the_only_image_without_a_number_is_for_all_frames(tmp_path: Path) -> No
         assert covered[:, :160].all()
         assert not covered[:, 160:].any()
     assert masks.provenance()["masks"].endswith("mask.png, for all frames")
-    assert masks.warnings == []
+    assert masks.notices == []
     assert cv2.imwrite(str(tmp_path / "masks" / "7.png"), left_half())
     numbered = MaskFiles(tmp_path / "masks", RECTIFIER)
     assert numbered.covered(7) is not None

@@ -113,7 +113,7 @@ def test_what_is_known_of_the_camera_is_said(sequence: Sequence) -> None:
     source = sequence.source
     assert (source.camera is None) == (not sequence.calibrated)
     assert sequence.camera_source
-    assert all(isinstance(text, str) and text for text in [*sequence.notes, *sequence.warnings])
+    assert all(str(said) for said in [*sequence.notes, *sequence.warnings])
     if source.masks is not None:
         masks = MaskFiles(source.masks, sequence.rectifier)
         assert any(masks.covered(frame.index) is not None for frame in sequence.frames())

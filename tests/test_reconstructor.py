@@ -160,8 +160,6 @@ def test_own_parts_without_a_kind_or_a_function_are_refused() -> None:
         Reconstructor(None, CAMERA, depth=_flat)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="expected a function of two pictures, got str"):
         Reconstructor(None, CAMERA, flow="dis")  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="give a number"):
-        Reconstructor(Config.load(settings={"depth.exponent": "fit"}), CAMERA)
 
 
 def test_pictures_that_do_not_fit_are_refused() -> None:

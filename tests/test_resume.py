@@ -208,8 +208,8 @@ def test_frames_that_fail_between_the_states_of_two_stages_are_counted(
     checkpoints.commit(frame.index)
     checkpoints.close()
     Checkpoints(tmp_path, {}, runs[1]).restore()
-    assert runs[1].pipeline.warnings == pipeline.warnings
-    assert pipeline.warnings[0].startswith("2 frame(s) could not be processed")
+    assert runs[1].pipeline.notices == pipeline.notices
+    assert (pipeline.notices[0].code, pipeline.notices[0].values["frames"]) == ("frames-failed", 2)
 
 
 def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path: Path) -> None:

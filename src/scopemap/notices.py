@@ -86,7 +86,12 @@ KINDS: dict[str, _Kind] = {
         "frame {most}: {share:.0%}, around {x:.2f} of the width and {y:.2f} of the height",
         "Tissue moves on its own in {frames} of {measured} frames",
     ),
-    "mapping-adjusted": _Kind("info", "mapping: {text}"),
+    "mapping-adjusted": _Kind(
+        "info",
+        "mapping: {keyframes} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg, {loops} loops closed in "
+        "{maps} map(s); reprojection errors {sigma_px:.2f} px (robust standard deviation); depth corrected by "
+        "{depth_change:.0%} on average",
+    ),
     "mapping-without-observations": _Kind(
         "info", "mapping: poses are as tracked; the {keyframes} keyframes have no common observations"
     ),
@@ -100,7 +105,11 @@ KINDS: dict[str, _Kind] = {
         "mapping: poses are as tracked{merged}; depths of keyframes would disagree by {adjusted:.0%}, as tracked by "
         "{tracked:.0%}",
     ),
-    "depth-triangulated": _Kind("info", "depth: {triangulated} of {keyframes} keyframes triangulated{rest}"),
+    "depth-triangulated": _Kind(
+        "info",
+        "depth: {triangulated} of {keyframes} keyframes triangulated against frames around them; where views disagree "
+        "(moving tissue, uncertain poses) or are too few the predicted depth stays",
+    ),
     "fusion-scaled": _Kind(
         "info",
         "fusion: voxels of {voxel_mm:g} mm, 1/{divisor} of the clip's median depth, and depth up to {max_depth_mm:g} "

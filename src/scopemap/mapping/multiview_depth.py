@@ -210,10 +210,7 @@ class KeyframeDepths:
     @property
     def notice(self) -> Notice:
         """How many keyframes were triangulated; complete after the last frame."""
-        rest = "; the others keep the predicted depth: views disagree (moving tissue, uncertain poses) or are too few"
-        rest = " against frames around them" + (rest if self.triangulated < len(self.keyframes) else "")
-        counts = {"triangulated": self.triangulated, "keyframes": len(self.keyframes)}
-        return Notice("depth-triangulated", counts | {"rest": rest})
+        return Notice("depth-triangulated", {"triangulated": self.triangulated, "keyframes": len(self.keyframes)})
 
     def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
         rgb, depth_mm = view(index)

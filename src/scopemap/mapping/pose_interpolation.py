@@ -71,14 +71,11 @@ class FrameCorrection:
             by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
             return Notice(self.refused.code, self.refused.values | {"merged": by_loops})
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
-        text = f"{len(self.index)} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg"
-        text += f", {self.loops} loops closed" if self.loops else ""
-        text += f", {len(self.S_common_map)} maps merged" if len(self.S_common_map) > 1 else ""
-        text += f"; reprojection errors {self.sigma_px:.2f} px (robust standard deviation)"
-        if self.depth_fields:
-            typical = np.median([np.abs(depth_field.values).mean() for depth_field in self.depth_fields])
-            text += f"; depth corrected by {100 * np.expm1(typical):.0f} % on average"
-        return Notice("mapping-adjusted", {"text": text})
+        changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
+        facts: dict[str, float] = {"keyframes": len(self.index), "loops": self.loops}
+        facts["maps"] = max(len(self.S_common_map), 1)
+        facts |= {"rotation_deg": float(rotation_deg), "sigma_px": float(self.sigma_px)}
+        return Notice("mapping-adjusted", facts | {"depth_change": float(np.expm1(np.median(changes or [0.0])))})
 
     def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
         """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""

@@ -87,10 +87,8 @@ def loop(folder: Path) -> list[str]:
             poses = result.trajectory.T_world_camera
             off = inverse(poses[0]) @ poses[-1]
             report = pose_report(match(result.trajectory, read_trajectory(source), "sim3"))
-            told = next(
-                (notice["text"] for notice in result.provenance["notices"] if notice["code"] == "mapping-adjusted"), ""
-            )
-            closed = told.split(" loops closed")[0].split()[-1]
+            adjusted = [one for one in result.provenance["notices"] if one["code"] == "mapping-adjusted"]
+            closed = adjusted[0]["values"]["loops"] if adjusted else 0
             rows.append(
                 f"| {scene}, {name} | {closed} | {np.linalg.norm(off[:3, 3]):.2f} / "
                 f"{np.degrees(rotation_angle_rad(off[:3, :3])):.2f} | {report['ate_rmse_mm']:.3f} "
