@@ -44,15 +44,26 @@ _WORDS = (
 )
 
 
+def _wanted() -> tuple[list[str], dict[str, list[str]]]:
+    """Return what the core needs, and what each extra and the package scopemap-bench need besides."""
+    files = (ROOT / "pyproject.toml", ROOT / "bench" / "pyproject.toml")
+    core, bench = (tomllib.loads(file.read_text(encoding="utf-8"))["project"] for file in files)
+    return core["dependencies"], {
+        **core["optional-dependencies"],
+        "bench": bench["dependencies"],
+        **bench["optional-dependencies"],
+    }
+
+
 def dependencies(extra: str = "") -> dict[str, str]:
     """Return the licence of each package that the core needs, or an extra besides, by name; those installed here."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = project["optional-dependencies"][extra] if extra else project["dependencies"]
+    core, extras = _wanted()
+    wanted = extras[extra] if extra else core
     todo, found = [Requirement(text) for text in wanted], dict[str, str]()
     while todo:
         one = todo.pop()
         name = re.sub(r"[-_.]+", "-", one.name).lower()
-        if name == "scopemap" or (name in found and not one.extras):
+        if name.startswith("scopemap") or (name in found and not one.extras):
             continue
         try:
             package = distribution(one.name)
@@ -82,10 +93,9 @@ def licence_of(name: str) -> str:
 
 def licences_page() -> str:
     """Return docs/licences.md."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     core, lines = dependencies(), [_HEAD]
     rows = {name: (licence, "core") for name, licence in core.items()}
-    for extra in project["optional-dependencies"]:
+    for extra in _wanted()[1]:
         if extra != "dev":
             for name, licence in dependencies(extra).items():
                 rows.setdefault(name, (licence, extra))

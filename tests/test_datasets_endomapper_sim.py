@@ -169,7 +169,7 @@ def test_without_a_decoder_there_is_no_depth_and_a_warning(tmp_path: Path, monke
     monkeypatch.setattr(endomapper_sim, "find_spec", lambda name: None)
     sequence = open_sequence(write_sim(tmp_path / "Seq_0"))
     assert sequence.source.truth(0).depth_mm is None
-    assert any("pip install -e '.[datasets]'" in warning for warning in sequence.warnings)
+    assert any("pip install -e bench" in warning for warning in sequence.warnings)
 
 
 # ---- OpenEXR

@@ -31,11 +31,8 @@ PERMISSIVE = {
     *("CC0-1.0", "CNRI-Python", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib", "any-OSI"),
 }
 OF_EXTRAS = PERMISSIVE | {"MPL-2.0", "LicenseRef-NVIDIA-Proprietary"}
-EXTRAS = [
-    name
-    for name in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    if name != "dev"
-]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = [name for name in PROJECT["optional-dependencies"] if name != "dev"] + ["bench", "baselines"]
 
 
 def _parts(licence: str) -> set[str]:

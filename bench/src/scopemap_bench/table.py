@@ -18,7 +18,7 @@ from scopemap.errors import SettingsError
 try:
     import pandas as pd
 except ImportError:  # the only door to pandas: `bench` and `compare` stop here, before they run anything
-    raise SettingsError("tables of runs need pandas: pip install -e '.[bench]'") from None
+    raise SettingsError("tables of runs need pandas: pip install -e bench") from None
 
 Better = Literal["lower", "higher", "one", ""]
 """Which value of a column is the best: the lowest, the highest, the nearest to 1; empty: none is."""

@@ -1,4 +1,4 @@
-"""Figures of benchmarks by matplotlib, the extra `figures`: without a display and without any state of its own."""
+"""Figures of benchmarks by matplotlib, which scopemap-bench brings: without a display, without any state of its own."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise SettingsError("figures of benchmarks need matplotlib: pip install -e '.[figures]'") from None
+        raise SettingsError("figures of benchmarks need matplotlib: pip install -e bench") from None
     figure = Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

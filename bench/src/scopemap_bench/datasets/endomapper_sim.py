@@ -49,7 +49,7 @@ class EndoMapperSimFolder(UnityFolder):
             self._warn(f"{path / _TRAJECTORY}: {without} of {self.count} images have no pose in it")
         if self.depth_files and find_spec("OpenEXR") is None:
             self.depth_files = {}
-            self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install -e '.[datasets]'")
+            self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install -e bench")
         file = path / _CALIBRATION
         if self.camera is None and file.is_file():
             camera = stated_calibration(file, (self.width, self.height)).camera

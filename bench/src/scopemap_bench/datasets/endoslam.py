@@ -176,7 +176,7 @@ def read_sheet(file: Path) -> list[tuple[int, list[str]]]:
     Raises `InputError` for any other file, for one that unpacks to more than 32 MB, and without `openpyxl`.
     """
     if find_spec("openpyxl") is None:
-        raise InputError(f"reading {file}: it is a spreadsheet; install its reader: pip install -e '.[datasets]'")
+        raise InputError(f"reading {file}: it is a spreadsheet; install its reader: pip install -e bench")
     import openpyxl
 
     with reporting(f"reading {file}: no Excel workbook, or damaged; download it again"):

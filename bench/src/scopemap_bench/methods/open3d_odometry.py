@@ -177,7 +177,7 @@ def load_open3d() -> Any:
     except (ImportError, OSError) as error:
         raise SettingsError(
             f"an odometry of Open3D cannot run: Open3D cannot be imported ({_last_line(str(error))}); pip install -e "
-            "'.[baselines]', and on Debian apt install libusb-1.0-0 libgl1 libx11-6 libegl1"
+            "'./bench[baselines]', and on Debian apt install libusb-1.0-0 libgl1 libx11-6 libegl1"
         ) from None
 
 
