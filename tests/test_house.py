@@ -311,13 +311,7 @@ def test_the_library_neither_prints_nor_exits() -> None:
         if module.room == "cli":
             continue
         for node in ast.walk(module.tree):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
-                "print",
-                "exit",
-                "quit",
-                "sys.exit",
-                "os._exit",
-            ):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ENDINGS:
                 faults.append(module.at(node))
     _none(faults)
 
@@ -333,6 +327,28 @@ def test_nothing_is_left_for_later() -> None:
     later = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b")
     found = [(module, later.search(module.path.read_text())) for module in MODULES + BENCH_MODULES + OTHERS]
     _none([f"{module.name}: {match[0]}" for module, match in found if match])
+
+
+def _reads_a_sentence(node: ast.AST) -> bool:
+    """Whether a condition depends on the words of a reason, a description or a text; whether it is empty may count."""
+    words = {"reason", "description", "text", "plain", "sentence"}
+    if isinstance(node, ast.Compare):
+        sides = [node.left, *node.comparators]
+        constants = [side.value for side in sides if isinstance(side, ast.Constant) and isinstance(side.value, str)]
+        is_phrase = isinstance(node.ops[0], ast.In | ast.NotIn) and any(" " in text for text in constants[:1])
+        named = any(isinstance(side, ast.Attribute) and side.attr in words for side in sides)
+        return is_phrase or (named and any(constants))
+    owner = node.func.value if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) else None
+    asks = isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("startswith", "endswith", "search")
+    return asks and isinstance(owner, ast.Attribute) and owner.attr in words
+
+
+def test_no_sentence_decides() -> None:
+    """Codes do: `Notice.code`, `LossCause`."""
+    nodes = [(module, node) for module in MODULES for node in ast.walk(module.tree)]
+    _none([module.at(node) for module, node in nodes if _reads_a_sentence(node)])
+    wrong = ("'not rigid' in notes", "track.reason == 'relocalised'", "a.text.startswith('masks')")
+    assert all(_reads_a_sentence(ast.parse(text, mode="eval").body) for text in wrong)
 
 
 def test_no_except_catches_everything_silently() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from base64 import b64encode
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -83,7 +84,7 @@ def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", sh
             for loss in losses(run)
         ],
         "not_shown_maps": max(len(run.maps) - _MOST_MAPS, 0),
-        "albedo": 'fusion.colours = "raw"' not in run.config,
+        "albedo": tomllib.loads(run.config).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
         "config": run.config,
         "provenance": run.provenance,
