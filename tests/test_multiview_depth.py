@@ -14,9 +14,9 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp
 from scopemap.mapping.multiview_depth import (
     KeyframeDepths,
     StereoView,
-    carry_depth,
     choose_neighbours,
     normalised_contrast,
+    propagate_depth,
     triangulate_depth,
 )
 
@@ -148,7 +148,7 @@ def test_frames_take_over_their_keyframes_depth() -> None:
     keyframe = triangulate_depth(_view(2, _bias()), [_view(number, _bias()) for number in (0, 1, 4, 6)], CAMERA, flow)
     assert keyframe is not None
     frame = _view(MIDDLE, _bias())
-    carried = carry_depth(frame.depth_mm, [(inverse(_pose(2)) @ _pose(MIDDLE), keyframe)], CAMERA)
+    carried = propagate_depth(frame.depth_mm, [(inverse(_pose(2)) @ _pose(MIDDLE), keyframe)], CAMERA)
     assert _error(carried.depth_mm) < 0.4 * _error(frame.depth_mm)
 
 

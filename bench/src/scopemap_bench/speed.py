@@ -58,7 +58,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "keyframe": ("tracking.tracker:Tracker.insert_keyframe", "mapping.submaps:Mapper.add_keyframe"),
     "store": ("fusion.frame_store:FrameStore.put", "fusion.frame_store:FrameStore._read"),
     "feature tracks": ("mapping.feature_tracks:FeatureTracks.add",),
-    "depth triangulation": ("mapping.multiview_depth:triangulate_depth", "mapping.multiview_depth:carry_depth"),
+    "depth triangulation": ("mapping.multiview_depth:triangulate_depth", "mapping.multiview_depth:propagate_depth"),
     "fusion": ("fusion.volume:TsdfVolume.integrate",),
     "writing": ("reconstruction:DepthWriter.__call__", "reconstruction:Reconstruction.save"),
 }

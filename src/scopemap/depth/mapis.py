@@ -44,7 +44,7 @@ class RefinedDepth:
     sigma_mm: np.ndarray
 
 
-class _Carried(NamedTuple):
+class _Propagated(NamedTuple):
     """Depth (H, W) mm for the next frame, and its relative standard deviation, NaN = unknown."""
 
     depth_mm: np.ndarray
@@ -56,7 +56,7 @@ class Mapis:
 
     def __init__(self, settings: MapisSettings) -> None:
         self.settings = settings
-        self._carried: _Carried | None = None
+        self._propagated: _Propagated | None = None
         self._scale = 1.0
 
     def refine(
@@ -84,7 +84,7 @@ class Mapis:
         overlap = float(np.isfinite(warped_mm).mean())
         if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
-            if correspondence is not None and self._carried is not None:
+            if correspondence is not None and self._propagated is not None:
                 self._scale = self._pulled_back(self._scale, overlap / max(correspondence.usable_share, 1e-6))
         scaled_mm = raw_mm * np.float32(self._scale)
         depth_mm, refined_sigma = scaled_mm, sigma
@@ -94,8 +94,8 @@ class Mapis:
             weight = by_variance(weight, warped_sigma, sigma)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_sigma = blended_sigma(weight, warped_sigma, sigma)
-        self._carried = (
-            _Carried(depth_mm, refined_sigma) if self.settings.paper.recursive else _Carried(scaled_mm, sigma)
+        self._propagated = (
+            _Propagated(depth_mm, refined_sigma) if self.settings.paper.recursive else _Propagated(scaled_mm, sigma)
         )
         return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
 
@@ -105,11 +105,11 @@ class Mapis:
 
     def reset(self) -> None:
         """Let the next frame start without a previous depth; the last scale is kept."""
-        self._carried = None
+        self._propagated = None
 
     def rescale(self, scale: float) -> None:
         """Let the next frame start with a scale that is known."""
-        self._carried, self._scale = None, scale
+        self._propagated, self._scale = None, scale
 
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.advanced.frame_scale
@@ -133,20 +133,20 @@ class Mapis:
         correspondence: DenseCorrespondence | None,
         T_current_previous: np.ndarray | None,
         sigma: np.ndarray,
-    ) -> _Carried:
+    ) -> _Propagated:
         """Warp the previous depth and its uncertainty to the current frame, whose own relative sigma is `sigma`."""
-        if correspondence is None or self._carried is None:
+        if correspondence is None or self._propagated is None:
             nothing = np.full((camera.height, camera.width), np.nan, np.float32)
-            return _Carried(nothing, nothing)
-        warped_mm = pull(self._carried.depth_mm, correspondence.to_previous)
+            return _Propagated(nothing, nothing)
+        warped_mm = pull(self._propagated.depth_mm, correspondence.to_previous)
         warped_mm = np.where(correspondence.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
         filtered_mm = bilateral_filtered(
             warped_mm, self.settings.advanced.filter_sigma_px, self.settings.advanced.filter_sigma_mm
         )
-        warped_sigma = pull(self._carried.relative_sigma, correspondence.to_previous)
-        return _Carried(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.advanced.sigma_fading))
+        warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
+        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.advanced.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""

@@ -44,14 +44,14 @@ def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: 
     return np.where(known, (floor + median) / (floor + sigma**2), 1.0).astype(np.float32)
 
 
-def faded_sigma(carried: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
+def faded_sigma(propagated: np.ndarray, current: np.ndarray, fading: float) -> np.ndarray:
     """Return the relative sigma of a depth from the previous frame, (H, W) float32, after one frame of growth.
 
     Per frame, variance grows by `fading` (0..1) of its difference to the current frame's; it never shrinks. NaN where
-    `carried` is; unchanged where `current` is NaN.
+    `propagated` is; unchanged where `current` is NaN.
     """
-    excess = np.maximum(np.nan_to_num(current**2 - carried**2, nan=0.0), 0.0)
-    return np.sqrt(carried**2 + np.float32(fading) * excess)
+    excess = np.maximum(np.nan_to_num(current**2 - propagated**2, nan=0.0), 0.0)
+    return np.sqrt(propagated**2 + np.float32(fading) * excess)
 
 
 def by_variance(weight: np.ndarray, sigma: np.ndarray, sigma_other: np.ndarray) -> np.ndarray:

@@ -139,7 +139,7 @@ def triangulate_depth(
     return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
 
 
-def carry_depth(
+def propagate_depth(
     depth_mm: np.ndarray, keyframes: Sequence[tuple[np.ndarray, TriangulatedDepth]], camera: PinholeCamera
 ) -> TriangulatedDepth:
     """Return the depth of a frame, corrected by what was triangulated at keyframes near it.
@@ -201,7 +201,7 @@ class KeyframeDepths:
         known = [(number, found) for number in around if (found := self._found[number].result()) is not None]
         T_camera_world = inverse(self._poses[index])
         relative = [(inverse(T_camera_world @ self._poses[number]), found) for number, found in known]
-        return carry_depth(depth_mm, relative, self._camera) if relative else None
+        return propagate_depth(depth_mm, relative, self._camera) if relative else None
 
     def close(self) -> None:
         """Stop the thread."""

@@ -21,9 +21,9 @@ from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
-_PASSED_KEYFRAMES = 64
+_EARLIER_KEYFRAMES = 64
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of a passed keyframe's view, at most, and over that of the current one
-_WALL_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
+_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
 _EVERY_PX, _RANGE = 4, (5, 95)
 # Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
 _FLOW_EVERY_PX, _FOLLOWED_COVERAGE, _FOLLOWED_ERROR = 8, 0.25, 0.01
@@ -49,14 +49,14 @@ class Keyframe:
     map: int
 
 
-def is_wall(frame: Frame, keyframe: Keyframe) -> bool:
+def is_close_up(frame: Frame, keyframe: Keyframe) -> bool:
     """Whether a frame shows nothing but one near wall, by its predicted depth: it hardly varies beside the keyframe's.
 
     How near the wall is depth networks do not tell; where depth is measured it is no reason to be lost.
     """
     if keyframe.measured or frame.depth_mm is None:
         return False
-    return _log_depth_range(frame) < _WALL_RANGE * _log_depth_range(keyframe.frame)
+    return _log_depth_range(frame) < _CLOSE_UP_RANGE * _log_depth_range(keyframe.frame)
 
 
 def _log_depth_range(frame: Frame) -> float:
@@ -80,11 +80,11 @@ def depth_ratio(keyframe: Keyframe, frame: Frame, T_world_camera: np.ndarray) ->
     return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else float("nan")
 
 
-class PassedKeyframes:
+class EarlierKeyframes:
     """Earlier keyframes of the current map, 64 at most, that the camera may come back to."""
 
     def __init__(self) -> None:
-        self._frames: deque[Frame] = deque(maxlen=_PASSED_KEYFRAMES)
+        self._frames: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
 
     def add(self, frame: Frame) -> None:
         """Add a keyframe with its pose and its depth."""

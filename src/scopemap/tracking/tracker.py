@@ -15,7 +15,7 @@ from scopemap.geometry.se3 import inverse, mean_near, orthonormalised
 from scopemap.tracking.acceptance import MIN_TEXTURE, LastPose, is_obscured, rejection
 from scopemap.tracking.features import FeatureDetector, RelativePose, SiftFeatures
 from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.relocalisation import Keyframe, PassedKeyframes, Relocaliser, depth_ratio, is_wall
+from scopemap.tracking.relocalisation import EarlierKeyframes, Keyframe, Relocaliser, depth_ratio, is_close_up
 from scopemap.tracking.reprojection import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment, Motion, align, judge
@@ -28,7 +28,7 @@ _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with 
 _MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer are matched becomes a keyframe
-_SEEN_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
+_REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
 _CLEAR, _PATIENCE = 0.8, 3  # of the best quality since the keyframe: below it the next one waits so many frames more
 _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
@@ -60,11 +60,11 @@ class Tracker(FrameTracker):
         self._frames_since_keyframe = 0
         self._frames_lost = self._sharp_frames_lost = 0
         self._agreement: list[float] = []
-        self._is_unsharp = self._met_wall = False
+        self._is_unsharp = self._after_close_up = False
         self._quality = self._best_quality = 0.0
         self._coverage = 1.0
-        self._passed = PassedKeyframes()
-        self._is_seen_again = False
+        self._earlier_keyframes = EarlierKeyframes()
+        self._is_revisited = False
         self._map, self._map_count = 0, 1
         self._frames_of_map: Counter[int] = Counter()
 
@@ -96,13 +96,13 @@ class Tracker(FrameTracker):
             and not self._frames_lost
             and not self._rejection(self._keyframe, alignment)
         ):
-            alignment = self._seen_again(frame, alignment)
+            alignment = self._against_earlier_keyframe(frame, alignment)
         obscured = is_obscured(sharpness, alignment, self.settings.min_sharpness)
         rejected, relocalised = self._rejection(self._keyframe, alignment), False
         failed, is_weak = obscured or bool(rejected), self._coverage < _WEAK_COVERAGE
-        if failed and is_wall(frame, self._keyframe):
-            self._met_wall, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
-        elif self._met_wall and not failed and self.settings.relocalisation_keyframes:
+        if failed and is_close_up(frame, self._keyframe):
+            self._after_close_up, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
+        elif self._after_close_up and not failed and self.settings.relocalisation_keyframes:
             failed, rejected = True, TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED)
         if failed or is_weak or self._frames_lost:
             found = self._found(frame, pyramid, sharpness, failed=failed)
@@ -115,7 +115,7 @@ class Tracker(FrameTracker):
             return self._lost(frame, unsharp, alignment)
         if rejected:
             self._sharp_frames_lost += 1
-            after = self.settings.new_map_after * (2 if self._met_wall else 1)
+            after = self.settings.new_map_after * (2 if self._after_close_up else 1)
             if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
                 return self._new_map(frame)
             return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
@@ -140,7 +140,7 @@ class Tracker(FrameTracker):
         if self._keyframe is None:
             return True
         # The depth of an unsharp frame is no better than its image.
-        return (self._is_seen_again or self._is_due(self._agreement[-1:])) and not self._is_unsharp
+        return (self._is_revisited or self._is_due(self._agreement[-1:])) and not self._is_unsharp
 
     def _is_due(self, agreement: list[float]) -> bool:
         """Whether a frame with this agreement, [] where it is not known, should become a keyframe."""
@@ -157,42 +157,42 @@ class Tracker(FrameTracker):
         """
         if frame.depth_mm is None or frame.T_world_camera is None:
             raise ValueError("a keyframe needs a depth and a pose")
-        if self._is_seen_again:
-            self._is_seen_again, self._frames_since_keyframe = False, 0
+        if self._is_revisited:
+            self._is_revisited, self._frames_since_keyframe = False, 0
             return True
         keyframe = self._keyframe_of(frame, measured)
         if keyframe is None:
             return False
         self._use_keyframe(keyframe)
         self._relocaliser.add(keyframe)
-        self._passed.add(frame)
+        self._earlier_keyframes.add(frame)
         self._frames_since_keyframe, self._best_quality = 0, 0.0
         return True
 
-    def _seen_again(self, frame: Frame, alignment: Alignment) -> Alignment:
+    def _against_earlier_keyframe(self, frame: Frame, alignment: Alignment) -> Alignment:
         """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces.
 
         Errors of poses and scale since then are gone: a camera that goes to and fro does not drift on and on.
         """
         current = self._keyframe
         assert current is not None
-        self._is_seen_again = False
+        self._is_revisited = False
         if self._matcher is None or current.measured:
             return alignment
         T_world_camera = _T_world_camera(current, alignment)
-        nearest = self._passed.nearer(T_world_camera, current)
+        nearest = self._earlier_keyframes.nearer(T_world_camera, current)
         keyframe = None if nearest is None else self._keyframe_of(nearest, current.measured)
         if keyframe is None:
             return alignment
         T_start, coverage = inverse(T_world_camera) @ keyframe.T_world_camera, self._coverage
         self._matcher.set_keyframe(keyframe.frame, frame, T_start)
         found = self._align_by_corners(keyframe, frame, T_start)
-        if found is None or self._coverage < _SEEN_COVERAGE or not self._is_accepted(keyframe, found):
+        if found is None or self._coverage < _REVISITED_COVERAGE or not self._is_accepted(keyframe, found):
             self._matcher.set_keyframe(current.frame)
             self._coverage = coverage
             return alignment
         self._use_keyframe(keyframe)
-        self._is_seen_again = True
+        self._is_revisited = True
         return found
 
     def _keyframe_of(self, frame: Frame, measured: bool) -> Keyframe | None:
@@ -317,8 +317,8 @@ class Tracker(FrameTracker):
             # The last pose is in another world.
             self._enter_map(keyframe.map)
             self._T_world_last = T_world_camera
-        ratio = depth_ratio(keyframe, frame, T_world_camera) if self._met_wall else float("nan")
-        self._met_wall = False
+        ratio = depth_ratio(keyframe, frame, T_world_camera) if self._after_close_up else float("nan")
+        self._after_close_up = False
         T_step = inverse(self._T_world_last) @ T_world_camera
         # After lost frames the step is that of several: its share of one.
         self._T_step = mean_near(np.eye(4), [T_step], [1 / (1 + self._frames_lost)])
@@ -342,12 +342,12 @@ class Tracker(FrameTracker):
         """Begin a new map with this frame; its relative pose to the other maps is unknown."""
         self._enter_map(self._map_count)
         self._map_count += 1
-        self._keyframe, self._T_world_last, self._T_step, self._met_wall = None, np.eye(4), np.eye(4), False
+        self._keyframe, self._T_world_last, self._T_step, self._after_close_up = None, np.eye(4), np.eye(4), False
         self._frames_lost = self._sharp_frames_lost = 0
         return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._map)
 
     def _enter_map(self, number: int) -> None:
-        self._passed.clear()
+        self._earlier_keyframes.clear()
         self._map, self._last = number, None
         self._relocaliser.enter_map(number, self._frames_of_map)
 
