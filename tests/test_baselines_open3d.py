@@ -197,7 +197,7 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch: pytest.Monke
         raise OSError(f"libusb-1.0.so.0: cannot open shared object file ({name})")
 
     monkeypatch.setattr(open3d_odometry.importlib, "import_module", missing)
-    with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -e '\.\[baselines\]'.*libgl1"):
+    with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -e '\./bench\[baselines\]'.*libgl1"):
         Open3dTracker("park")
 
 

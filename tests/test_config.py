@@ -24,7 +24,7 @@ READERS = {
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner/*.py"],
     "mask": ["masking/*.py"],
     "depth": ["depth/*.py"],
-    "mapis": ["depth/*.py", "pipeline.py"],
+    "mapis": ["depth/*.py", "preprocessing.py", "odometry.py"],
     "networks": ["estimators.py"],
     "tracking": ["tracking/*.py", "estimators.py"],
     "smoothing": ["tracking/smoothing.py"],

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import socket
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +39,13 @@ EXTRAS = [name for name in PROJECT["optional-dependencies"] if name != "dev"] + 
 
 def _parts(licence: str) -> set[str]:
     return set(re.split(r" AND | OR ", licence.replace("(", "").replace(")", "")))
+
+
+def test_telemetry_of_dependencies_is_off_before_they_are_imported() -> None:
+    names = ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "RAY_USAGE_STATS_ENABLED")
+    code = f"import os, sys, scopemap; print(*(os.environ[n] for n in {names}), 'onnxruntime' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "1", "0", "False"]
 
 
 def test_a_run_and_its_report_open_no_socket(

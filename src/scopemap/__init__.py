@@ -16,8 +16,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # The stages have threads of their own. OpenBLAS's would compete with them (a run took 1.3 times the time), and
 # sum in another order: results would depend on their number. Read when numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# ONNX Runtime's builds send telemetry unless this is set before it is imported; nothing may leave the machine.
-os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+# Nothing may leave the machine: these libraries send telemetry unless that is set before they are imported.
+for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY"):
+    os.environ[_switch] = "1"
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 
 
 def _may_write(folder: Path) -> bool:
