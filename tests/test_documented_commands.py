@@ -41,9 +41,7 @@ def _commands(document: Path) -> list[list[str]]:
     for block in _blocks(document.read_text(encoding="utf-8")):
         for line in block.replace("\\\n", " ").splitlines():
             parts = re.split(r"\s(?:&&|\||>|&)\s|;\s", re.sub(r"\s#.*", "", line))
-            called = [
-                re.search(r"^(?!podman )(?:.*[\s!(])?scopemap ((?!import)[a-z-].*)", part.strip()) for part in parts
-            ]
+            called = [CALLED.match(part.strip()) for part in parts]
             found += [shlex.split(match[1]) for match in called if match]
     return found
 

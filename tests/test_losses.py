@@ -80,12 +80,6 @@ def test_segments_have_the_cause_that_began_them() -> None:
     assert in_words(found).startswith("Mostly by this: fast motion. Next time: turn and withdraw more slowly")
 
 
-def test_a_run_without_causes_says_nothing() -> None:
-    found = losses(run_of([0, "", "", 0]))
-    assert [(loss.frames, loss.advice) for loss in found] == [(2, "")]
-    assert in_words(found) == in_words([]) == ""
-
-
 def test_black_frames_of_a_phantom_are_too_dark_and_motion_is_measured(tmp_path: Path) -> None:
     spec = PhantomSpec(frames=8, width=96, height=80, seed=3, events=parse_events("black:4-5"))
     write_phantom(spec, tmp_path / "phantom")
