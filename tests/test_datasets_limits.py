@@ -50,7 +50,7 @@ def test_a_workbook_of_much_text_is_refused(tmp_path: Path, monkeypatch: pytest.
 
 def test_without_its_package_a_workbook_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(endoslam, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install -e '\.\[datasets\]'"):
+    with pytest.raises(InputError, match=r"pip install -e bench"):
         read_sheet(tmp_path / "a.xlsx")
 
 

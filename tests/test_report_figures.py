@@ -80,7 +80,7 @@ def test_only_figures_of_benchmarks_need_matplotlib(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     draw_trajectories(np.zeros((2, 3)), None, tmp_path / "t.png")
     draw_mesh(BALL, tmp_path / "m.png")
-    with pytest.raises(SettingsError, match=r"pip install -e '\.\[figures\]'"):
+    with pytest.raises(SettingsError, match=r"pip install -e bench"):
         draw_depth_change(DepthScene("s", (np.zeros((4, 4, 3), np.uint8),) * 2, {}), tmp_path / "d.png")
 
 

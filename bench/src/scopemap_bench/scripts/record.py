@@ -5,7 +5,7 @@
     python -m scopemap_bench.scripts.record --check                               name the tables that the code has
             outdated
 
-A table is outdated where `src/` has changed since its commit. `.ci/release` asks; tests do not.
+A table is outdated where `src/` or `bench/src/` has changed since its commit. `.ci/release` asks; tests do not.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[4]
 RESULTS = ROOT / "bench" / "results"
+MEASURED = ("src", "bench/src")
+"""What a table depends on."""
 
 
 def git(*arguments: str) -> str:
@@ -29,8 +31,8 @@ def git(*arguments: str) -> str:
 
 def record(name: str, note: str, command: list[str]) -> Path:
     """Run a command and keep what it prints; raises `SystemExit` where it fails or the code is not committed."""
-    if git("status", "--porcelain", "--", "src"):
-        sys.exit("record: src/ differs from the last commit; commit first, so that the table's commit says what ran")
+    if git("status", "--porcelain", "--", *MEASURED):
+        sys.exit("record: the sources differ from the last commit; commit first: the table names what ran by it")
     commit, date = git("rev-parse", "--short", "HEAD"), datetime.now(UTC).date().isoformat()
     run = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     printed = ""
@@ -52,11 +54,11 @@ def outdated() -> list[str]:
     for file in sorted(RESULTS.glob("*.md")):
         commit = re.search(r"^Commit (\w+)", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
         try:
-            changes = git("rev-list", "--count", f"{commit[1]}..HEAD", "--", "src") if commit else "unknown"
+            changes = git("rev-list", "--count", f"{commit[1]}..HEAD", "--", *MEASURED) if commit else "unknown"
         except subprocess.CalledProcessError:
             changes = "unknown"
         if changes != "0":
-            found.append(f"{file.relative_to(ROOT)}: {changes} commits to src/ since it was measured")
+            found.append(f"{file.relative_to(ROOT)}: {changes} commits to the sources since it was measured")
     return found
 
 
