@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import Config, FusionSettings
+from scopemap.config import FusionSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import compare_with_frame
@@ -101,8 +101,3 @@ def test_a_rendering_is_lit_again_before_it_is_compared() -> None:
         # The tone curve and the bounds are not the model's exactly.
         assert np.abs(view.rgb.astype(float) - frame.rgb)[shown].mean() < 8
         assert agreement.ssim > compare_with_frame(mesh, *seen)[0].ssim + 0.005
-
-
-def test_the_paper_keeps_the_colours_of_the_video() -> None:
-    assert Config.load("paper").fusion.colours == "raw"
-    assert Config.load().fusion.colours == "albedo"

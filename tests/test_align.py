@@ -52,14 +52,6 @@ def test_umeyama_is_a_rotation_and_no_nearby_similarity_fits_better(seed: int) -
         assert cost(found) <= cost(near) + 1e-12
 
 
-def test_without_scale_the_motion_is_rigid() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(10, 3))
-    found = umeyama(points, 3 * points, with_scale=False)
-    assert found.scale == 1.0
-    np.testing.assert_allclose(found.R, np.eye(3), atol=1e-12)
-
-
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
 def test_line_and_single_place_are_refused_with_the_singular_values(offset: float) -> None:
     rng = np.random.default_rng(1)

@@ -95,14 +95,6 @@ def test_observations_are_where_the_plane_projects_to() -> None:
             assert np.median(away) < 0.25
 
 
-def test_keyframes_at_other_gaps_are_not_matched() -> None:
-    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(2,))), DisFlow())
-    for number in (0, 1, 2):
-        tracks.add(_frame(number))
-    points, observations = tracks.collected()
-    assert set(np.abs(points.host[observations.point] - observations.keyframe)) == {2}
-
-
 def test_corners_are_detected_on_usable_tissue_only() -> None:
     rgb = np.full((180, 240, 3), 90, np.uint8)
     for x, y in ((40, 40), (136, 100)):

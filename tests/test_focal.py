@@ -27,7 +27,6 @@ from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import so3_exp
-from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.runner.run import reconstruct
@@ -94,12 +93,6 @@ def test_distortion_does_not_bias_the_focal_length(fov_deg: float) -> None:
     assert fit.distortion == pytest.approx(0.25, abs=0.02)
 
 
-def test_pixels_need_not_be_square() -> None:
-    window = _window(80.0)
-    squeezed = Window(window.start * [1, 0.8], window.seen * [1, 0.8], HALF_PX, aspect=0.8)
-    assert abs(_error(adjust_window(squeezed, ASSUMED_PX), 80.0)) < 2e-3
-
-
 def test_the_standard_deviation_covers_the_error_by_noise() -> None:
     scores = []
     for seed in range(10):
@@ -109,13 +102,6 @@ def test_the_standard_deviation_covers_the_error_by_noise() -> None:
         assert fit.residual_px == pytest.approx(0.3, rel=0.25)
         scores.append(_error(fit, 75.0) / fit.deviation)
     assert 0.3 < np.sqrt(np.mean(np.square(scores))) < 1.8
-
-
-def test_outliers_do_little_harm() -> None:
-    window = _window(75.0, noise_px=0.1)
-    wrong = np.random.default_rng(1).random(window.seen.shape[:2]) < 0.1
-    seen = np.where(wrong[..., None], window.seen + 15.0, window.seen)
-    assert abs(_error(adjust_window(dataclasses.replace(window, seen=seen), ASSUMED_PX), 75.0)) < 0.03
 
 
 def test_pure_rotation_determines_the_focal_length() -> None:
@@ -174,13 +160,6 @@ def test_an_impossible_field_of_view_is_no_estimate(fov_deg: float) -> None:
     assert "no endoscope" in combine([_fit(fov_deg)] * 3, 320.0).reason
 
 
-def test_a_difference_is_two_standard_deviations() -> None:
-    estimate = FocalEstimate(100.0, 0.05, 90.0, 3)
-    assert estimate.differs_from(112.0)
-    assert estimate.differs_from(89.0)
-    assert not estimate.differs_from(108.0)
-
-
 # ---- images
 
 
@@ -198,14 +177,6 @@ def test_the_focal_length_is_estimated_from_images_of_a_rotating_camera(turning:
     window = next(windows_of(sequence, Config()))
     assert window.seen.shape == (len(window.start), 6, 2)
     assert window.half_width_px == SIZE[0] / 2
-
-
-def test_frames_that_the_estimate_leaves_out_are_not_skipped_in_the_run(turning: Path) -> None:
-    sequence = dataclasses.replace(open_sequence(turning), choice=FrameChoice(skip_repeated=True, fps=5.0))
-    focal_from_motion(sequence, Config())
-    assert not sequence.skipped
-    list(sequence.frames())
-    assert sequence.skipped
 
 
 def test_no_estimate_from_a_source_that_ends_early(turning: Path) -> None:

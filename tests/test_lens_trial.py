@@ -16,7 +16,6 @@ from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
 from scopemap.calibration.focal_length.windows import Window, windows_of
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.config import Config
 from scopemap.geometry.se3 import so3_exp
@@ -98,11 +97,6 @@ def test_tissue_that_deforms_tells_nothing() -> None:
     assert try_lenses([]) is None
 
 
-def test_a_trial_repeats_itself() -> None:
-    window = _window("equidistant fisheye", 170.0, 5, **FORWARD)
-    assert try_lenses([window, window]) == try_lenses([window, window])
-
-
 # ---- in a run
 
 UNDETERMINED = FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 windows")
@@ -179,10 +173,3 @@ def test_corners_have_distances_that_do_not_depend_on_the_lens(tmp_path: Path) -
     one, other = (next(windows_of(sequence, Config())) for sequence in (narrow, wide))
     assert one.log_distance is not None
     np.testing.assert_allclose(one.log_distance, other.log_distance, atol=1e-4)
-
-
-def test_a_fisheye_is_written_as_it_is(clip: Path, tmp_path: Path) -> None:
-    sequence = open_sequence(clip).with_focal(100.0, "found", 2.0, KINDS["equidistant fisheye"])
-    assert sequence.camera.fx == pytest.approx(100.0)
-    write_calibration(sequence.rectifier.source, tmp_path / "lens.yaml")
-    assert open_sequence(clip, camera=tmp_path / "lens.yaml").rectifier.source == sequence.rectifier.source

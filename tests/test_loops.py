@@ -81,13 +81,6 @@ def test_all_keyframes_of_two_maps_are_weighed_at_the_end(candidates: int, monke
         assert off_mm < 1.0
 
 
-def test_one_map_has_no_loops_between_maps() -> None:
-    finder = LoopFinder(SETTINGS)
-    for number in range(6):
-        finder.add(_frame(number))
-    assert finder.between([0] * 6) == []
-
-
 def test_a_camera_that_never_returns_closes_no_loop() -> None:
     finder = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
     for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):
@@ -135,17 +128,6 @@ def _loop(past: int, new: int, T_new_past: np.ndarray) -> Loop:
     return Loop(past, new, T_new_past, 0.0, *(np.zeros((0, 2)),) * 4)
 
 
-def test_a_loop_is_converted_to_the_units_of_the_common_world() -> None:
-    T = se3_exp(np.array([0.1, 0, 0, 2.0, 3.0, 4.0]))
-    original = replace(_loop(3, 7, T), log_ratio=0.1)
-    loop = original.among([3, 6, 7], np.log([2.0, 1.0, 3.0]))
-    assert (loop.past, loop.new) == (0, 2)
-    np.testing.assert_allclose(loop.T_new_past[:3, 3], [2 * x for x in T[:3, 3]])
-    np.testing.assert_allclose(loop.T_new_past[:3, :3], T[:3, :3])
-    assert loop.log_ratio == pytest.approx(0.1 + np.log(1.5))
-    np.testing.assert_array_equal(original.T_new_past, T)
-
-
 def test_keyframes_are_paired_with_their_reference_keyframes() -> None:
     tracked = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
     frames, poses = [frame for frame, *_ in tracked], [TrackedPose(m, of, np.eye(4)) for _, m, of in tracked]
@@ -186,13 +168,6 @@ def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     assert (correction.notice.values["loops"] > 0) == closing
     if closing:
         assert after < 0.3
-
-
-def test_keyframes_without_depth_close_no_loop() -> None:
-    finder = LoopFinder(SETTINGS)
-    for number in range(COUNT):
-        frame = _frame(number)
-        assert not finder.add(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
 
 
 def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:

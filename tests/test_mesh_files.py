@@ -46,14 +46,6 @@ def test_glb_is_metres_y_up_with_linear_colours(tmp_path: Path, ball: trimesh.Tr
     assert np.allclose(upper[:, :3] / 65535, (0.2158, 0.2158, 0), atol=1e-3)
 
 
-def test_glb_is_matt_and_seen_from_both_sides(tmp_path: Path, ball: trimesh.Trimesh) -> None:
-    file = tmp_path / "mesh.glb"
-    save_mesh(ball, glb_file=file)
-    (read,) = trimesh.load(file, process=False).geometry.values()
-    assert read.visual.material.doubleSided is True
-    assert read.visual.material.metallicFactor == 0.0
-
-
 def _glb_tree(file: Path) -> tuple[dict, bytes]:
     content = file.read_bytes()
     (length,) = struct.unpack("<I", content[12:16])

@@ -164,7 +164,3 @@ def test_the_options_of_a_run(tmp_path: Path) -> None:
     fusion = Config.load(file=tmp_path / "run" / "config.toml").fusion
     assert (fusion.mesh_faces, fusion.mesh_smooth, fusion.colours, fusion.holes) == (900, 2, "raw", "small")
     assert 500 < len(trimesh.load(tmp_path / "run" / "mesh.ply", process=False).faces) <= 900
-
-
-def test_the_paper_closes_no_holes() -> None:
-    assert Config.load("paper").fusion.holes == "none"

@@ -90,14 +90,6 @@ def test_a_right_depth_stays() -> None:
     assert _error(found.depth_mm) < 0.006
 
 
-def test_unknown_depth_stays_unknown() -> None:
-    view = _view(MIDDLE, _bias())
-    view.depth_mm[40:60, 50:90] = np.nan
-    found = triangulate_depth(view, [_view(number) for number in (2, 3, 5, 6)], CAMERA, DisFlow())
-    assert found is not None
-    assert np.array_equal(np.isnan(found.depth_mm), np.isnan(view.depth_mm))
-
-
 def test_tissue_that_moves_is_not_triangulated() -> None:
     """The wall slides to and fro by as much as the camera moves: neighbours contradict each other."""
     neighbours = [_view(number, shift_mm=3.0 * (-1) ** number) for number in (1, 2, 3, 5, 6, 7)]
@@ -136,11 +128,6 @@ def test_neighbours_are_on_both_sides_and_have_parallax() -> None:
     # Parallax: focal length times distance over depth, px per unit of ln depth.
     parallax_px = [CAMERA.fx * 0.5 * abs(number - 30) / WALL_MM for number in chosen]
     assert all(3 < px < 25 for px in parallax_px), parallax_px
-
-
-def test_a_camera_at_rest_has_no_neighbours() -> None:
-    depth_mm = np.full((CAMERA.height, CAMERA.width), WALL_MM, np.float32)
-    assert choose_neighbours(3, depth_mm, CAMERA, dict.fromkeys(range(9), np.eye(4))) == []
 
 
 def test_frames_take_over_their_keyframes_depth() -> None:

@@ -65,8 +65,3 @@ def test_too_few_points_and_points_behind_give_no_pose() -> None:
     few = Correspondences2D3D(seen.points_mm[:49], seen.pixels[:49], 0.2, 0)
     assert pose_from_correspondences(few, CAMERA, np.eye(4), 0.2) is None
     assert pose_from_correspondences(replace(seen, points_mm=-seen.points_mm), CAMERA, np.eye(4), 0.2) is None
-
-
-def test_the_pose_is_a_rigid_motion() -> None:
-    R = _pose(_observed(TRUE))[:3, :3]
-    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)

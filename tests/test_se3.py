@@ -15,7 +15,6 @@ from scopemap.geometry.se3 import (
     mean_near,
     orthonormalised,
     rotation_angle_rad,
-    se3,
     se3_exp,
     se3_log,
     so3_exp,
@@ -44,19 +43,6 @@ def _generator(twist: np.ndarray) -> np.ndarray:
 
 
 @few
-@given(translations, translations)
-def test_hat_is_the_cross_product(a: np.ndarray, b: np.ndarray) -> None:
-    np.testing.assert_allclose(hat(a) @ b, np.cross(a, b), atol=1e-9)
-    np.testing.assert_array_equal(hat(a), -hat(a).T)
-
-
-@few
-@given(axes, angles)
-def test_so3_exp_is_scipys_rotation(axis: np.ndarray, angle: float) -> None:
-    np.testing.assert_allclose(so3_exp(angle * axis), Rotation.from_rotvec(angle * axis).as_matrix(), atol=1e-14)
-
-
-@few
 @given(axes, angles, translations)
 def test_se3_exp_is_the_matrix_exponential(axis: np.ndarray, angle: float, v: np.ndarray) -> None:
     twist = np.concatenate([angle * axis, v])
@@ -81,14 +67,6 @@ def test_log_around_pi_gives_the_same_rotation(axis: np.ndarray, short_of_pi: fl
     np.testing.assert_allclose(so3_exp(vector), R, atol=1e-7)
 
 
-@pytest.mark.parametrize("axis", np.vstack([np.eye(3), -np.eye(3), [[1, 1, 0], [0, -1, 1], [1, 1, 1]]]))
-def test_log_of_a_half_turn(axis: np.ndarray) -> None:
-    R = 2 * np.outer(_unit(axis), _unit(axis)) - np.eye(3)
-    vector = so3_log(R)
-    assert np.linalg.norm(vector) == pytest.approx(np.pi)
-    assert abs(_unit(vector) @ _unit(axis)) == pytest.approx(1)
-
-
 @few
 @given(st.lists(st.tuples(axes, st.floats(0, np.pi)), min_size=1, max_size=4))
 def test_rotation_angle_of_a_stack(turns: list[tuple[np.ndarray, float]]) -> None:
@@ -109,12 +87,6 @@ def test_inverse_and_transform(axis: np.ndarray, angle: float, v: np.ndarray, po
     np.testing.assert_allclose(transform(inverse(T), transform(T, point)), point, atol=1e-8)
 
 
-def test_se3_puts_its_parts_in_place() -> None:
-    R = so3_exp(np.array([0.3, -0.2, 0.1]))
-    T = se3(R, np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(T, np.vstack([np.column_stack([R, [1, 2, 3]]), [0, 0, 0, 1]]))
-
-
 @few
 @given(axes, st.floats(0, 1), translations, st.floats(0, 1))
 def test_mean_of_base_and_another_lies_on_the_geodesic(axis: np.ndarray, angle: float, v: np.ndarray, w: float) -> None:
@@ -122,17 +94,6 @@ def test_mean_of_base_and_another_lies_on_the_geodesic(axis: np.ndarray, angle: 
     twist = np.concatenate([angle * axis, v])
     mean = mean_near(base, [base @ se3_exp(twist), base], [w, 1 - w])
     np.testing.assert_allclose(mean, base @ se3_exp(w * twist), atol=1e-7)
-
-
-def test_mean_of_translations_is_the_weighted_mean() -> None:
-    poses = [se3(np.eye(3), t) for t in np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 4]])]
-    mean = mean_near(poses[0], poses, [0.5, 0.3, 0.2])
-    np.testing.assert_allclose(mean, se3(np.eye(3), np.array([0.5, 0.6, 0.8])), atol=1e-12)
-
-
-def test_mean_needs_a_weight_per_pose() -> None:
-    with pytest.raises(ValueError, match="zip"):
-        mean_near(np.eye(4), [np.eye(4)] * 2, [1.0])
 
 
 @few
