@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
@@ -9,7 +10,11 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import MappingSettings
+from scopemap.flow.dis import DisFlow
+from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.mapping import Backend, FrameCorrection
 
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)
 PLANE_MM = 50.0
@@ -56,3 +61,21 @@ def _texture() -> np.ndarray:
     noise = np.random.default_rng(7).normal(size=(_TEXTURE, _TEXTURE, 3)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
     return np.clip(128 + 40 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def frame(
+    T_world_camera: np.ndarray, index: int = 0, T_tracked: np.ndarray | None = None, factor: float = 1.0
+) -> Frame:
+    """The view from a pose, tracked at `T_tracked`, None: there; its depth times `factor`."""
+    view = see(T_world_camera)
+    depth_mm = (factor * view.depth_mm).astype(np.float32)
+    T = T_world_camera if T_tracked is None else T_tracked
+    return Frame(index, index / 30, view.rgb, CAMERA, EVERYWHERE, depth_mm, T)
+
+
+def adjusted(frames: Iterable[Frame], settings: MappingSettings | None = None) -> FrameCorrection:
+    """The back end's correction of keyframes, tracked one after the other."""
+    backend = Backend(settings or MappingSettings(), DisFlow())
+    for keyframe in frames:
+        backend.add(keyframe)
+    return backend.adjust()

@@ -32,11 +32,7 @@ POSES = [
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
-    """View number `number` of the plane, tracked at `T_tracked`, with depth times `factor`."""
-    view = plane_scene.see(POSES[number])
-    T = view.T_world_camera if T_tracked is None else T_tracked
-    depth_mm = (factor * view.depth_mm).astype(np.float32)
-    return Frame(10 * number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm, T)
+    return plane_scene.frame(POSES[number], 10 * number, T_tracked, factor)
 
 
 def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, float]:
@@ -47,10 +43,7 @@ def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, flo
 def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
     drift = [se3_exp(0.01 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
-    backend = Backend(MappingSettings(), DisFlow())
-    for number in (0, 1, 3, 4, 5):
-        backend.add(_frame(number, tracked[number]))
-    correction = backend.adjust()
+    correction = plane_scene.adjusted(_frame(number, tracked[number]) for number in (0, 1, 3, 4, 5))
     before = _errors(tracked, POSES)
     rotation_rad, translation_mm = _errors([correction.pose(10 * n, T) for n, T in enumerate(tracked)], POSES)
     assert before[0] > 0.05
@@ -61,10 +54,9 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    backend = Backend(MappingSettings(advanced=MappingAdvanced(depth_sigma_share=0.05, scale_sigma=0.3)), DisFlow())
-    for number in range(6):
-        backend.add(_frame(number, factor=0.8 if number == 2 else 1.0))
-    correction = backend.adjust()
+    settings = MappingSettings(advanced=MappingAdvanced(depth_sigma_share=0.05, scale_sigma=0.3))
+    frames = [_frame(number, factor=0.8 if number == 2 else 1.0) for number in range(6)]
+    correction = plane_scene.adjusted(frames, settings)
     factors = np.array([correction.depth_factor(10 * number) for number in range(6)])
     assert factors[2] / np.delete(factors, 2).mean() == pytest.approx(1.25, rel=0.03)
     assert correction.depth_factor(15) == pytest.approx(np.sqrt(factors[1] * factors[2]))
@@ -114,10 +106,7 @@ def test_corners_are_detected_on_usable_tissue_only() -> None:
 
 def test_keyframes_without_corners_change_nothing() -> None:
     speckled = np.random.default_rng(0).random(plane_scene.EVERYWHERE.shape) < 0.6
-    backend = Backend(MappingSettings(), DisFlow())
-    for number in range(3):
-        backend.add(replace(_frame(number), valid=speckled))
-    correction = backend.adjust()
+    correction = plane_scene.adjusted(replace(_frame(number), valid=speckled) for number in range(3))
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
     assert "no common observations" in correction.notice.text
 
@@ -142,18 +131,6 @@ def test_an_error_with_a_keyframe_is_raised_at_a_later_call(monkeypatch: pytest.
         backend.adjust()
 
 
-def test_before_and_after_all_keyframes_the_nearest_correction_is_used() -> None:
-    T = np.stack([se3_exp(np.array([0, 0, 0.1 * k, k, 0, 0.0])) for k in range(3)])
-    correction = FrameCorrection(np.array([10, 20, 40]), T, np.log([1.0, 1.1, 1.3]))
-    np.testing.assert_allclose(correction.pose(3, np.eye(4)), T[0])
-    np.testing.assert_allclose(correction.pose(20, np.eye(4)), T[1])
-    np.testing.assert_allclose(correction.pose(99, np.eye(4)), T[2])
-    assert correction.depth_factor(99) == pytest.approx(1.3)
-    middle = correction.pose(30, np.eye(4))
-    assert rotation_angle_rad(middle[:3, :3]) == pytest.approx(0.15)
-    assert "as tracked" in correction.notice.text
-
-
 def _tracked(keyframe: int, x_mm: float, segment: int = 0) -> TrackedPose:
     return TrackedPose(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), segment)
 
@@ -165,19 +142,45 @@ def test_corrections_are_interpolated_by_the_camera_motion() -> None:
     for index, share in ((0, 0), (2, 0.1), (5, 0.2), (7, 0.9), (10, 1)):
         assert correction.pose(index, np.eye(4))[0, 3] == pytest.approx(4 * share)
         assert correction.depth_factor(index) == pytest.approx(2.0**share)
+    # Before and after all keyframes the nearest correction holds.
+    np.testing.assert_array_equal(replace(correction, index=correction.index + 5).pose(3, np.eye(4)), T[0])
+    assert correction.depth_factor(99) == pytest.approx(2.0)
+    assert "as tracked" in correction.notice.text
     # Frame 4 has no tracked pose, and a camera at rest has no motion: time is used.
     assert correction.pose(4, np.eye(4))[0, 3] == pytest.approx(1.6)
     resting = replace(correction, tracked={0: _tracked(0, 3), 5: _tracked(0, 3), 10: _tracked(0, 3)})
     assert resting.pose(5, np.eye(4))[0, 3] == pytest.approx(2.0)
 
 
-def test_after_relocalisation_the_next_keyframes_correction_is_used() -> None:
-    T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(4)])
-    # Frames up to 23 follow keyframe 20; the next are relocalised against keyframe 10, and keyframe 30 follows.
-    tracked = {0: _tracked(0, 0), 10: _tracked(0, 1), 20: _tracked(10, 2), 30: _tracked(10, 3)}
-    tracked |= {22: _tracked(20, 2.2), 26: _tracked(10, 2.6), 33: _tracked(30, 3.3), 35: _tracked(20, 3.5)}
-    correction = FrameCorrection(np.array([0, 10, 20, 30]), T, np.zeros(4), tracked=tracked, depth_mm=50.0)
-    for index, of in ((20, 2), (22, 2), (26, 3), (30, 3), (33, 3), (35, 2)):
+@pytest.mark.parametrize(
+    ("keyframes", "tracked", "expected"),
+    [
+        # Frames up to 23 follow keyframe 20; the next are relocalised against keyframe 10, and keyframe 30 follows.
+        (
+            (0, 10, 20, 30),
+            {
+                **{0: _tracked(0, 0), 10: _tracked(0, 1), 20: _tracked(10, 2), 30: _tracked(10, 3)},
+                **{22: _tracked(20, 2.2), 26: _tracked(10, 2.6), 33: _tracked(30, 3.3), 35: _tracked(20, 3.5)},
+            },
+            {20: 2, 22: 2, 26: 3, 30: 3, 33: 3, 35: 2},
+        ),
+        # Frames 4 and 5 were lost; the next are relocalised against keyframe 0, and keyframe 10 follows.
+        (
+            (0, 10),
+            {
+                **{0: _tracked(0, 0), 2: _tracked(0, 0.2), 7: _tracked(0, 0.7, 2)},
+                **{10: _tracked(0, 1, 2), 12: _tracked(10, 1.2, 2)},
+            },
+            {2: 0, 7: 1, 12: 1},
+        ),
+    ],
+)
+def test_corrections_are_not_interpolated_across_a_loss(
+    keyframes: tuple[int, ...], tracked: dict[int, TrackedPose], expected: dict[int, int]
+) -> None:
+    T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(len(keyframes))])
+    correction = FrameCorrection(np.array(keyframes), T, np.zeros(len(T)), tracked=tracked, depth_mm=50.0)
+    for index, of in expected.items():
         np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
 
 
@@ -188,18 +191,10 @@ def test_motion_and_depth_of_a_merged_map_are_converted_to_the_common_world() ->
     merged = {0: Similarity.identity(), 1: Similarity(2.0, np.eye(3), np.array([5.0, 0, 0]))}
     T, depth_mm = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))]), np.full((10, 12), 20.0, np.float32)
     # The origin of map 1 is at 5 mm in the common world, and its scale is 2.
-    tracked = {
-        10: TrackedPose(1, 10, np.eye(4)),
-        14: _tracked(10, 1.0)._replace(map=1),
-        20: _tracked(10, 4.0)._replace(map=1),
-    }
+    tracked = {index: _tracked(10, x_mm)._replace(map=1) for index, x_mm in ((10, 0.0), (14, 1.0), (20, 4.0))}
+    fields = (field, field)
     correction = FrameCorrection(
-        np.array([10, 20]),
-        T,
-        np.zeros(2),
-        depth_fields=(field, field),
-        S_common_map=merged,
-        tracked=tracked,
+        np.array([10, 20]), T, np.zeros(2), depth_fields=fields, S_common_map=merged, tracked=tracked
     )
     assert correction.pose(14, tracked[14].T_world_camera)[0, 3] == pytest.approx(5 + 2 + 1)
     expected = 2 * np.exp(field.log_factor(2 * depth_mm))
@@ -217,32 +212,15 @@ def test_few_points_with_another_depth_do_not_refuse_the_adjustment(certain: int
     assert bool(contradiction(points, found, MappingAdvanced())) == refused
 
 
-def test_corrections_are_not_interpolated_across_a_loss() -> None:
-    T = np.stack([se3_exp(np.array([0, 0, 0, 1.0 * k, 0, 0])) for k in range(2)])
-    # Frames 4 and 5 were lost; the next are relocalised against keyframe 0, and keyframe 10 follows.
-    tracked = {
-        0: _tracked(0, 0),
-        2: _tracked(0, 0.2),
-        7: _tracked(0, 0.7, 2),
-        10: _tracked(0, 1, 2),
-        12: _tracked(10, 1.2, 2),
-    }
-    correction = FrameCorrection(np.array([0, 10]), T, np.zeros(2), tracked=tracked, depth_mm=50.0)
-    for index, of in ((2, 0), (7, 1), (12, 1)):
-        np.testing.assert_allclose(correction.pose(index, np.eye(4)), T[of], atol=1e-12)
-
-
 def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
-    rng = np.random.default_rng(1)
-    backend = Backend(MappingSettings(), DisFlow())
+    rng, frames = np.random.default_rng(1), []
     x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
-    for number in range(5):
-        frame = _frame(number)
+    for frame in map(_frame, range(5)):
         # A smooth deformation that differs between keyframes, by some 3 px.
         swell = cv2.resize(rng.normal(0, 3, (4, 5, 2)).astype(np.float32), (240, 180), interpolation=cv2.INTER_CUBIC)
         moved = cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR)
-        backend.add(replace(frame, rgb=moved))
-    correction = backend.adjust()
+        frames.append(replace(frame, rgb=moved))
+    correction = plane_scene.adjusted(frames)
     assert correction.refused
     assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
@@ -253,14 +231,9 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
 def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
     factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
     for most, refused in ((0.2, True), (0.6, False)):
-        backend = Backend(
-            MappingSettings(advanced=MappingAdvanced(max_depth_change=most, depth_sigma_share=0.5)), DisFlow()
-        )
-        for number in range(5):
-            frame = _frame(number)
-            assert frame.depth_mm is not None
-            backend.add(replace(frame, depth_mm=frame.depth_mm * factors))
-        correction = backend.adjust()
+        settings = MappingSettings(advanced=MappingAdvanced(max_depth_change=most, depth_sigma_share=0.5))
+        frames = [replace(frame, depth_mm=frame.depth_mm * factors) for frame in map(_frame, range(5))]
+        correction = plane_scene.adjusted(frames, settings)
         assert bool(correction.refused) == refused
         assert ("depth would have to change by" in correction.notice.text) == refused
 
@@ -279,10 +252,7 @@ def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkey
     monkeypatch.setattr(FeatureTracks, "collected", biased)
     drift = [se3_exp(0.003 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
-    backend = Backend(MappingSettings(), DisFlow())
-    for number in range(6):
-        backend.add(_frame(number, tracked[number]))
-    correction = backend.adjust()
+    correction = plane_scene.adjusted(_frame(number, T) for number, T in enumerate(tracked))
     assert correction.sigma_px < 0.8
     assert (correction.notice.code == "mapping-depth-disagrees") == bool(zoom)
     before = _errors(tracked, POSES)
@@ -299,19 +269,15 @@ def test_disagreement_of_depth_is_that_of_keyframes_that_see_the_same() -> None:
     every, far = depth_disagreement(CAMERA, T, grids, (1, 2))
     assert far == pytest.approx(np.log(1.1), abs=0.01)
     assert 0.01 < every < 0.1
+    # OpenCV takes no image of more than 32,767 columns: 43,200 pixels are compared at once.
+    large, flat = PinholeCamera(900.0, 900.0, 959.5, 719.5, 1920, 1440), np.full((180, 240), 50.0, np.float32)
+    assert max(depth_disagreement(large, np.tile(np.eye(4), (2, 1, 1)), [flat, flat], (1,))) < 1e-5
     # Keyframes that look elsewhere, and a single one, are not compared.
     T[:, :3, 3] += [[0, 0, 0], [500, 0, 0], [1000, 0, 0]]
     assert np.isnan(depth_disagreement(CAMERA, T, grids, (1, 2))).all()
     assert np.isnan(depth_disagreement(CAMERA, T[:1], grids[:1], (1, 2))).all()
     unknown = np.full_like(grids[0], np.nan)
     assert np.isnan(depth_disagreement(CAMERA, T, [unknown] * len(T), (1,))).all()
-
-
-def test_disagreement_of_depth_takes_large_images() -> None:
-    # 43,200 compared pixels: OpenCV takes no image of more than 32,767 columns.
-    camera = PinholeCamera(1920, 1440, 900.0, 900.0, 959.5, 719.5)
-    grid = depth_grid(np.full((1440, 1920), 50.0, np.float32), np.ones((1440, 1920), bool))
-    assert max(depth_disagreement(camera, np.tile(np.eye(4), (2, 1, 1)), [grid, grid], (1,))) < 1e-5
 
 
 def test_adjusting_without_keyframes_raises() -> None:

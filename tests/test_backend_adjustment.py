@@ -6,42 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, transform
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors
 
-FOCAL_PX = 150.0
-KEYFRAMES, PER_KEYFRAME = 6, 80
-LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
-
-
-def _world(rng: np.random.Generator) -> tuple[np.ndarray, Points, Observations]:
-    """True poses (camera from world), points with true depth, and their exact observations."""
-    twists = [np.append(rng.normal(0, 0.02, 3), [1.5 * k, 0.6 * np.sin(k), 0.8 * k]) for k in range(KEYFRAMES)]
-    T = np.stack([inverse(se3_exp(twist)) for twist in twists])
-    T = T @ inverse(T[0])
-    pixels = rng.uniform([-70, -54], [70, 54], (KEYFRAMES * PER_KEYFRAME, 2))
-    rays = np.column_stack([pixels / FOCAL_PX, np.ones(len(pixels))])
-    host = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME)
-    depth_mm = rng.uniform(25, 60, len(host))
-    seen = []
-    for p, (h, ray, depth) in enumerate(zip(host, rays, depth_mm, strict=True)):
-        for t in (h - 2, h - 1, h + 1, h + 2):
-            if 0 <= t < KEYFRAMES:
-                x = transform(T[t] @ inverse(T[h]), depth * ray)
-                seen.append((p, t, *(FOCAL_PX * x[:2] / x[2])))
-    table = np.array(seen)
-    observations = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
-    return T, Points(host, pixels, np.log(depth_mm), np.full(len(host), 0.1)), observations
-
-
-def _tracked(
-    T: np.ndarray, rng: np.random.Generator, rotation_rad: float = 0.02, translation_mm: float = 0.8
-) -> np.ndarray:
-    """True poses with errors; the first is kept."""
-    errors = [se3_exp(rng.normal(0, [rotation_rad] * 3 + [translation_mm] * 3)) for _ in T[1:]]
-    return np.stack([T[0], *(error @ pose for error, pose in zip(errors, T[1:], strict=True))])
+LOOSE = Priors(rotation_rad=10, translation_share=10)
 
 
 def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -49,44 +20,26 @@ def _pose_errors(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(rotation_angle_rad(off[:, :3, :3]).max()), float(np.linalg.norm(off[:, :3, 3], axis=1).max())
 
 
-def test_exact_observations_and_depths_recover_exact_poses() -> None:
-    rng = np.random.default_rng(0)
-    T, points, observations = _world(rng)
-    found = adjust(
-        BundleProblem(
-            _tracked(T, rng), points, observations, Priors(rotation_rad=10, translation_share=10), LINE, FOCAL_PX
-        )
-    )
-    rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
-    assert rotation_rad < 1e-4
-    assert translation_mm < 1e-2
-    assert np.abs(found.state.log_depth - points.log_depth).max() < 1e-3
-    assert found.sigma_px == pytest.approx(0.1)  # its floor
-
-
-@pytest.mark.parametrize("window", [2, 3, 4])
-def test_windows_of_exact_data_recover_exact_poses(window: int) -> None:
+@pytest.mark.parametrize("window", [2, 3, 4, None])
+def test_exact_observations_and_depths_recover_exact_poses(window: int | None) -> None:
     rng = np.random.default_rng(7)
-    T, points, observations = _world(rng)
-    loose = Priors(rotation_rad=10, translation_share=10)
-    found = adjust_in_windows(BundleProblem(_tracked(T, rng), points, observations, loose, LINE, FOCAL_PX), window)
+    T, points, observations = world(rng)
+    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX)
+    found = adjust(problem) if window is None else adjust_in_windows(problem, window)
     rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
     assert rotation_rad < 3e-4
     assert translation_mm < 3e-2
     assert np.abs(found.state.log_depth - points.log_depth).max() < 3e-3
     assert np.isfinite(found.log_depth_sigma).all()
-    assert found.sigma_px == pytest.approx(0.1)
+    assert found.sigma_px == pytest.approx(0.1)  # its floor
 
 
 def test_windows_lose_little_against_all_keyframes_at_once() -> None:
     rng = np.random.default_rng(8)
-    T, points, observations = _world(rng)
+    T, points, observations = world(rng)
     noisy = replace(observations, pixel=observations.pixel + rng.normal(0, 0.3, observations.pixel.shape))
-    tracked, wrong = (
-        _tracked(T, rng),
-        replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host))),
-    )
-    problem = BundleProblem(tracked, wrong, noisy, Priors(), LINE, FOCAL_PX)
+    start, wrong = tracked(T, rng), replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
+    problem = BundleProblem(start, wrong, noisy, Priors(), LINE, FOCAL_PX)
     at_once, windowed = adjust(problem), adjust_in_windows(problem, 3)
     one = adjust_in_windows(problem, KEYFRAMES).state
     assert one.T_camera_world.tobytes() == at_once.state.T_camera_world.tobytes()
@@ -99,49 +52,39 @@ def test_windows_lose_little_against_all_keyframes_at_once() -> None:
 @pytest.mark.parametrize("window", [2, 3])
 def test_a_window_that_nothing_is_observed_in_goes_on_as_tracked(window: int) -> None:
     rng = np.random.default_rng(9)
-    T, points, observations = _world(rng)
+    T, points, observations = world(rng)
     early = np.maximum(points.host[observations.point], observations.keyframe) < 3
     some = Observations(observations.point[early], observations.keyframe[early], observations.pixel[early])
-    tracked = _tracked(T, rng)
-    loose = Priors(rotation_rad=10, translation_share=10)
-    problem = BundleProblem(tracked, points, some, loose, LINE, FOCAL_PX)
+    start = tracked(T, rng)
+    problem = BundleProblem(start, points, some, LOOSE, LINE, FOCAL_PX)
     found, last = adjust_in_windows(problem, window).state.T_camera_world, 5 - window
     for k in range(last + 1, KEYFRAMES):
-        np.testing.assert_allclose(found[k] @ inverse(found[last]), tracked[k] @ inverse(tracked[last]), atol=1e-9)
+        np.testing.assert_allclose(found[k] @ inverse(found[last]), start[k] @ inverse(start[last]), atol=1e-9)
     assert _pose_errors(found[:3], T[:3])[1] < 3e-2
 
 
 def test_a_wrong_depth_scale_of_one_keyframe_is_found() -> None:
     rng = np.random.default_rng(1)
-    T, points, observations = _world(rng)
-    wrong = replace(
-        points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=np.full(len(points.host), 0.02)
-    )
-    found = adjust(
-        BundleProblem(
-            _tracked(T, rng),
-            wrong,
-            observations,
-            Priors(scale=0.3, rotation_rad=10, translation_share=10),
-            LINE,
-            FOCAL_PX,
-        )
-    )
+    T, points, observations = world(rng)
+    sigma = np.full(len(points.host), 0.02)
+    wrong = replace(points, log_depth=points.log_depth - 0.2 * (points.host == 3), sigma=sigma)
+    priors = replace(LOOSE, scale=0.3)
+    found = adjust(BundleProblem(tracked(T, rng), wrong, observations, priors, LINE, FOCAL_PX))
     assert found.state.log_scale[3] - np.delete(found.state.log_scale, 3).mean() == pytest.approx(0.2, abs=0.02)
     assert _pose_errors(found.state.T_camera_world, T)[0] < 2e-3
 
 
 def test_a_fifth_of_outliers_does_little_harm() -> None:
     rng = np.random.default_rng(2)
-    T, points, observations = _world(rng)
+    T, points, observations = world(rng)
     pixel = observations.pixel + rng.normal(0, 0.3, observations.pixel.shape)
     wild = rng.random(len(pixel)) < 0.2
     pixel[wild] += rng.uniform(-20, 20, (int(wild.sum()), 2))
-    tracked = _tracked(T, rng)
+    start = tracked(T, rng)
     noisy = replace(points, log_depth=points.log_depth + rng.normal(0, 0.1, len(points.host)))
-    found = adjust(BundleProblem(tracked, noisy, replace(observations, pixel=pixel), Priors(), LINE, FOCAL_PX))
+    found = adjust(BundleProblem(start, noisy, replace(observations, pixel=pixel), Priors(), LINE, FOCAL_PX))
     rotation_rad, translation_mm = _pose_errors(found.state.T_camera_world, T)
-    rotation_before, translation_before = _pose_errors(tracked, T)
+    rotation_before, translation_before = _pose_errors(start, T)
     assert rotation_rad < 0.2 * rotation_before
     assert translation_mm < 0.3 * translation_before
     assert found.sigma_px == pytest.approx(0.3, rel=0.6)
@@ -149,23 +92,11 @@ def test_a_fifth_of_outliers_does_little_harm() -> None:
 
 def test_without_observations_nothing_changes() -> None:
     rng = np.random.default_rng(3)
-    T, points, _ = _world(rng)
+    T, points, _ = world(rng)
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     found = adjust(BundleProblem(T, points, nothing, Priors(), LINE, FOCAL_PX))
     np.testing.assert_array_equal(found.state.T_camera_world, T)
     assert found.iterations == 0
-
-
-def test_the_tracked_motion_stays_where_there_are_no_observations() -> None:
-    rng = np.random.default_rng(4)
-    T, points, observations = _world(rng)
-    # The last two keyframes share no observation with the others.
-    known = (observations.keyframe < 4) & (points.host[observations.point] < 4)
-    some = Observations(observations.point[known], observations.keyframe[known], observations.pixel[known])
-    tracked = _tracked(T, rng)
-    found = adjust(BundleProblem(tracked, points, some, Priors(), LINE, FOCAL_PX)).state.T_camera_world
-    np.testing.assert_allclose(found[5] @ inverse(found[4]), tracked[5] @ inverse(tracked[4]), atol=0.02)
-    np.testing.assert_allclose(found[4] @ inverse(found[3]), tracked[4] @ inverse(tracked[3]), atol=0.02)
 
 
 def test_depth_uncertainty_follows_from_the_baseline() -> None:

@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import plane_scene
 import pytest
+from drawn_bundle import FOCAL_PX, LINE, tracked, world
 from plane_scene import CAMERA
-from test_backend_adjustment import FOCAL_PX, LINE, _tracked, _world
 
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
 from scopemap.flow.corners import normalised_brightness, refined_corners
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator
-from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.bundle_adjustment import adjust
 from scopemap.mapping.feature_tracks import FeatureTracks
@@ -44,8 +43,7 @@ def _errors_px(flow: FlowEstimator, gap: int, step_mm: float) -> np.ndarray:
     poses = [plane_scene.pose(at_mm=(step_mm * n, 0.0, 0.0)) for n in range(gap + 1)]
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(gap,))), flow)
     for number, pose in enumerate(poses):
-        view = plane_scene.see(pose)
-        tracks.add(Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose))
+        tracks.add(plane_scene.frame(pose, number))
     points, observations = tracks.collected()
     host = points.host[observations.point]
     errors = []
@@ -76,9 +74,7 @@ def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_b
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2, 3))), DisFlow())
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
-        view = plane_scene.see(pose)
-        frame = Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose)
-        tracks.add(frame, map_number)
+        tracks.add(plane_scene.frame(pose, number), map_number)
         if map_number == 1:
             assert all(past.composed is None for past in tracks._recent[0])
     points, observations = tracks.collected()
@@ -91,10 +87,8 @@ def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_b
 
 def test_patches_that_differ_are_no_observations() -> None:
     view, rng = plane_scene.see(plane_scene.pose()), np.random.default_rng(0)
-    image, other = (
-        normalised_brightness(view.rgb),
-        normalised_brightness(rng.integers(0, 255, view.rgb.shape, np.uint8)),
-    )
+    noise = rng.integers(0, 255, view.rgb.shape, np.uint8)
+    image, other = normalised_brightness(view.rgb), normalised_brightness(noise)
     corners = np.stack(np.meshgrid(np.arange(30, 210, 20), np.arange(30, 150, 20)), -1).reshape(-1, 2)
     kept, pixels = refined_corners(image, image, corners, corners + rng.uniform(-0.7, 0.7, corners.shape))
     assert len(kept) > 0.95 * len(corners)
@@ -113,9 +107,9 @@ def test_normalised_brightness_forgets_the_lamp() -> None:
 
 def test_observations_that_share_their_errors_count_as_one() -> None:
     rng = np.random.default_rng(3)
-    T, points, observations = _world(rng)
+    T, points, observations = world(rng)
     observations = replace(observations, pixel=observations.pixel + rng.normal(0, 3.0, observations.pixel.shape))
-    once = BundleProblem(_tracked(T, rng), points, observations, Priors(translation_share=0.002), LINE, FOCAL_PX)
+    once = BundleProblem(tracked(T, rng), points, observations, Priors(translation_share=0.002), LINE, FOCAL_PX)
     repeated = Observations(*(np.repeat(part, 4, axis=0) for part in observations.__dict__.values()))
     problems = once, replace(once, observations=repeated, correlated=4.0), replace(once, observations=repeated)
     wanted, found, trusted = (adjust(p, max_iterations=50, min_decrease=1e-8).state for p in problems)
@@ -132,8 +126,7 @@ def test_less_than_one_observation_is_refused() -> None:
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
     for number in range(4):
-        view = plane_scene.see(pose := plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)))
-        tracks.add(Frame(number, number / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, pose))
+        tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
     points, observations = tracks.collected()
     most = len(observations.point) // 3 + 1
     fewer_points, fewer = tracks.collected(most_observations=most)

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import plane_scene
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
-from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.mapping import MAX_LOG_FACTOR, Backend, FrameCorrection
+from scopemap.mapping import MAX_LOG_FACTOR, FrameCorrection
 from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
 from scopemap.mapping.submaps import corrected_frame
 
@@ -50,9 +50,8 @@ def test_surfaces_at_two_depths_get_separate_factors_where_they_overlap() -> Non
     rng = np.random.default_rng(1)
     places = rng.random((800, 2))
     near = rng.random(800) < 0.5
-    field = fit_depth_correction(
-        places, np.where(near, np.log(30), np.log(70)), np.where(near, 0.3, -0.2), np.full(800, 0.01), 0.2
-    )
+    log_depth, error = np.where(near, np.log(30), np.log(70)), np.where(near, 0.3, -0.2)
+    field = fit_depth_correction(places, log_depth, error, np.full(800, 0.01), 0.2)
     depth_mm = np.full((HEIGHT, WIDTH), 70, np.float32)
     depth_mm[::2] = 30
     found = field.log_factor(depth_mm)
@@ -71,26 +70,18 @@ def test_a_quarter_of_outliers_does_little_harm() -> None:
     assert np.abs(clean - spoilt).mean() < 0.015
 
 
-def test_uncertain_points_change_nothing() -> None:
+@pytest.mark.parametrize(("count", "sigma"), [(600, np.inf), (600, 1e3), (9, 0.01)])
+def test_uncertain_or_few_points_change_nothing(count: int, sigma: float) -> None:
     rng = np.random.default_rng(3)
-    places, log_depth = _points(rng)
-    wild = rng.normal(0, 1, len(log_depth))
-    for sigma in (np.full(len(wild), np.inf), np.full(len(wild), 1e3)):
-        field = fit_depth_correction(places, log_depth, wild, sigma, 0.1)
-        assert np.abs(field.log_factor(_image(rng))).max() < 1e-3
-
-
-def test_fewer_than_ten_points_change_nothing() -> None:
-    places, log_depth = _points(np.random.default_rng(4), 9)
-    field = fit_depth_correction(places, log_depth, np.full(9, 0.3), np.full(9, 0.01), 0.1)
-    np.testing.assert_array_equal(field.values, 0)
+    places, log_depth = _points(rng, count)
+    field = fit_depth_correction(places, log_depth, rng.normal(0, 1, count), np.full(count, sigma), 0.1)
+    assert np.abs(field.log_factor(_image(rng))).max() < 1e-3
 
 
 def test_points_of_equal_depth_do_not_divide_by_zero() -> None:
     places, _ = _points(np.random.default_rng(5))
-    field = fit_depth_correction(
-        places, np.full(len(places), 3.7), np.full(len(places), 0.2), np.full(len(places), 0.01), 0.1
-    )
+    log_depth, error, sigma = (np.full(len(places), value) for value in (3.7, 0.2, 0.01))
+    field = fit_depth_correction(places, log_depth, error, sigma, 0.1)
     np.testing.assert_allclose(field.log_factor(np.full((8, 8), np.exp(3.7), np.float32)), 0.2, atol=0.01)
 
 
@@ -117,16 +108,8 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
     depth_mm = np.array([[30.0, np.nan]], np.float32)
     for index, log in ((0, 0.1), (10, 0.1), (15, 0.2 + 0.1), (20, 0.3 + 0.2), (99, 0.3 + 0.2)):
         np.testing.assert_allclose(correction.depth_factors(index, depth_mm), np.exp([[log, np.nan]]), rtol=1e-5)
-    frame = Frame(
-        15,
-        0.0,
-        np.zeros((1, 2, 3), np.uint8),
-        plane_scene.CAMERA.resized(2, 1),
-        np.ones((1, 2), bool),
-        depth_mm,
-        np.eye(4),
-        depth_sigma_mm=np.array([[3.0, np.nan]], np.float32),
-    )
+    camera, rgb, valid = plane_scene.CAMERA.resized(2, 1), np.zeros((1, 2, 3), np.uint8), np.ones((1, 2), bool)
+    frame = Frame(15, 0.0, rgb, camera, valid, depth_mm, np.eye(4), depth_sigma_mm=0.1 * depth_mm)
     done = corrected_frame(frame, correction)
     assert done.depth_sigma_mm is not None
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
@@ -135,12 +118,10 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
 
 def _bent(number: int) -> Frame:
     """View of the plane whose depth is wrong by up to 30 %, varying from left to right, as a network's is."""
-    at = (2.0 * number, 0.6 * number, 0.5 * number)
-    view = plane_scene.see(plane_scene.pose(at_mm=at, turn_rad=(0.01 * number, -0.01 * number, 0.02 * number)))
-    assert view.depth_mm is not None
-    bend = np.exp(0.3 * np.sin(np.linspace(-2, 2, view.depth_mm.shape[1]))).astype(np.float32)
-    depth_mm = (view.depth_mm * bend).astype(np.float32)
-    return Frame(number, 0.0, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, view.T_world_camera)
+    at_mm, turn_rad = (2.0 * number, 0.6 * number, 0.5 * number), (0.01 * number, -0.01 * number, 0.02 * number)
+    frame = plane_scene.frame(plane_scene.pose(at_mm=at_mm, turn_rad=turn_rad), number)
+    bend = np.exp(0.3 * np.sin(np.linspace(-2, 2, plane_scene.CAMERA.width))).astype(np.float32)
+    return replace(frame, depth_mm=frame.depth_mm * bend)
 
 
 def _shape_error(frame: Frame, factors: np.ndarray) -> float:
@@ -155,10 +136,8 @@ def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
     frames = [_bent(number) for number in range(6)]
     results = {}
     for step_sigma in (0.0, 0.1):
-        backend = Backend(MappingSettings(advanced=MappingAdvanced(depth_step_sigma=step_sigma)), DisFlow())
-        for frame in frames:
-            backend.add(frame)
-        correction = backend.adjust()
+        settings = MappingSettings(advanced=MappingAdvanced(depth_step_sigma=step_sigma))
+        correction = plane_scene.adjusted(frames, settings)
         assert not correction.refused
         results[step_sigma] = [_shape_error(f, correction.depth_factors(f.index, f.depth_mm)) for f in frames]
     assert min(results[0.0]) > 0.1
@@ -166,23 +145,15 @@ def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
 
 
 def test_depth_stays_where_the_adjustment_is_refused() -> None:
-    backend = Backend(MappingSettings(advanced=MappingAdvanced(max_sigma_px=1e-6)), DisFlow())
     frames = [_bent(number) for number in range(4)]
-    for frame in frames:
-        backend.add(frame)
-    correction = backend.adjust()
+    correction = plane_scene.adjusted(frames, MappingSettings(advanced=MappingAdvanced(max_sigma_px=1e-6)))
     assert correction.refused
     np.testing.assert_array_equal(correction.depth_factors(2, frames[2].depth_mm), 1.0)
 
 
 def test_pure_rotation_does_not_change_depth() -> None:
-    backend = Backend(MappingSettings(), DisFlow())
-    frames = []
-    for number in range(5):
-        view = plane_scene.see(plane_scene.pose(turn_rad=(0.01 * number, -0.012 * number, 0.02 * number)))
-        seen = replace(_bent(0), rgb=view.rgb, depth_mm=view.depth_mm, T_world_camera=view.T_world_camera)
-        frames.append(replace(seen, index=number))
-        backend.add(frames[-1])
-    correction = backend.adjust()
+    turns_rad = [(0.01 * number, -0.012 * number, 0.02 * number) for number in range(5)]
+    frames = [plane_scene.frame(plane_scene.pose(turn_rad=turn), number) for number, turn in enumerate(turns_rad)]
+    correction = plane_scene.adjusted(frames)
     for frame in frames:
         np.testing.assert_allclose(correction.depth_factors(frame.index, frame.depth_mm), 1.0, atol=0.05)

@@ -8,14 +8,12 @@ from itertools import pairwise
 import numpy as np
 import plane_scene
 import pytest
-from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
-from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping import Backend, TrackedPose
+from scopemap.mapping import TrackedPose
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
 from scopemap.mapping.loop_closure import Loop, LoopFinder
 from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
@@ -30,10 +28,11 @@ SETTINGS = MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2)))
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
-    view = plane_scene.see(POSES[number])
-    T = view.T_world_camera if T_tracked is None else T_tracked
-    depth_mm = (factor * view.depth_mm).astype(np.float32)
-    return Frame(10 * number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm, T)
+    return plane_scene.frame(POSES[number], 10 * number, T_tracked, factor)
+
+
+def _sideways(number: int, x_mm: float) -> Frame:
+    return plane_scene.frame(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)), number)
 
 
 def _drifting() -> list[np.ndarray]:
@@ -49,7 +48,7 @@ def _off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(rotation_angle_rad(off[:3, :3])), float(np.linalg.norm(off[:3, 3]))
 
 
-def test_a_place_seen_again_is_found_with_its_relative_pose() -> None:
+def test_a_revisited_place_is_found_with_its_relative_pose() -> None:
     finder = LoopFinder(SETTINGS)
     loops = [loop for number in range(COUNT) for loop in finder.add(_frame(number, factor=1.0 + 0.02 * number))]
     assert any(loop.past + loop.new == COUNT - 1 for loop in loops)
@@ -64,7 +63,7 @@ def test_a_place_seen_again_is_found_with_its_relative_pose() -> None:
 
 
 @pytest.mark.parametrize("candidates", [0, 3])
-def test_all_keyframes_of_two_maps_are_weighed_at_the_end(candidates: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.mapping.loop_closure._CANDIDATES", candidates)
     finder, map_of = LoopFinder(SETTINGS), [0] * len(OUT) + [1] * (COUNT - len(OUT))
     first = [loop for number in range(COUNT) for loop in finder.add(_frame(number), map_of[number])]
@@ -84,18 +83,14 @@ def test_all_keyframes_of_two_maps_are_weighed_at_the_end(candidates: int, monke
 def test_a_camera_that_never_returns_closes_no_loop() -> None:
     finder = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
     for number, x_mm in enumerate((-60.0, 30.0, 45.0, 60.0)):
-        view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
-        frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
-        assert not [loop for loop in finder.add(frame) if loop.past == 0]
+        assert not [loop for loop in finder.add(_sideways(number, x_mm)) if loop.past == 0]
 
 
 def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.mapping.loop_closure.MOST_SEARCHED", 6)
     finder, kept, loops = LoopFinder(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,)))), [], []
     for number, x_mm in enumerate([*np.linspace(-60.0, 60.0, 17), -60.0]):
-        view = plane_scene.see(plane_scene.pose(at_mm=(x_mm, 0.0, 0.0)))
-        frame = Frame(number, number / 3, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)
-        loops = finder.add(frame)
+        loops = finder.add(_sideways(number, x_mm))
         kept.append(len(finder._features))
     assert max(kept) == 6
     assert [(loop.past, loop.new) for loop in loops if loop.past == 0] == [(0, 17)]
@@ -157,10 +152,7 @@ def test_one_false_loop_is_an_outlier() -> None:
 def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()
     settings = SETTINGS if closing else SETTINGS.model_copy(update={"min_loop_inliers": 0})
-    backend = Backend(settings, DisFlow())
-    for number in range(COUNT):
-        backend.add(_frame(number, tracked[number]))
-    correction = backend.adjust()
+    correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     _, before = _off(tracked[-1], POSES[-1])
     _, after = _off(correction.pose(10 * (COUNT - 1), tracked[-1]), POSES[-1])
     assert before > 10
@@ -181,9 +173,6 @@ def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
 
 def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: pytest.MonkeyPatch) -> None:
     """The repeated adjustment starts from the poses as tracked."""
-    backend = Backend(SETTINGS, DisFlow())
-    for number, pose in enumerate(POSES[:12]):
-        backend.add(_frame(number, pose))
     starts = []
 
     def failing(problem: BundleProblem) -> BundleSolution:
@@ -192,7 +181,7 @@ def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: py
         return found if problem.start is None else replace(found, state=found.state._replace(sigma_px=9.9))
 
     monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
-    correction = backend.adjust()
+    correction = plane_scene.adjusted((_frame(number) for number in range(12)), SETTINGS)
     assert [start is None for start in starts] == [False, True]
     assert not correction.refused
     assert correction.loops == 0

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import fast_simplification
 import numpy as np
-import trimesh
-from scipy.sparse import coo_matrix
+import trimesh.smoothing
 from scipy.spatial import cKDTree
 
 from scopemap.config import FusionSettings
@@ -14,7 +13,7 @@ from scopemap.fusion.watertight import watertight
 from scopemap.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
-_SHRINK, _GROW = 0.5, -0.52
+_SHRINK, _GROW = 0.5, 0.52
 
 
 def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh:
@@ -51,16 +50,6 @@ def smoothed(mesh: trimesh.Trimesh, iterations: int) -> trimesh.Trimesh:
     """Return the mesh after so many pairs of steps, one that shrinks and one that grows; border vertices stay."""
     if not iterations or not len(mesh.faces):
         return mesh
-    edges = np.asarray(mesh.edges_unique)
-    both = np.concatenate([edges, edges[:, ::-1]]).T
-    neighbours = coo_matrix((np.ones(both.shape[1]), both), shape=(len(mesh.vertices),) * 2).tocsr()
-    count = np.maximum(np.asarray(neighbours.sum(axis=1)).ravel(), 1.0)[:, None]
-    inner = np.ones((len(mesh.vertices), 1))
-    inner[edges[np.bincount(mesh.edges_unique_inverse, minlength=len(edges)) == 1]] = 0
-    vertices = np.array(mesh.vertices)
-    for _ in range(iterations):
-        for share in (_SHRINK, _GROW):
-            vertices += share * inner * (neighbours @ vertices / count - vertices)
-    result = mesh.copy()
-    result.vertices = vertices
-    return result
+    border = np.unique(mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)])
+    laplacian = trimesh.smoothing.laplacian_calculation(mesh, pinned_vertices=border)
+    return trimesh.smoothing.filter_taubin(mesh.copy(), _SHRINK, _GROW, 2 * iterations, laplacian)
