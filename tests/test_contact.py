@@ -17,8 +17,7 @@ from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import MapisSettings, TrackingSettings
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis
+from scopemap.depth.mapis import DenseCorrespondence, Mapis
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping.submaps import Submap

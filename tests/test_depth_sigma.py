@@ -17,9 +17,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.correspondence import DenseCorrespondence
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.mapis import Mapis, RefinedDepth
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame

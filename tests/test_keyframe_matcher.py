@@ -16,7 +16,8 @@ from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.tracking.relocalisation import EarlierKeyframes, Keyframe
+from scopemap.tracking.keyframe_alignment import Keyframe
+from scopemap.tracking.relocalisation import EarlierKeyframes
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MapisSettings
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis, RefinedDepth, robust_scale
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth, robust_scale
 from scopemap.geometry.se3 import se3
 
 SHAPE = (48, 64)

@@ -19,10 +19,9 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import PRESETS, FusionSettings
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.correspondence import DenseMatcher
 from scopemap.depth.create import create_depth
 from scopemap.depth.estimate import DepthEstimate, PerceptualResult
-from scopemap.depth.mapis import Mapis
+from scopemap.depth.mapis import DenseMatcher, Mapis
 from scopemap.depth.shading import ShadingDepth
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowPair

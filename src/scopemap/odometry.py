@@ -11,8 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from scopemap.config import Config
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis, RefinedDepth
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.faults import StageFaults
 from scopemap.frame import Frame
 from scopemap.mapping.submaps import Mapper

@@ -16,6 +16,7 @@ import numpy as np
 from scopemap.errors import check_shape
 from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame
+from scopemap.geometry.local_contrast import local_contrast, local_mean
 from scopemap.geometry.se3 import inverse, transform
 
 _CORNER_BLOCK_PX = 5
@@ -180,7 +181,7 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     assert frame.depth_mm is not None
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     # On brightness relative to its surround: distant tissue is dark, not without texture.
-    level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
+    level = local_mean(grey.astype(np.float32), _SURROUND_PX) + _DARKEST
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
     usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
     # A patch that touches a mask's edge has a corner that is not the tissue's.
@@ -234,19 +235,9 @@ def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
 def normalised_brightness(rgb: np.ndarray) -> np.ndarray:
     """Return grey values (H, W) uint8 of an (H, W, 3) uint8 image, less their local mean, over their local contrast."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    relative = grey / (_surround(grey) + _DARKEST) - 1
-    contrast = np.sqrt(_surround(relative**2)) + _LEAST_CONTRAST
-    return np.clip(128 + _CONTRAST * relative / contrast, 0, 255).astype(np.uint8)
-
-
-def _surround(values: np.ndarray) -> np.ndarray:
-    """Return the local mean (H, W) float32 of values (H, W) float32."""
-    height, width = values.shape
-    small = (max(1, width // _LOW_RESOLUTION), max(1, height // _LOW_RESOLUTION))
-    mean = cv2.GaussianBlur(
-        cv2.resize(values, small, interpolation=cv2.INTER_AREA), (0, 0), _SURROUND_PX / _LOW_RESOLUTION
-    )
-    return cv2.resize(mean, (width, height))
+    relative = grey / (local_mean(grey, _SURROUND_PX, downscale=_LOW_RESOLUTION) + _DARKEST) - 1
+    contrast = local_contrast(relative, _SURROUND_PX, unit=_CONTRAST, least=_LEAST_CONTRAST, downscale=_LOW_RESOLUTION)
+    return np.clip(128 + contrast, 0, 255).astype(np.uint8)
 
 
 def refined_corners(

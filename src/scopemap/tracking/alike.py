@@ -17,6 +17,7 @@ import onnxruntime
 
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
+from scopemap.geometry.local_contrast import local_mean
 from scopemap.io.inference import open_network
 from scopemap.io.weights import sha256_of
 from scopemap.tracking.features import Features, points_at, usable_pixels
@@ -65,11 +66,10 @@ def evenly_lit(rgb: np.ndarray) -> np.ndarray:
 
     What was a dark lumen is matched with the bright wall that it becomes.
     """
-    height, width = rgb.shape[:2]
+    width = rgb.shape[1]
     brightest = cv2.max(cv2.max(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
-    size = (max(1, width // _LOW_RESOLUTION), max(1, height // _LOW_RESOLUTION))
-    small = cv2.resize(brightest, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    local = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(_EVEN_SHARE * size[0], 1.0)), (width, height))
+    sigma_px = _LOW_RESOLUTION * max(_EVEN_SHARE * (width // _LOW_RESOLUTION), 1.0)
+    local = local_mean(brightest, sigma_px, downscale=_LOW_RESOLUTION)
     return np.clip(rgb * (_EVEN_LEVEL / (local + _DARKEST))[..., None], 0, 255).astype(np.uint8)
 
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import TrackingSettings
-from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.flow.corners import Correspondences2D3D
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
+from scopemap.tracking.corner_pose import pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.features import FeatureDetector, Features, RelativePose, points_at, relative_pose_pnp
-from scopemap.tracking.reprojection import pose_from_correspondences, reprojection_error_px
-from scopemap.tracking.residuals import View
+from scopemap.tracking.keyframe_alignment import Keyframe
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track
 
@@ -29,24 +29,6 @@ _EVERY_PX, _RANGE = 4, (5, 95)
 _FLOW_EVERY_PX, _FOLLOWED_COVERAGE, _FOLLOWED_ERROR = 8, 0.25, 0.01
 _DEPTH_SIGMA = 0.2  # relative standard deviation of the wall's shape
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
-
-
-@dataclass(frozen=True)
-class Keyframe:
-    """A frame with depth that later frames are aligned to.
-
-    Attributes
-    ----------
-    frame : with `depth_mm`. T_world_camera : (4, 4), in the world of its map. pyramid : of the frame, with depth.
-    depth_mm : mean depth. measured : whether the depth is measured, not predicted. map : number of its map.
-    """
-
-    frame: Frame
-    T_world_camera: np.ndarray
-    pyramid: list[View]
-    depth_mm: float
-    measured: bool
-    map: int
 
 
 def is_close_up(frame: Frame, keyframe: Keyframe) -> bool:
@@ -170,20 +152,23 @@ class Relocaliser:
         self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
         self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
+        self._frames_of_map: Counter[int] = Counter()
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of the current map."""
         self._keyframes.append(keyframe)
 
-    def enter_map(self, number: int, frames: Counter[int]) -> None:
-        """Make a map the current one; `frames` counts the tracked frames per map, and maps of few are dropped."""
-        known = [*self._of_other_maps, *self._keyframes]
+    def count(self, number: int) -> None:
+        """Count a tracked frame of a map."""
+        self._frames_of_map[number] += 1
+
+    def enter_map(self, number: int) -> None:
+        """Make a map the current one; others with few tracked frames are dropped."""
+        known, frames = [*self._of_other_maps, *self._keyframes], self._frames_of_map
         self._keyframes.clear()
         self._of_other_maps.clear()
         self._keyframes.extend(keyframe for keyframe in known if keyframe.map == number)
-        self._of_other_maps.extend(
-            keyframe for keyframe in known if keyframe.map != number and frames[keyframe.map] >= _MIN_MAP_FRAMES
-        )
+        self._of_other_maps.extend(k for k in known if k.map != number and frames[k.map] >= _MIN_MAP_FRAMES)
 
     def find(
         self,

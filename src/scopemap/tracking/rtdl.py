@@ -52,8 +52,9 @@ class Alignment:
     both frames' normalised channel over these pixels; near 0 for noise, however well that fits.
     texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
-    is_supported : whether matched corners confirm the motion. matches : inliers of the features that it was found by.
-    nonrigidity : as `tracking.track.Track` has it.
+    is_supported : whether matched corners confirm the motion. coverage : share of the keyframe's corners that are
+    matched, 1 where they are not used. matches : inliers of the features that it was found by. nonrigidity : as in
+    `Track`.
     """
 
     motion: Motion
@@ -64,6 +65,7 @@ class Alignment:
     overlap: float
     iterations: int
     is_supported: bool = False
+    coverage: float = 1.0
     matches: int = 0
     nonrigidity: np.ndarray | None = None
 

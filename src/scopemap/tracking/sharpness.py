@@ -7,6 +7,8 @@ from collections import deque
 import cv2
 import numpy as np
 
+from scopemap.geometry.local_contrast import local_mean
+
 _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
 _FRAMES = 30
 # What its picture is worth is measured in a small copy, against the upper quartile of so many frames: unlike their
@@ -69,12 +71,6 @@ def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
 def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:
     """Return the mean local contrast of an image (H, W, 3) uint8 over valid pixels (H, W), relative to brightness."""
     grey, valid = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), valid.astype(np.float32)
-    fine, coarse = (_blurred(grey, valid, share * grey.shape[1]) for share in (_FINE, _COARSE))
+    fine, coarse = (local_mean(grey, share * grey.shape[1], valid) for share in (_FINE, _COARSE))
     brightness = float((coarse * valid).sum())
     return float((np.abs(fine - coarse) * valid).sum()) / brightness if brightness > 0 else 0.0
-
-
-def _blurred(grey: np.ndarray, valid: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Gaussian mean over the usable pixels alone."""
-    weight = cv2.GaussianBlur(valid, (0, 0), sigma_px)
-    return cv2.GaussianBlur(grey * valid, (0, 0), sigma_px) / np.maximum(weight, 1e-3)

@@ -1,4 +1,4 @@
-"""Depth by a function of the caller's own, checked at the door."""
+"""Depth by a function of the caller, checked."""
 
 from __future__ import annotations
 
