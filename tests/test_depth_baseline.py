@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.depth.pseudo_stereo import (
-    AffineDisparity,
     fit_affine_disparity,
     fit_baseline_lbfgsb,
 )
@@ -45,25 +44,9 @@ def test_a_true_baseline_comes_back_in_spite_of_unknown_and_far_pixels() -> None
     assert dominated_mm < 1e-3  # by the far pixels
 
 
-def test_the_closed_form_is_the_minimum_of_the_papers_sum() -> None:
-    rng = np.random.default_rng(1)
-    depth_mm, disparity = rng.uniform(10, 80, 500), rng.uniform(0.3, 1, 500)
-    baseline_mm = closed_form(depth_mm, disparity, 300.0)
-    cost = [np.mean((depth_mm - 300.0 * b / disparity) ** 2) for b in baseline_mm * np.array([0.999, 1, 1.001])]
-    assert cost[1] < min(cost[0], cost[2])
-
-
 def test_no_pixel_to_fit_a_baseline_to_is_an_error() -> None:
     with pytest.raises(InputError, match="no pixel"):
         fit_baseline_lbfgsb(np.ones(10), np.zeros(10), 300.0)
-
-
-def test_the_pseudo_stereo_form_is_an_affine_disparity_without_shift() -> None:
-    disparity = np.array([0.1, 0.5, 0.0, np.nan, -1.0])
-    depth_mm = AffineDisparity.from_baseline(4.0, 500.0).depth_mm(disparity)
-    assert depth_mm.dtype == np.float32
-    np.testing.assert_allclose(depth_mm[:2], [20000, 4000], rtol=1e-6)
-    assert np.isnan(depth_mm[2:]).all()
 
 
 @settings(max_examples=25, deadline=None)

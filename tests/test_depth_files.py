@@ -18,7 +18,7 @@ from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.create import create_anchor, create_depth
-from scopemap.depth.files import FilesDepth, depth_files
+from scopemap.depth.files import FilesDepth
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 from scopemap_bench.datasets.c3vd import C3vdFolder
@@ -68,22 +68,6 @@ def test_16_bit_is_measured_mm_with_0_and_65535_unknown(tmp_path: Path) -> None:
     assert "assumed" in source.provenance()["depth_scale"]
 
 
-def test_8_bit_depth_where_the_setting_says_so(tmp_path: Path) -> None:
-    write(tmp_path, "frame-000000.depth.png", ramp(np.uint8, 255))
-    estimate = files(tmp_path, files_kind="measured").estimate(frame())
-    assert estimate.kind == "measured"
-    np.testing.assert_allclose(estimate.values, np.where(ramp(np.uint8, 255) > 0, ramp(np.uint8, 255), np.nan))
-
-
-def test_16_bit_disparity_and_predicted_depth_where_the_setting_says_so(tmp_path: Path) -> None:
-    array = ramp(np.uint16, 65535)
-    write(tmp_path, "0.png", array)
-    np.testing.assert_allclose(
-        files(tmp_path, files_kind="disparity").estimate(frame()).values, array / 65535, rtol=1e-5
-    )
-    assert files(tmp_path, files_kind="depth").estimate(frame()).kind == "depth"
-
-
 def test_arrays_of_floats(tmp_path: Path) -> None:
     depth_mm = ramp(np.float64, 80)
     depth_mm[0, 5], depth_mm[1, 5] = np.nan, -3
@@ -120,17 +104,6 @@ def test_the_scale_and_its_order_of_precedence(tmp_path: Path) -> None:
     (tmp_path / "depth.json").write_text("{}")
     with pytest.raises(InputError, match="scale_mm"):
         files(tmp_path)
-
-
-def test_depth_is_found_among_the_files_of_its_frame(tmp_path: Path) -> None:
-    for number in (0, 2, 10):
-        write(tmp_path, f"{number}_color.png", np.zeros((50, 60, 3), np.uint8))
-        write(tmp_path, f"{number}_depth.tiff", np.full((50, 60), 600 + number, np.uint16))
-        write(tmp_path, f"{number}_mask.png", np.zeros((50, 60), np.uint8))
-    found = depth_files(tmp_path)
-    assert list(found) == [0, 2, 10]
-    assert all(file.name == f"{number}_depth.tiff" for number, file in found.items())
-    assert files(tmp_path).estimate(frame(10)).values[9, 9] == pytest.approx(610 * 100 / 65535)
 
 
 def test_files_follow_the_lens_of_the_frames_at_another_size(tmp_path: Path) -> None:

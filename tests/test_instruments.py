@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from chosen_settings import chosen
 from tiny_phantom import write_tiny
 
-from scopemap import open_sequence, reconstruct
+from scopemap import open_sequence
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import Config, MaskSettings
@@ -24,9 +23,7 @@ from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker, without_instruments
-from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
-from scopemap.report.frame_pictures import FramePictures
 from training.export import export, read_network
 from training.network import ScopeNet
 
@@ -62,16 +59,6 @@ def with_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
     network.instruments = None
     export(network, folder / "without.onnx", {})
     return folder
-
-
-def test_the_head_changes_no_bit_of_depth(with_head: Path) -> None:
-    frame = _frame()
-    with_it, without = (ScopeNetDepth(str(with_head / f"{name}.onnx")).estimate(frame) for name in ("with", "without"))
-    assert without.instruments is None
-    assert with_it.instruments is not None
-    assert with_it.instruments.shape == (HEIGHT, WIDTH)
-    np.testing.assert_array_equal(with_it.values, without.values)
-    np.testing.assert_array_equal(with_it.sigma, without.sigma)
 
 
 def test_the_runtime_finds_instruments_as_torch_does(with_head: Path) -> None:
@@ -229,60 +216,3 @@ def test_instruments_have_no_depth_and_are_not_usable_and_a_covered_frame_says_s
         assert covered.reason == "only 0% of the image is usable: instruments cover 100%"
         network.columns = slice(0, 0)
         assert pipeline.step(pipeline.preprocess(third)).track.status != "lost"
-
-
-def test_a_killed_run_goes_on_with_the_instruments_of_the_frame_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All frames but the first show a bar that only a mask before it holds: forgotten, the rest would differ."""
-    real = ScopeNetDepth.estimate
-
-    def with_bar(self: ScopeNetDepth, frame: Frame) -> DepthEstimate:
-        found = np.zeros(frame.valid.shape, np.float32)
-        found[:, :12] = 0.03 if frame.index else 0.9
-        found[:3, :12] = 0.9
-        return replace(real(self, frame), instruments=found)
-
-    class Killed(BaseException):
-        pass
-
-    def kill(step: Step) -> None:
-        if step.frame.index >= 4:
-            raise Killed
-
-    monkeypatch.setattr(ScopeNetDepth, "estimate", with_bar)
-    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
-    monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
-    folder = write_tiny(tmp_path / "phantom")
-    seen: dict[int, np.ndarray] = {}
-    looked_for = Config.load(settings={"mask.instruments": "auto"})
-    reconstruct(
-        open_sequence(folder),
-        looked_for,
-        out=tmp_path / "whole",
-        observers=(lambda s: seen.update({s.frame.index: s.frame.valid}),),
-    )
-    assert not any(valid[30:, :12].any() for valid in seen.values())
-    with pytest.raises(Killed):
-        reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again", observers=(kill,))
-    resumed = reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again")
-    assert resumed.provenance["resumed_after_frame"] is not None
-    whole, again = (
-        {file.relative_to(out): file.read_bytes() for file in sorted(out.rglob("*")) if file.is_file()}
-        for out in (tmp_path / "whole", tmp_path / "again")
-    )
-    of_its_time = {Path("provenance.json"), Path("SHA256SUMS")}
-    assert whole.keys() == again.keys()
-    assert not [file for file in whole if whole[file] != again[file] and file not in of_its_time]
-
-
-def test_pictures_of_frames_show_instruments_grey(tmp_path: Path) -> None:
-    pictures, frame = FramePictures(), _frame()
-    instruments = _bar(1.0) > 0.5
-    pictures.put(0, frame.rgb, frame.valid & ~instruments, instruments)
-    pictures.put(1, frame.rgb, frame.valid)
-    pictures.save(tmp_path)
-    shown, bare = (cv2.imread(str(tmp_path / f"frames/00000{n}_mask.png"), cv2.IMREAD_GRAYSCALE) for n in (0, 1))
-    assert set(np.unique(shown[:, 30:50])) == {90}
-    assert set(np.unique(shown[:, 50:])) == {255}
-    assert set(np.unique(bare)) == {255}

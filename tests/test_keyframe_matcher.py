@@ -16,8 +16,6 @@ from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.tracking.keyframe_alignment import Keyframe
-from scopemap.tracking.relocalisation import EarlierKeyframes
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -208,21 +206,3 @@ def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(mon
     onwards = _to_and_fro(Tracker(settings, DisFlow()))
     assert np.linalg.norm(onwards[-1].T_world_camera[:3, 3]) > 0.5
     assert onwards[-1].keyframe > 10
-
-
-def test_the_nearest_passed_keyframe_is_asked_for_where_it_is_clearly_nearer() -> None:
-    earlier = EarlierKeyframes()
-    current = Keyframe(
-        _frame(9, plane_scene.pose(at_mm=(20.0, 0, 0))), plane_scene.pose(at_mm=(20.0, 0, 0)), [], 50.0, False, 0
-    )
-    assert earlier.nearer(HERE, current) is None
-    for index, x_mm in enumerate((0.0, 8.0, 20.0)):
-        earlier.add(_frame(index, plane_scene.pose(at_mm=(x_mm, 0, 0))))
-
-    def nearer(x_mm: float) -> int | None:
-        found = earlier.nearer(plane_scene.pose(at_mm=(x_mm, 0, 0)), current)
-        return None if found is None else found.index
-
-    assert [nearer(x_mm) for x_mm in (0.0, 7.0, 13.0, 16.0, 19.0, -16.0)] == [0, 1, None, None, None, None]
-    earlier.clear()
-    assert nearer(0.0) is None

@@ -14,7 +14,6 @@ from plane_scene import CAMERA
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.sharpness import SharpnessMonitor, sharpness
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -66,13 +65,6 @@ def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: i
     assert way_mm < 0.3
 
 
-def test_the_gate_can_be_opened() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
-    frames[4] = _smoked(frames[4])
-    opened = SETTINGS.model_copy(update={"min_sharpness": 0.0})
-    assert not [track for track in _tracked(frames, opened) if "sharpness" in track.reason]
-
-
 @pytest.mark.parametrize("remembered", [10, 0])
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
     dark = replace(_frame(8, NEAR[-1]), valid=np.zeros_like(plane_scene.EVERYWHERE))
@@ -89,36 +81,6 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
     else:
         # Alignment alone does not bridge that: either it says so, or it is far off.
         assert tracks[9].status == "lost" or way_mm > 2
-
-
-def test_relative_sharpness_is_a_share_of_the_recent_median() -> None:
-    frame = _frame(0, NEAR[0])
-
-    def after_itself(other: Frame) -> float:
-        monitor = SharpnessMonitor()
-        assert monitor.relative_sharpness(frame.rgb, frame.valid) == 1.0
-        assert monitor.relative_sharpness(frame.rgb, frame.valid) == pytest.approx(1.0)
-        return monitor.relative_sharpness(other.rgb, other.valid)
-
-    assert after_itself(_blurred(frame)) < 0.5
-    assert after_itself(_smoked(frame)) < 0.3
-    # A dimmer lamp shows the same detail.
-    assert after_itself(replace(frame, rgb=(0.7 * frame.rgb).astype(np.uint8))) == pytest.approx(1.0, abs=0.1)
-
-
-def test_what_is_unsharp_for_long_becomes_usual() -> None:
-    sharp, soft, monitor = _frame(0, NEAR[0]), _blurred(_frame(0, NEAR[0])), SharpnessMonitor()
-    for _ in range(30):
-        monitor.relative_sharpness(sharp.rgb, sharp.valid)
-    shares = [monitor.relative_sharpness(soft.rgb, soft.valid) for _ in range(30)]
-    assert shares[9] < 0.6
-    assert shares[-1] == pytest.approx(1.0)
-
-
-def test_nothing_usable_is_not_sharp() -> None:
-    frame = _frame(0, NEAR[0])
-    assert sharpness(frame.rgb, np.zeros_like(frame.valid)) == 0.0
-    assert sharpness(np.zeros_like(frame.rgb), frame.valid) == 0.0
 
 
 def _elsewhere(index: int, n: int) -> Frame:
@@ -189,30 +151,6 @@ def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
     assert track.status == "lost"
     assert "weakly constrained" in track.reason
     assert abs(track.correlation) < 0.15
-
-
-def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
-    rng = np.random.default_rng(4)
-    # As clear as tissue, and nothing that lasts.
-    shape = frames[0].rgb.shape[:2]
-    soft = [cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 1.5) for _ in range(70)]
-    nothing = [
-        replace(
-            frames[0],
-            index=8 + n,
-            rgb=np.repeat((128 + 40 * grey / grey.std()).clip(0, 255).astype(np.uint8)[..., None], 3, 2),
-        )
-        for n, grey in enumerate(soft)
-    ]
-    tracks = _tracked(
-        [*frames, *nothing, replace(frames[4], index=78)], SETTINGS.model_copy(update={"new_map_after": 1})
-    )
-    assert max(track.map for track in tracks) > 20
-    assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "relocalised", 0)
-    turn, way_mm = _off(tracks[-1], NEAR[4])
-    assert turn < np.radians(0.4)
-    assert way_mm < 0.3
 
 
 def test_no_map_begins_with_an_unsharp_frame() -> None:

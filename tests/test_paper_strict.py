@@ -19,7 +19,6 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import PRESETS, FusionSettings
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.create import create_depth
 from scopemap.depth.estimate import DepthEstimate, PerceptualResult
 from scopemap.depth.mapis import DenseMatcher, Mapis
 from scopemap.depth.shading import ShadingDepth
@@ -27,7 +26,6 @@ from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowPair
 from scopemap.frame import Frame
 from scopemap.fusion.volume import TsdfVolume
-from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 from scopemap.odometry import Step
@@ -84,13 +82,6 @@ def test_a_range_takes_the_place_of_depth_pro(tmp_path: Path, monkeypatch: pytes
     assert result.provenance["estimators"]["anchor"] == "near-far 20:70 mm"
 
 
-def test_the_working_size_is_the_inputs(tmp_path: Path) -> None:
-    for number in range(2):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((600, 900, 3), 50 * number, np.uint8))
-    widths = [open_sequence(tmp_path, settings=config.input).camera.width for config in (PAPER, STRICT)]
-    assert widths == [300, 900]
-
-
 def _frame(rgb: np.ndarray, depth_mm: np.ndarray | None = None, T: np.ndarray | None = None) -> Frame:
     height, width = rgb.shape[:2]
     camera = CAMERA if (height, width) == (CAMERA.height, CAMERA.width) else NARROW
@@ -107,14 +98,6 @@ def test_no_pixel_is_masked(tmp_path: Path) -> None:
     rectifier = Rectifier(NARROW, NARROW)
     for config, used in ((PAPER, True), (STRICT, False)):
         assert (create_masks(config.mask, rectifier, tmp_path) is not None) == used
-
-
-def test_the_first_depth_anything_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
-    owner, name = STRICT.depth.model.split("/")
-    saved(small_depth_anything(), tmp_path / f"{owner}--{name}")
-    facts = create_depth(STRICT.depth, None, "cpu").provenance()  # type: ignore[arg-type]
-    assert facts["model"] == "LiheYoung/depth-anything-small-hf"
 
 
 def test_far_depth_is_kept() -> None:
@@ -192,18 +175,6 @@ def test_no_frame_is_called_lost_for_fitting_badly(fault: str) -> None:
     assert [_second(config, *shown).status for config in (PAPER, STRICT)] == ["lost", "ok"]
 
 
-def test_a_jump_is_accepted() -> None:
-    """The picture has moved by 12 px."""
-    settings = STRICT.tracking.model_copy(
-        update={"advanced": STRICT.tracking.advanced.model_copy(update={"max_step": 0.005})}
-    )
-    rgb = see(pose(at_mm=(4.0, 0.0, 0.0))).rgb
-    cautious = STRICT.model_copy(update={"tracking": settings})
-    tracks = [_second(config, rgb) for config in (cautious, STRICT)]
-    assert [track.status for track in tracks] == ["lost", "ok"]
-    assert "jump" in tracks[0].reason
-
-
 def _wall(distance_mm: float, error_mm: float = 0.0) -> Frame:
     """A camera that sees the world's plane z = 100 mm from a distance, with an error of its depth."""
     grey = np.full((60, 80, 3), 120, np.uint8)
@@ -226,59 +197,6 @@ def test_every_observation_weighs_the_same_in_the_volume() -> None:
         levels.append(float(np.median(vertices[middle, 2])))
     assert levels[0] < 100.4
     assert levels[1] == pytest.approx(100.5, abs=0.05)
-
-
-def _slanted_wall(tangent: float, distance_mm: float) -> Frame:
-    """A wall whose normal is so far from the optical axis, as the tangent of the angle."""
-    normal = se3(so3_exp(np.array([0.0, np.arctan(tangent), 0.0])), np.zeros(3))[:3, 2]
-    u, v = np.meshgrid(np.arange(80), np.arange(60))
-    rays = NARROW.unproject(np.stack([u, v], -1))
-    depth_mm = (distance_mm / (rays @ normal)).astype(np.float32)
-    depth_mm[depth_mm <= 0] = np.nan
-    return _frame(np.full((60, 80, 3), 120, np.uint8), depth_mm, np.eye(4))
-
-
-def test_a_far_oblique_wall_seen_once_gives_a_surface() -> None:
-    faces = []
-    for config in (PAPER, STRICT):
-        volume = TsdfVolume(_fusion(config, max_depth_mm=100.0))
-        volume.integrate(_slanted_wall(5.0, 18.0))
-        faces.append(len(volume.extract_mesh().faces))
-    assert faces[0] < 0.5 * faces[1]
-
-
-def test_a_wall_seen_from_its_edge_is_fused() -> None:
-    faces = []
-    for config in (PAPER, STRICT):
-        volume = TsdfVolume(_fusion(config, max_depth_mm=300.0))
-        for _ in range(5):
-            volume.integrate(_slanted_wall(14.0, 6.0))
-        faces.append(len(volume.extract_mesh().faces))
-    assert faces[0] < 0.5 * faces[1]
-
-
-def test_a_small_piece_stays() -> None:
-    frame = _wall(40.0)
-    assert frame.depth_mm is not None
-    depth_mm = np.where(np.arange(80) < 60, frame.depth_mm, np.nan).astype(np.float32)
-    depth_mm[:8, 70:] = 40.0
-    pieces = []
-    for config in (PAPER, STRICT):
-        volume = TsdfVolume(_fusion(config, voxel_mm=0.2, truncation_mm=1.0))
-        for _ in range(4):
-            volume.integrate(replace(frame, depth_mm=depth_mm))
-        pieces.append(len(volume.extract_mesh().split(only_watertight=False)))
-    assert pieces == [1, 2]
-
-
-def test_the_far_wall_is_fused() -> None:
-    faces = []
-    for config in (PAPER, STRICT):
-        volume = TsdfVolume(_fusion(config, voxel_mm=2.0, truncation_mm=10.0))
-        for _ in range(3):
-            volume.integrate(_wall(200.0))
-        faces.append(len(volume.extract_mesh().faces))
-    assert faces[0] == 0 < faces[1]
 
 
 @pytest.mark.parametrize(("blend", "expected_mm"), [("linear", 50.0), ("none", 100.0)])
