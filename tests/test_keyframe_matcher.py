@@ -202,7 +202,7 @@ def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(mon
     assert again[-1].keyframe == 0
     assert len({track.keyframe for track in again}) <= 6
     assert np.linalg.norm(again[-1].T_world_camera[:3, 3]) < 0.1
-    monkeypatch.setattr("scopemap.tracking.relocalisation.EarlierKeyframes.nearer", lambda *_: None)
+    monkeypatch.setattr("scopemap.tracking.tracker.nearer_keyframe", lambda *_: None)
     onwards = _to_and_fro(Tracker(settings, DisFlow()))
     assert np.linalg.norm(onwards[-1].T_world_camera[:3, 3]) > 0.5
     assert onwards[-1].keyframe > 10

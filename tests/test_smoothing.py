@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from scopemap.config import SmoothingSettings
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
-from scopemap.tracking.smoothing import NoSmoothing, Wema, create_smoother
+from scopemap.tracking.smoothing import Wema
 
 ALPHA, BETA, GAMMA = 0.5, 0.3, 0.2
 
@@ -23,7 +23,7 @@ def _at(position_mm: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(poses: list[np.ndarray], chosen: SmoothingSettings) -> list[np.ndarray]:
-    smoother = create_smoother(chosen)
+    smoother = Wema(chosen)
     return [smoother(pose) for pose in poses]
 
 
@@ -61,7 +61,7 @@ def test_the_mean_does_not_depend_on_the_world(seed: int) -> None:
 
 
 def test_after_a_loss_the_past_is_forgotten_and_s_goes_on() -> None:
-    smoother = create_smoother(_wema(omega=0.2))
+    smoother = Wema(_wema(omega=0.2))
     x = np.array([0.0, 1.0, 2.0, 50.0, 51.0, 53.0])
     found = []
     for i, position in enumerate(x):
@@ -74,9 +74,7 @@ def test_after_a_loss_the_past_is_forgotten_and_s_goes_on() -> None:
 
 
 def test_none_is_the_default_and_leaves_poses_alone() -> None:
-    smoother = create_smoother(SmoothingSettings())
-    assert isinstance(smoother, NoSmoothing)
-    assert isinstance(create_smoother(_wema()), Wema)
+    smoother = Wema(SmoothingSettings())
     T = se3_exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     for _ in range(4):
         np.testing.assert_array_equal(smoother(T), T)

@@ -17,7 +17,7 @@ from scopemap.frame import Frame
 from scopemap.mapping.submaps import Mapper
 from scopemap.preprocessing import PreprocessedFrame, with_depth, without_depth
 from scopemap.tracking.relocalisation import RotationFollower
-from scopemap.tracking.smoothing import create_smoother
+from scopemap.tracking.smoothing import Wema
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.trajectory.causes import LossCause
 
@@ -47,7 +47,7 @@ class Odometry:
     def __init__(self, config: Config, tracker: FrameTracker, mapper: Mapper) -> None:
         self._config, self._tracker, self.mapper = config, tracker, mapper
         self._mapis = Mapis(config.mapis)
-        self._smooth = create_smoother(config.smoothing)
+        self._smooth = Wema(config.smoothing)
         self._rotation = RotationFollower()
         self._last_track: Track | None = None
         self._last_frame: tuple[Frame, Track] | None = None

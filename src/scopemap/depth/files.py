@@ -21,6 +21,7 @@ from scopemap.depth.estimate import DepthEstimate, DepthKind
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.io.decoding import read_decoded
+from scopemap.io.images import by_number, frame_number
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"
@@ -145,20 +146,14 @@ def depth_files(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         raise InputError(f"reading depth files: {folder} is no folder; give files:FOLDER with the folder of the files")
     candidates = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in (*_IMAGES, _NUMPY) and f.name[0] != "."]
-    numbered = [f for f in candidates if re.search(r"\d", f.stem) and not _OTHER_CONTENT.search(f.stem)]
+    numbered = [f for f in candidates if frame_number(f) is not None and not _OTHER_CONTENT.search(f.stem)]
     named = [f for f in numbered if _NAMED_DEPTH.search(f.stem)]
-    found: dict[int, Path] = {}
-    for file in named or numbered:
-        number = int(re.findall(r"\d+", file.stem)[-1])
-        if number in found:
-            raise InputError(f"two depth files for frame {number} in {folder}: {found[number].name} and {file.name}")
-        found[number] = file
-    if not found:
+    if not numbered:
         raise InputError(
             f"reading depth files: {folder} holds no png, tif, jpg or npy file with a number in its name that could be "
             "depth; the number is the frame's"
         )
-    return dict(sorted(found.items()))
+    return by_number(named or numbered)
 
 
 def _read(file: Path) -> np.ndarray:

@@ -31,8 +31,6 @@ _MIN_OVERLAP = 0.2
 class DenseCorrespondence:
     """Dense correspondence of a frame with the previous one.
 
-    Attributes
-    ----------
     to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, flow check passed.
     distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant for a single score.
     usable_share : share of the current image that shows tissue.
@@ -74,8 +72,6 @@ class DenseMatcher:
 class RefinedDepth:
     """Depth of one frame after the consistency stage.
 
-    Attributes
-    ----------
     depth_mm : (H, W) float32, NaN = unknown. scale : factor applied to the raw depth.
     warped_share : share of the image with a warped previous depth. sigma_mm : (H, W) float32, one standard
     deviation of the depth, NaN = unknown.

@@ -1,10 +1,8 @@
 """Depth from near-field shading: an estimator that needs no weights.
 
-In endoscopy the lamp sits at the camera and is the only light, so brightness falls with the square of the distance
-along the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away
-from the lamp the farther it is down a lumen, which makes it darker still, and light bounces between the walls, which
-makes it brighter: the exponent is therefore a setting, chosen on real frames
-(scopemap_bench/scripts/depth_without_download.py).
+In endoscopy the lamp is at the camera and is the only light, so brightness falls with the square of the distance along
+the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away from the
+lamp down a lumen, and light bounces between its walls: the exponent is chosen on real frames.
 """
 
 from __future__ import annotations

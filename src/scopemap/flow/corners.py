@@ -53,8 +53,6 @@ _QUICK = _Search(11, 10, 0.03)  # a third of the time, and poses of the same err
 class Correspondences2D3D:
     """Points of a reference frame, and the pixels of the current frame where optical flow observes them.
 
-    Attributes
-    ----------
     points_mm : (N, 3) float64, in the camera of the reference. pixels : (N, 2) float64 x, y in the current frame.
     coverage : share of the reference's corners that were matched, 0..1. reference : index of the reference frame.
     """

@@ -99,8 +99,6 @@ class OwnFlow(FlowEstimator):
 class Flow:
     """Optical flow between the previous and the current frame.
 
-    Attributes
-    ----------
     to_previous : (H, W, 2) float32, px: pixel p of the current frame is seen at p + to_previous(p) in the previous.
     consistent : (H, W) bool on the current frame's grid: True where the forward-backward error is small.
     """

@@ -54,11 +54,11 @@ def huber_weight(residuals: np.ndarray, threshold: float) -> np.ndarray:
 
 
 class Model(Protocol):
-    """Quadratic model of a cost around a state: cost, gradient (n,), and products with its Gauss-Newton hessian."""
+    """Quadratic model of a cost, infinite where the state is impossible; gradient (n,), and Gauss-Newton hessian H."""
 
     @property
     def cost(self) -> float:
-        """Cost at the state, infinite where the state is impossible."""
+        """Cost at the state."""
 
     @property
     def gradient(self) -> np.ndarray:
@@ -223,14 +223,14 @@ class SchurModel:
     @cached_property
     def gradient(self) -> np.ndarray:
         """First derivative (cameras + points,); 0 for fixed unknowns."""
-        own, points = np.zeros(self.cameras), np.zeros(self.points)
+        cameras, points = np.zeros(self.cameras), np.zeros(self.points)
         for block in self.blocks[0]:
-            own[block.columns] += block.scores.sum(0)
+            cameras[block.columns] += block.scores.sum(0)
             points[block.points] = block.g
         for prior in self.blocks[1]:
-            own[prior.columns] += prior.b
+            cameras[prior.columns] += prior.b
         free = np.zeros(self.cameras)
-        free[self.free] = own[self.free]
+        free[self.free] = cameras[self.free]
         return np.concatenate([free, points])
 
     def gauss_newton_step(self) -> np.ndarray:
@@ -252,8 +252,8 @@ class SchurModel:
         def add(columns: np.ndarray, A: np.ndarray, b: np.ndarray) -> None:
             rhs[columns] -= b
             kept = np.flatnonzero(place[columns] >= 0)
-            own = place[columns[kept]]
-            matrix[np.ix_(own, own)] += A[np.ix_(kept, kept)]
+            free = place[columns[kept]]
+            matrix[np.ix_(free, free)] += A[np.ix_(kept, kept)]
 
         for prior in self.blocks[1]:
             add(*prior)
@@ -265,9 +265,9 @@ class SchurModel:
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""
-        own, points = step[: self.cameras], step[self.cameras :]
-        total = sum(float(own[prior.columns] @ prior.A @ own[prior.columns]) for prior in self.blocks[1])
+        cameras, points = step[: self.cameras], step[self.cameras :]
+        total = sum(float(cameras[prior.columns] @ prior.A @ cameras[prior.columns]) for prior in self.blocks[1])
         for block in self.blocks[0]:
-            cameras, some = own[block.columns], points[block.points]
-            total += float(cameras @ block.A @ cameras + 2 * some @ (block.E @ cameras) + some @ (block.h * some))
+            own, some = cameras[block.columns], points[block.points]
+            total += float(own @ block.A @ own + 2 * some @ (block.E @ own) + some @ (block.h * some))
         return total

@@ -1,4 +1,4 @@
-"""Carrying images and depth from one frame to the next along known correspondences and motion."""
+"""Images and depth warped from one frame to the next along known correspondences and motion."""
 
 from __future__ import annotations
 
@@ -73,21 +73,10 @@ def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
 def moved_depth(
     depth_previous_mm: np.ndarray, to_previous: np.ndarray, camera: PinholeCamera, T_current_previous: np.ndarray
 ) -> np.ndarray:
-    """Return the depth that points, sampled from the previous frame, have as seen from the current camera.
+    """Return the depth (H, W) float32, mm, of the previous frame's points in the current camera; NaN: unknown, behind.
 
-    A warp alone carries values unchanged although the camera moved: here each value becomes a point, the point is
-    moved, and its new depth is what counts.
-
-    Parameters
-    ----------
     depth_previous_mm : (H, W) float32, the previous depth already sampled on the current grid, NaN = unknown.
-    to_previous : (H, W, 2) float32 px, where in the previous image each pixel's depth was sampled.
-    camera : of both frames.
-    T_current_previous : (4, 4) takes points of the previous camera to the current one.
-
-    Returns
-    -------
-    (H, W) float32 in mm, NaN = unknown or behind the camera.
+    to_previous : (H, W, 2) float32 px, where in the previous image each pixel's depth was sampled. camera : of both.
     """
     check_shape("depth_previous_mm", depth_previous_mm, (camera.height, camera.width))
     check_shape("to_previous", to_previous, (camera.height, camera.width, 2))

@@ -36,8 +36,8 @@ _NEAR_SHARE, _RIM_SHARE = 0.02, 0.008
 class FieldOfView:
     """The convex hull (circle, octagon and rectangle are convex) of the largest area that was lit in any frame so far.
 
-    Dark tissue in the lumen is thus not taken for the surround. The hull is shrunk by `BORDER_PX`, from pixels that the
-    rectification could not fill too, but not from the image's own edge.
+    Dark tissue in the lumen is thus not taken for the surround. The hull is shrunk by `BORDER_PX`, and keeps
+    as far from pixels that the rectification could not fill, but not from the image's own edge.
     """
 
     def __init__(self) -> None:

@@ -30,8 +30,6 @@ _INLIER_SHARE = 1 / 80  # largest reprojection error of an inlier, share of the 
 class Features:
     """Features of a frame, strongest first.
 
-    Attributes
-    ----------
     pixels : (N, 2) float64 x, y. descriptors : (N, D) float32 of unit length. points_mm : (N, 3) float64 in the
     camera frame, NaN where the depth is unknown. max_ratio : of the distances to the nearest and to the second nearest
     descriptor, above which a feature is not matched; 1: mutual nearest neighbours are matched however close others are.
@@ -64,8 +62,16 @@ class SiftFeatures:
     name, descriptor_size, max_ratio = "sift", 128, _MAX_RATIO
 
     def detect(self, frame: Frame) -> Features:
-        """Return features in the usable pixels of a frame, with depth where the frame has it."""
-        return detect_features(frame)
+        """Return at most 500 features in the usable pixels of a frame, with depth where the frame has it."""
+        sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST, edgeThreshold=_MAX_EDGE_RATIO)
+        usable = 255 * usable_pixels(frame.valid).astype(np.uint8)
+        corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), usable)
+        if descriptors is None:
+            return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
+        order = np.argsort([-corner.response for corner in corners], kind="stable")
+        pixels = np.array([corner.pt for corner in corners], dtype=np.float64)[order]
+        rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
+        return Features(pixels, rooted.astype(np.float32), points_at(pixels, frame.depth_mm, frame.camera))
 
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""
@@ -74,29 +80,13 @@ class SiftFeatures:
 
 @dataclass(frozen=True)
 class RelativePose:
-    """Relative pose of two frames and its inlier matches.
+    """Relative pose (4, 4), mm of the reference's depth, and its inliers.
 
-    Attributes
-    ----------
-    T_current_reference : (4, 4), mm of the reference's depth. pairs : (M, 2) int, indices of the inlier
-    features in the reference and in the current frame.
+    pairs : (M, 2) int, indices of the inlier features in the reference and in the current frame.
     """
 
     T_current_reference: np.ndarray
     pairs: np.ndarray
-
-
-def detect_features(frame: Frame) -> Features:
-    """Return at most 500 RootSIFT features in the usable pixels of a frame, with depth where the frame has it."""
-    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST, edgeThreshold=_MAX_EDGE_RATIO)
-    usable = 255 * usable_pixels(frame.valid).astype(np.uint8)
-    corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), usable)
-    if descriptors is None:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
-    order = np.argsort([-corner.response for corner in corners], kind="stable")
-    pixels = np.array([corner.pt for corner in corners], dtype=np.float64)[order]
-    rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
-    return Features(pixels, rooted.astype(np.float32), points_at(pixels, frame.depth_mm, frame.camera))
 
 
 def usable_pixels(valid: np.ndarray) -> np.ndarray:

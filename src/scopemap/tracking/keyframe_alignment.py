@@ -33,8 +33,6 @@ _MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
 class Keyframe:
     """A frame with depth that later frames are aligned to.
 
-    Attributes
-    ----------
     frame : with `depth_mm`. T_world_camera : (4, 4), in the world of its map. pyramid : of the frame, with depth.
     depth_mm : mean depth. measured : whether the depth is measured, not predicted. map : number of its map.
     """
@@ -56,8 +54,6 @@ class Keyframe:
 class MotionModel:
     """Constant motion: the pose that was tracked last, the step to it, and how many frames were lost since.
 
-    Attributes
-    ----------
     map : number of the map whose world `T_world_last` (4, 4) is in.
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +21,7 @@ from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
-_EARLIER_KEYFRAMES = 64
-_MAX_APART, _NEARER = 0.3, 0.7  # distance of a passed keyframe's view, at most, and over that of the current one
+_MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
 _CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
 _EVERY_PX, _RANGE = 4, (5, 95)
 # Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
@@ -62,36 +61,22 @@ def depth_ratio(keyframe: Keyframe, frame: Frame, T_world_camera: np.ndarray) ->
     return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else float("nan")
 
 
-class EarlierKeyframes:
-    """Earlier keyframes of the current map, 64 at most, that the camera may come back to."""
+def nearer_keyframe(keyframes: Iterable[Frame], T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
+    """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
 
-    def __init__(self) -> None:
-        self._frames: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
+    The distance of two views is the rotation, rad, plus the translation over the scene's depth.
+    """
 
-    def add(self, frame: Frame) -> None:
-        """Add a keyframe with its pose and its depth."""
-        self._frames.append(replace(frame, depth_sigma_mm=None))
+    def distance(T_world_other: np.ndarray | None) -> float:
+        assert T_world_other is not None
+        T = inverse(T_world_other) @ T_world_camera
+        return float(rotation_angle_rad(T[:3, :3])) + float(np.linalg.norm(T[:3, 3])) / current.depth_mm
 
-    def clear(self) -> None:
-        """Forget them: the world is another one."""
-        self._frames.clear()
-
-    def nearer(self, T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
-        """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
-
-        The distance of two views is the turn, rad, plus the way over the scene's depth.
-        """
-
-        def distance(T_world_other: np.ndarray | None) -> float:
-            assert T_world_other is not None
-            T = inverse(T_world_other) @ T_world_camera
-            return float(rotation_angle_rad(T[:3, :3])) + float(np.linalg.norm(T[:3, 3])) / current.depth_mm
-
-        nearest = min(self._frames, key=lambda frame: distance(frame.T_world_camera), default=None)
-        if nearest is None or nearest.index == current.frame.index:
-            return None
-        limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
-        return nearest if distance(nearest.T_world_camera) <= limit else None
+    nearest = min(keyframes, key=lambda frame: distance(frame.T_world_camera), default=None)
+    if nearest is None or nearest.index == current.frame.index:
+        return None
+    limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
+    return nearest if distance(nearest.T_world_camera) <= limit else None
 
 
 class RotationFollower:

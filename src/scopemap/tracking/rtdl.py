@@ -44,8 +44,6 @@ class Motion(NamedTuple):
 class Alignment:
     """Relative pose of two frames, and how well it fits their images.
 
-    Attributes
-    ----------
     motion : relative pose and brightness. residual : robust standard deviation of the normalised channel's residuals
     at the finest level, in local deviations of the grey value.
     inlier_share : share of the used pixels whose residual is below half a local deviation. correlation : -1..1, of

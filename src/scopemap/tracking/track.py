@@ -29,8 +29,6 @@ class TrackingLoss(NamedTuple):
 class Track:
     """Tracking result of one frame: its pose, or the reason why it is lost.
 
-    Attributes
-    ----------
     index : number of the frame.
     status : "initial" for the frame that fixes the world of its map, "ok", or "lost". Trackers do not give
         "other-map" and "rotation-only": in the records of a result these mark frames that were tracked in another

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +21,14 @@ from scopemap.tracking.keyframe_alignment import (
     is_obscured,
 )
 from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.relocalisation import EarlierKeyframes, Relocaliser, depth_ratio, is_close_up
+from scopemap.tracking.relocalisation import Relocaliser, depth_ratio, is_close_up, nearer_keyframe
 from scopemap.tracking.residuals import View
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.sharpness import SharpnessMonitor
 from scopemap.tracking.track import FrameTracker, Track, TrackingLoss, unusable
 from scopemap.trajectory.causes import LossCause
 
+_EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
 _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a keyframe
@@ -95,7 +97,7 @@ class Tracker(FrameTracker):
         self._motion = MotionModel()
         self._aligner = KeyframeAligner(settings, flow, self._motion)
         self._relocaliser = Relocaliser(settings, features or SiftFeatures())
-        self._earlier_keyframes = EarlierKeyframes()
+        self._earlier_keyframes: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
         self._choice = KeyframeChoice(settings)
         self._sharpness = SharpnessMonitor()
         self._keyframe: Keyframe | None = None
@@ -187,7 +189,7 @@ class Tracker(FrameTracker):
             return False
         self._use_keyframe(keyframe)
         self._relocaliser.add(keyframe)
-        self._earlier_keyframes.add(frame)
+        self._earlier_keyframes.append(replace(frame, depth_sigma_mm=None))
         self._choice.begin()
         return True
 
@@ -202,7 +204,7 @@ class Tracker(FrameTracker):
         if not self._aligner.has_corners(current):
             return alignment
         T_world_camera = current.pose_by(alignment)
-        nearest = self._earlier_keyframes.nearer(T_world_camera, current)
+        nearest = nearer_keyframe(self._earlier_keyframes, T_world_camera, current)
         keyframe = None if nearest is None else self._keyframe_of(nearest, current.measured)
         if keyframe is None:
             return alignment
