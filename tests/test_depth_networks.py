@@ -60,21 +60,6 @@ def test_metric_depth_anything_gives_millimetres(frame: Frame) -> None:
     np.testing.assert_allclose(estimate.values, 1000 * _by_hand(pair, frame)["predicted_depth"].numpy(), rtol=1e-4)
 
 
-def test_depth_pro_with_its_own_focal_length(frame: Frame, tmp_path: Path) -> None:
-    pair = small_depth_pro()
-    estimator = DepthPro.from_folder_or_hub(str(saved(pair, tmp_path)), "cpu", use_known_focal=False)
-    estimate = estimator.estimate(frame)
-    expected = _by_hand(pair, frame)
-    assert estimate.kind == "depth"
-    assert estimate.values.dtype == np.float32
-    assert estimate.values.shape == (HEIGHT, WIDTH)
-    assert np.isfinite(estimate.values).all()
-    assert np.ptp(estimate.values) > 0
-    np.testing.assert_allclose(estimate.values, 1000 * expected["predicted_depth"].numpy(), rtol=1e-4)
-    assert estimate.focal_px == pytest.approx(float(expected["focal_length"]), rel=1e-5)
-    np.testing.assert_array_equal(estimator.estimate(frame).values, estimate.values)
-
-
 def test_depth_pro_scales_with_the_known_focal_length(frame: Frame) -> None:
     pair = small_depth_pro()
     own = DepthPro(*pair, device="cpu", use_known_focal=False).estimate(frame)

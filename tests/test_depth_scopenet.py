@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -87,21 +86,6 @@ def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(
     np.testing.assert_allclose(estimate.values, depth_mm, rtol=1e-5)
     assert estimate.sigma is not None
     np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-5)
-
-
-def test_the_network_is_told_the_mask_and_the_rays(frame: Frame, file: Path) -> None:
-    estimator = ScopeNetDepth(str(file))
-    plain = estimator.estimate(frame).values
-    masked = estimator.estimate(replace(frame, valid=np.zeros_like(frame.valid))).values
-    wide = replace(CAMERA, fx=20.0, fy=21.0)
-    elsewhere = estimator.estimate(replace(frame, camera=wide)).values
-    assert np.abs(masked / plain - 1).max() > 1e-3
-    assert np.isfinite(masked).all()
-    unit_z = 1 / np.linalg.norm(wide.rays, axis=-1)
-    assert np.abs(elsewhere / unit_z / (plain / UNIT_RAYS[..., 2]) - 1).max() > 1e-3
-    blind = ScopeNetDepth(str(file), rays_known=False)
-    one, two = blind.estimate(frame).values, blind.estimate(replace(frame, camera=wide)).values
-    np.testing.assert_allclose(two / unit_z, one / UNIT_RAYS[..., 2], rtol=1e-5)
 
 
 def test_the_package_s_network_answers_as_torch_does(frame: Frame) -> None:

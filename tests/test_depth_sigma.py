@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from chosen_settings import chosen
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings
@@ -43,13 +41,6 @@ def test_a_share_is_sigma_over_depth_and_unknown_where_either_is() -> None:
         relative_sigma(depth, sigma[:, :2])
 
 
-def test_trust_is_the_inverse_variance_against_the_median_pixel() -> None:
-    share = np.array([[0.05, 0.1, 0.3]], np.float32)
-    depth = np.array([[20.0, 40.0, 70.0]], np.float32)
-    expected = (0.1**2 + 0.1**2) / (0.1**2 + share**2)
-    np.testing.assert_allclose(depth_trust(depth, share * depth, 0.1), expected, rtol=1e-5)
-
-
 def test_trust_is_one_where_nothing_is_said_and_everywhere_with_a_large_floor() -> None:
     np.testing.assert_array_equal(depth_trust(DEPTH, None, 0.1), 1.0)
     np.testing.assert_array_equal(depth_trust(DEPTH, np.full(SHAPE, np.nan, np.float32), 0.1), 1.0)
@@ -67,14 +58,6 @@ def test_odds_are_multiplied_by_the_ratio_of_inverse_variances() -> None:
     one, two = 1 / share[1:5] ** 2, 1 / other[1:5] ** 2
     by_hand = weight[1:5] * one / (weight[1:5] * one + (1 - weight[1:5]) * two)
     np.testing.assert_allclose(by_variance(weight, share, other)[1:5], by_hand, rtol=1e-5)
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
-def test_equal_shares_leave_every_weight_to_the_last_bit(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    weight, share = rng.random(500, np.float32), rng.random(500, np.float32) + np.float32(1e-4)
-    np.testing.assert_array_equal(by_variance(weight, share, share), weight)
 
 
 def test_errors_of_one_kind_do_not_average_out() -> None:
@@ -148,19 +131,6 @@ def test_without_sigma_the_blend_is_the_perceptual_one_to_the_last_bit() -> None
     weight = 1 - np.clip(DISTANCE, 0, 1)
     expected = np.where(weight > 0, weight * DEPTH + (1 - weight) * OTHER, OTHER)
     np.testing.assert_array_equal(_refined((None, None))[1].depth_mm, expected)
-
-
-def test_a_pixel_that_knows_nothing_takes_what_was_seen_and_gives_nothing() -> None:
-    glare = np.zeros(SHAPE, bool)
-    glare[10:20, 10:30] = True
-    sigma = 0.1 * OTHER
-    blinded = np.where(glare, 1e9, sigma).astype(np.float32)
-    trusted = glare & (DISTANCE < 0.99)
-    taken = _refined((0.1 * DEPTH, blinded), sigma_fading=0.0)[1]
-    np.testing.assert_allclose(taken.depth_mm[trusted], DEPTH[trusted], rtol=1e-4)
-    given_up = _refined((np.where(glare, 1e9, 0.1 * DEPTH).astype(np.float32), sigma))[1]
-    doubtful = glare & (DISTANCE > 0.01)
-    np.testing.assert_allclose(given_up.depth_mm[doubtful], OTHER[doubtful], rtol=1e-4)
 
 
 def test_the_scale_of_a_frame_is_that_of_its_sigma() -> None:

@@ -45,17 +45,6 @@ def test_the_pose_of_a_far_view_is_found_from_features(detector: FeatureDetector
     assert len(located.pairs) >= 20
 
 
-def test_features_have_the_3d_point_of_their_pixel(detector: FeatureDetector) -> None:
-    frame = _frame(THERE)
-    features = detector.detect(frame)
-    assert len(features.pixels) > 100
-    np.testing.assert_allclose(CAMERA.project(features.points_mm), features.pixels, atol=1e-6)
-    column, row = np.rint(features.pixels).astype(int).T
-    assert frame.depth_mm is not None
-    np.testing.assert_allclose(features.points_mm[:, 2], frame.depth_mm[row, column])
-    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-5)
-
-
 def test_masked_pixels_have_no_features(detector: FeatureDetector) -> None:
     half = plane_scene.EVERYWHERE.copy()
     half[:, 120:] = False

@@ -55,30 +55,6 @@ def test_corners_of_masked_or_unknown_tissue_are_not_matched() -> None:
     assert matcher.match(_frame(1, THERE)) is None
 
 
-class _Started(NoFlow):
-    """Notes the starts that it is given."""
-
-    def __init__(self) -> None:
-        self.starts: list[FlowPair | None] = []
-
-    def estimate_checked(
-        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        self.starts.append(start)
-        return super().estimate_checked(rgb_from, rgb_to)
-
-
-def test_flow_begins_at_that_of_the_frame_before_unless_this_matched_few_corners() -> None:
-    flow, frame = _Started(), _frame(0, HERE)
-    matcher, nothing = KeyframeMatcher(flow), np.zeros_like(plane_scene.EVERYWHERE)
-    matcher.set_keyframe(frame)
-    for valid in (plane_scene.EVERYWHERE, nothing, plane_scene.EVERYWHERE):
-        matcher.match(replace(frame, valid=valid))
-    matcher.set_keyframe(frame)
-    matcher.match(frame)
-    assert [start is not None for start in flow.starts] == [False, True, False, False]
-
-
 class _InHalf(DisFlow):
     """DIS flow that is searched in images of half the size; `blind` there: it finds nothing."""
 

@@ -151,11 +151,3 @@ def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
     assert track.status == "lost"
     assert "weakly constrained" in track.reason
     assert abs(track.correlation) < 0.15
-
-
-def test_no_map_begins_with_an_unsharp_frame() -> None:
-    tracker, frame = Tracker(SETTINGS), _frame(0, NEAR[0])
-    assert tracker.track(frame).status == "initial"
-    # Not inserted, for want of depth: the next one fixes the world, unless it shows nothing.
-    assert tracker.track(replace(_smoked(frame), index=1)).status == "lost"
-    assert tracker.track(replace(frame, index=2)).status == "initial"

@@ -179,12 +179,3 @@ def test_without_a_warped_value_the_scaled_raw_depth_stands() -> None:
     np.testing.assert_array_equal(refined.depth_mm[:, :7], (4 * OTHER * np.float32(refined.scale))[:, :7])
     np.testing.assert_allclose(refined.depth_mm[10:, 7:], DEPTH[10:, 7:], rtol=1e-5)
     assert refined.warped_share == pytest.approx(38 * 57 / (48 * 64))
-
-
-def test_an_unknown_raw_pixel_does_not_spread() -> None:
-    mapis = Mapis(Config().mapis)
-    mapis.refine(DEPTH, "depth", CAMERA, None, None)
-    raw = OTHER.copy()
-    raw[20:23, 30:33] = np.nan
-    known = np.isfinite(mapis.refine(raw, "depth", CAMERA, _link(DISTANCE), None).depth_mm)
-    assert known[np.isfinite(raw)].all()

@@ -68,16 +68,6 @@ def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
     assert not any(one is not None for one in found_in(pictures))
 
 
-def test_what_goes_is_forgotten_and_another_size_begins_anew() -> None:
-    pictures = clip(40, text()) + clip(70)[40:]
-    finder = OverlayFinder()
-    found = [finder(picture, EVERYWHERE) for picture in pictures]
-    assert found[39] is not None
-    assert found[-1] is None
-    assert finder(clip(1, size=(160, 120))[0], EVERYWHERE[::2, ::2]) is None
-    assert finder.count == 1
-
-
 def with_vessels(picture: np.ndarray) -> np.ndarray:
     """Tissue with sharp dark lines, as near as a picture has them."""
     out, (height, width) = picture.copy(), picture.shape[:2]
