@@ -57,6 +57,16 @@ def disparity(scale: float = 0.07, shift: float = 0.006) -> DepthEstimate:
     return DepthEstimate(((1 / TRUTH_MM - shift) / scale).astype(np.float32), "disparity")
 
 
+def test_the_data_sets_own_convention_comes_back_from_near_and_far() -> None:
+    """C3VD cecum: depth = 15.6 / (disparity / 255 + 0.156) is near 13.5 at 255 and far 100 at 0."""
+    levels = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
+    levels[0], levels[1, 0] = 0.5, 0.0
+    anchor = anchored(near_far_mm=(13.5, 100.0))
+    found_mm = depth_of(anchor, DepthEstimate(levels, "disparity"), frame())
+    np.testing.assert_allclose(found_mm, 15.6 / (levels + 0.156), rtol=5e-4)
+    assert anchor.description == "near-far 13.5:100 mm"
+
+
 @settings(max_examples=15, deadline=None)
 @given(scale=st.floats(1e-4, 1), shift=st.floats(0, 0.009))
 def test_disparity_of_any_scale_and_shift_becomes_the_depth_of_the_reference(scale: float, shift: float) -> None:

@@ -21,7 +21,6 @@ from scopemap.depth.create import create_anchor, create_depth
 from scopemap.depth.files import FilesDepth
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
-from scopemap_bench.datasets.c3vd import C3vdFolder
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)
@@ -170,19 +169,3 @@ def test_the_registry_knows_its_names(tmp_path: Path) -> None:
     assert isinstance(create_anchor(DepthSettings(), "cpu"), AnchoredDepth)
     with pytest.raises(SettingsError, match="shading, depth-anything, depth-pro or files:FOLDER"):
         create_depth(chosen(DepthSettings, backend="midas"), SAME, "cpu")
-
-
-@pytest.mark.real
-def test_real_disparity_files_of_a_fisheye_video(real_data: Path) -> None:
-    """Anchored by near and far, frame 0 comes within 10 % of the peers' reading of the same files everywhere."""
-    folder = real_data / "endoscopy" / "c3vd"
-    source = C3vdFolder(folder / "cecum_t1_a")
-    assert source.camera is not None
-    rectifier = Rectifier(source.camera, working_camera(source.camera, (337, 270)))
-    settings = chosen(DepthSettings, backend=f"files:{folder / 'cecum_t1_a_depth_anything'}", near_far_mm=(13.5, 100.0))
-    first = frame(0, rectifier.target)
-    estimate = create_depth(settings, rectifier, "cpu").estimate(first)
-    depth_mm = create_anchor(settings, "cpu").metric(estimate, first).depth_mm
-    convention_mm = 15.6 / (estimate.values + 0.156)
-    assert np.isfinite(depth_mm).mean() > 0.99
-    assert np.nanmax(np.abs(depth_mm / convention_mm - 1)) < 0.15

@@ -14,7 +14,6 @@ from scopemap.config import TrackingSettings
 from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
-from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
@@ -23,16 +22,11 @@ HERE = plane_scene.pose()
 THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
 
 
-def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
-    view = plane_scene.see(T_world_camera)
-    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
-
-
 def test_corners_are_matched_where_the_plane_projects() -> None:
     matcher = KeyframeMatcher(DisFlow())
-    assert matcher.match(_frame(1, THERE)) is None
-    matcher.set_keyframe(_frame(4, HERE))
-    found = matcher.match(_frame(5, THERE))
+    assert matcher.match(plane_scene.frame(THERE, 1)) is None
+    matcher.set_keyframe(plane_scene.frame(HERE, 4))
+    found = matcher.match(plane_scene.frame(THERE, 5))
     assert found is not None
     assert found.reference == 4
     assert 0.8 < found.coverage <= 1
@@ -40,19 +34,19 @@ def test_corners_are_matched_where_the_plane_projects() -> None:
     errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.25
     matcher.set_keyframe(None)
-    assert matcher.match(_frame(5, THERE)) is None
+    assert matcher.match(plane_scene.frame(THERE, 5)) is None
 
 
 def test_corners_of_masked_or_unknown_tissue_are_not_matched() -> None:
-    matcher, frame = KeyframeMatcher(DisFlow()), _frame(0, HERE)
+    matcher, frame = KeyframeMatcher(DisFlow()), plane_scene.frame(HERE, 0)
     half = plane_scene.EVERYWHERE.copy()
     half[:, 120:] = False
     matcher.set_keyframe(frame)
-    found = matcher.match(replace(_frame(1, HERE), valid=half))
+    found = matcher.match(replace(plane_scene.frame(HERE, 1), valid=half))
     assert found is not None
     assert found.pixels[:, 0].max() < 120.5
     matcher.set_keyframe(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
-    assert matcher.match(_frame(1, THERE)) is None
+    assert matcher.match(plane_scene.frame(THERE, 1)) is None
 
 
 class _InHalf(DisFlow):
@@ -75,9 +69,9 @@ def test_flow_between_small_images_is_enough_for_as_exact_corners() -> None:
     T, errors_px = inverse(THERE) @ HERE, []
     for flow in (DisFlow(), _InHalf(blind=False)):
         matcher = KeyframeMatcher(flow)
-        matcher.set_keyframe(_frame(0, HERE))
+        matcher.set_keyframe(plane_scene.frame(HERE, 0))
         for index in (1, 2):
-            found = matcher.match(_frame(index, THERE))
+            found = matcher.match(plane_scene.frame(THERE, index))
         assert found is not None
         assert found.coverage > 0.8
         errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
@@ -89,8 +83,8 @@ def test_flow_between_small_images_is_enough_for_as_exact_corners() -> None:
 def test_where_flow_between_small_images_fails_the_whole_ones_are_used() -> None:
     matcher, flow = KeyframeMatcher(blind := _InHalf(blind=True)), KeyframeMatcher(DisFlow())
     for each in (matcher, flow):
-        each.set_keyframe(_frame(0, HERE))
-    found, wanted = matcher.match(_frame(1, THERE)), flow.match(_frame(1, THERE))
+        each.set_keyframe(plane_scene.frame(HERE, 0))
+    found, wanted = matcher.match(plane_scene.frame(THERE, 1)), flow.match(plane_scene.frame(THERE, 1))
     assert blind.widths == [120, 240]
     assert found is not None
     assert wanted is not None
@@ -111,9 +105,9 @@ class _Shifted(DisFlow):
 
 def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
     tracker = Tracker(chosen(TrackingSettings, finest_level=0, **changes), flow)
-    tracker.track(_frame(0, HERE))
-    assert tracker.insert_keyframe(_frame(0, HERE), measured=measured)
-    return tracker.track(_frame(1, THERE))
+    tracker.track(plane_scene.frame(HERE, 0))
+    assert tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=measured)
+    return tracker.track(plane_scene.frame(THERE, 1))
 
 
 def test_the_pose_is_the_corners_and_no_alignment_is_needed() -> None:
@@ -149,9 +143,9 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
     narrow[:, 64:] = False
     for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
         tracker = Tracker(chosen(TrackingSettings, finest_level=0, min_keyframe_agreement=0.0), DisFlow())
-        tracker.track(_frame(0, HERE))
-        tracker.insert_keyframe(_frame(0, HERE), measured=False)
-        assert tracker.track(replace(_frame(1, THERE), valid=valid)).status == "ok"
+        tracker.track(plane_scene.frame(HERE, 0))
+        tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=False)
+        assert tracker.track(replace(plane_scene.frame(THERE, 1), valid=valid)).status == "ok"
         assert tracker.needs_keyframe() == wanted
 
 
@@ -160,7 +154,7 @@ def _to_and_fro(tracker: Tracker) -> list[Track]:
     tracks: list[Track] = []
     keyframes = 0
     for index, way in enumerate([*range(9), *range(7, -1, -1)]):
-        frame = _frame(index, plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)))
+        frame = plane_scene.frame(plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)), index)
         track = tracker.track(replace(frame, T_world_camera=None))
         assert track.status != "lost", track.reason
         if tracker.needs_keyframe():

@@ -23,11 +23,6 @@ NEAR = [plane_scene.pose(at_mm=(1.0 * n, 0.3 * n, 0.0), turn_rad=(0.0, 0.0, 0.00
 FAR = [plane_scene.pose(at_mm=(27.0 + n, 8.0, 4.0), turn_rad=(0.05, -0.1, 0.3)) for n in range(3)]
 
 
-def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
-    view = plane_scene.see(T_world_camera)
-    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm)
-
-
 def _smoked(frame: Frame) -> Frame:
     """A frame of which a tenth shines through."""
     return replace(frame, rgb=np.clip(0.1 * frame.rgb + 150, 0, 255).astype(np.uint8))
@@ -54,7 +49,7 @@ def _off(track: Track, T_world_camera: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("spoil", [_smoked, _blurred])
 def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: ignore[no-untyped-def]
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     spoilt = [*frames[:4], spoil(frames[4]), spoil(frames[5]), *frames[6:]]
     tracks = _tracked(spoilt)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 3 + ["lost"] * 2 + ["ok"] * 2
@@ -67,8 +62,12 @@ def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: i
 
 @pytest.mark.parametrize("remembered", [10, 0])
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
-    dark = replace(_frame(8, NEAR[-1]), valid=np.zeros_like(plane_scene.EVERYWHERE))
-    frames = [*(_frame(n, T) for n, T in enumerate(NEAR)), dark, *(_frame(9 + n, T) for n, T in enumerate(FAR))]
+    dark = replace(plane_scene.frame(NEAR[-1], 8), valid=np.zeros_like(plane_scene.EVERYWHERE))
+    frames = [
+        *(plane_scene.frame(T, n) for n, T in enumerate(NEAR)),
+        dark,
+        *(plane_scene.frame(T, 9 + n) for n, T in enumerate(FAR)),
+    ]
     tracks = _tracked(frames, SETTINGS.model_copy(update={"relocalisation_keyframes": remembered}))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
@@ -85,13 +84,13 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
 
 def _elsewhere(index: int, n: int) -> Frame:
     """A frame of another place, far beyond what any of the others shows."""
-    return _frame(index, plane_scene.pose(at_mm=(-58.0 + n, -50.0, -10.0), turn_rad=(0.0, 0.0, 2.0)))
+    return plane_scene.frame(plane_scene.pose(at_mm=(-58.0 + n, -50.0, -10.0), turn_rad=(0.0, 0.0, 2.0)), index)
 
 
 def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_again() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(9)]
-    back = [_frame(17 + n, T) for n, T in enumerate(NEAR[:3])]
+    back = [plane_scene.frame(T, 17 + n) for n, T in enumerate(NEAR[:3])]
     tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
     assert tracks[11].reason == "new map"
@@ -108,9 +107,9 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
 
 
 def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_found() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
-    back = [_frame(20 + n, T) for n, T in enumerate(NEAR[:4])]
+    back = [plane_scene.frame(T, 20 + n) for n, T in enumerate(NEAR[:4])]
     tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 0, "search_every": 3}))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
@@ -124,7 +123,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
 
 @pytest.mark.parametrize("unseen", ["dark", "smoked"])
 def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     last = frames[-1]
     nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
     spoilt = [replace(nothing, index=8 + n) for n in range(12)]

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from scopemap.config import DepthSettings
-from scopemap.depth.estimate import DepthEstimate, DepthEstimator
+from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
@@ -54,15 +54,6 @@ class MetricDepth:
     depth_mm: np.ndarray
     sigma_mm: np.ndarray | None
     limit_note: str = ""
-
-
-@dataclass(frozen=True)
-class _Target:
-    """Pairs to fit: estimated values (N,) and their metric depth (N,), mm."""
-
-    values: np.ndarray
-    depth_mm: np.ndarray
-    focal_px: float
 
 
 class AnchoredDepth:
@@ -149,7 +140,7 @@ class AnchoredDepth:
         elif source == "factor":
             self.conversion = self._from_factor(estimate, usable)
         elif source == "near-far":
-            self.conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
+            self.conversion = self._fitted_to_range(estimate, usable, frame)
         else:
             reference = self.reference.estimate(frame)
             _, limit_note = self._beyond_limit(reference.values, usable)
@@ -158,8 +149,7 @@ class AnchoredDepth:
                 return None, f"no scale by {self.reference.name}: {limit_note}" if limit_note else ""
             details = self._details(reference, frame) + (f"; {limit_note}, and left the fit" if limit_note else "")
             focal_px = reference.focal_px or frame.camera.fx
-            target = _Target(estimate.values[known], reference.values[known], focal_px)
-            self.conversion = self._fitted(estimate, target)
+            self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
             first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
@@ -189,19 +179,24 @@ class AnchoredDepth:
             return AffineDisparity(1 / (nearest_mm * float(positive.max())), 0.0)
         return DepthScale(nearest_mm / float(positive.min()))
 
-    def _range_target(self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame) -> _Target:
+    def _fitted_to_range(
+        self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame
+    ) -> AffineDisparity | DepthScale:
         values = estimate.values[usable]
         near_far = (values.max(), values.min()) if estimate.kind == "disparity" else (values.min(), values.max())
-        return _Target(np.array(near_far, np.float64), np.array(self._settings.near_far_mm), frame.camera.fx)
+        range_mm = np.array(self._settings.near_far_mm)
+        return self._fitted(estimate.kind, np.array(near_far, np.float64), range_mm, frame.camera.fx)
 
-    def _fitted(self, estimate: DepthEstimate, target: _Target) -> AffineDisparity | DepthScale:
-        if estimate.kind == "depth":
-            return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
+    def _fitted(
+        self, kind: DepthKind, values: np.ndarray, depth_mm: np.ndarray, focal_px: float
+    ) -> AffineDisparity | DepthScale:
+        """Return the conversion of estimated values (N,) to their metric depth (N,), mm."""
+        if kind == "depth":
+            return DepthScale(float(np.exp(np.median(np.log(depth_mm / values)))))
         if self._settings.paper.fit_shift:
-            return fit_affine_disparity(target.depth_mm, target.values, max_depth_mm(self._settings))
-        floor = self._settings.paper.disparity_floor
-        baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px, floor)
-        return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
+            return fit_affine_disparity(depth_mm, values, max_depth_mm(self._settings))
+        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.paper.disparity_floor)
+        return AffineDisparity.from_baseline(baseline_mm, focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
         if estimate.kind == "measured":

@@ -159,9 +159,12 @@ def depth_files(folder: Path) -> dict[int, Path]:
 def _read(file: Path) -> np.ndarray:
     """Return (h, w) uint8, uint16 or floating; raises `InputError` for other content."""
     try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False) if file.suffix.lower() == _NUMPY else _read_image(file)
+        is_array = file.suffix.lower() == _NUMPY
+        array = np.load(file, mmap_mode="r", allow_pickle=False) if is_array else read_decoded(file)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"cannot read the depth file {file}: {error}") from None
+    if array is None:
+        raise InputError(f"cannot read the depth file {file}: not an image, or damaged")
     array = np.squeeze(array)
     if array.ndim == 3 and (array[..., :3] == array[..., :1]).all():
         array = array[..., 0]
@@ -170,13 +173,6 @@ def _read(file: Path) -> np.ndarray:
             f"the depth file {file} holds {array.dtype} of shape {array.shape}: expected one channel of 8 or 16 bit "
             "or floats; a colour-mapped depth picture cannot be converted to depth"
         )
-    return array
-
-
-def _read_image(file: Path) -> np.ndarray:
-    array = read_decoded(file)
-    if array is None:
-        raise ValueError("not an image, or damaged")
     return array
 
 

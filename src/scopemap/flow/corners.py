@@ -18,6 +18,7 @@ from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame
 from scopemap.geometry.local_contrast import local_contrast, local_mean
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.geometry.warp import bilinear
 
 _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
@@ -215,19 +216,9 @@ def match_corners(
 
 
 def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside.
-
-    OpenCV's remap is not used: it fails for no points and for more than 32767.
-    """
-    height, width = flow.shape[:2]
-    inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)
-    place = np.where(inside, pixel, 0.0)
-    corner = np.clip(np.floor(place).astype(int), 0, [width - 2, height - 2])
-    x, y = corner.T
-    a, b = (place - corner).T[..., None]
-    top = (1 - a) * flow[y, x] + a * flow[y, x + 1]
-    bottom = (1 - a) * flow[y + 1, x] + a * flow[y + 1, x + 1]
-    return np.where(inside, (1 - b) * top + b * bottom, np.nan)
+    """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside."""
+    inside = ((pixel >= 0) & (pixel <= [flow.shape[1] - 1, flow.shape[0] - 1])).all(axis=1, keepdims=True)
+    return np.where(inside, bilinear(flow, np.where(inside, pixel, 0.0)), np.nan)
 
 
 def normalised_brightness(rgb: np.ndarray) -> np.ndarray:

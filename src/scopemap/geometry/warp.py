@@ -88,6 +88,19 @@ def moved_depth(
     return np.where(moved > 0, moved, np.float32(np.nan))
 
 
+def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, C) at places (N, 2) x, y within it, (N, C), bilinear.
+
+    OpenCV's remap is not used: it fails for no points and for more than 32767.
+    """
+    corner = np.clip(np.floor(places).astype(int), 0, [image.shape[1] - 2, image.shape[0] - 2])
+    x, y = corner.T
+    a, b = (places - corner).T[..., None]
+    top = (1 - a) * image[y, x] + a * image[y, x + 1]
+    bottom = (1 - a) * image[y + 1, x] + a * image[y + 1, x + 1]
+    return np.asarray((1 - b) * top + b * bottom)
+
+
 def resampled(values: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """Return floats (H, W) of the same view at the size of `camera`, bilinear; nearest where that meets NaN."""
     size = camera.width, camera.height

@@ -18,6 +18,7 @@ import onnxruntime
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.geometry.local_contrast import local_mean
+from scopemap.geometry.warp import bilinear
 from scopemap.io.inference import open_network
 from scopemap.io.weights import sha256_of
 from scopemap.tracking.features import Features, points_at, usable_pixels
@@ -93,19 +94,9 @@ def descriptors_at(pixels: np.ndarray, maps: list[np.ndarray], head: np.ndarray)
     for features in maps:
         # The corners of all scales lie on each other, as in the network's training.
         last = np.array([features.shape[2] - 1, features.shape[1] - 1])
-        parts.append(_sampled(features, pixels * last / [width - 1, height - 1]))
+        parts.append(bilinear(np.moveaxis(features, 0, -1), pixels * last / [width - 1, height - 1]))
     descriptors = np.concatenate(parts, 1) @ head.T
     return (descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)).astype(np.float32)
-
-
-def _sampled(features: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return features (C, h, w) at places (N, 2) x, y within them, (N, C), bilinear."""
-    corner = np.clip(np.floor(places).astype(int), 0, [features.shape[2] - 2, features.shape[1] - 2])
-    x, y = corner.T
-    a, b = (places - corner).T
-    top = (1 - a) * features[:, y, x] + a * features[:, y, x + 1]
-    bottom = (1 - a) * features[:, y + 1, x] + a * features[:, y + 1, x + 1]
-    return np.asarray(((1 - b) * top + b * bottom).T)
 
 
 def _keypoints(scores: np.ndarray, usable: np.ndarray) -> np.ndarray:

@@ -53,15 +53,8 @@ def build_pyramid(
             camera = camera.resized(width, height)
         if level >= finest:
             slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
-            views.append(
-                View(
-                    _channels(grey, weight),
-                    weight,
-                    depth,
-                    slope,
-                    np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-                )
-            )
+            intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+            views.append(View(_channels(grey, weight), weight, depth, slope, intrinsics))
     return views
 
 
