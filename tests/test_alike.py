@@ -53,16 +53,6 @@ def test_features_are_those_of_before() -> None:
     np.testing.assert_allclose(features.descriptors[0, :4], EXPECTED_DESCRIPTOR, atol=2e-3)
 
 
-def test_what_the_network_sees_hardly_depends_on_the_lamp() -> None:
-    ramp = np.linspace(0.25, 1.0, RGB.shape[1])[:, None]
-    lit, dim = (alike.evenly_lit(rgb).astype(float) for rgb in (RGB, (RGB * ramp).astype(np.uint8)))
-    before = np.abs(RGB * (1 - ramp)).mean()
-    assert np.abs(lit - dim).mean() < before / 5
-    dark = alike.evenly_lit(np.zeros((20, 30, 3), np.uint8))
-    assert dark.shape == (20, 30, 3)
-    assert not dark.any()
-
-
 def test_an_installation_without_the_network_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alike, "_NETWORK", "none.onnx")
     alike._network.cache_clear()

@@ -22,7 +22,7 @@ from scopemap.depth.scopenet.planes import input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
-from training.export import export, read_network
+from training.export import export
 from training.network import ScopeNet
 
 HEIGHT, WIDTH = 50, 61  # no multiple of anything
@@ -86,15 +86,6 @@ def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(
     np.testing.assert_allclose(estimate.values, depth_mm, rtol=1e-5)
     assert estimate.sigma is not None
     np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-5)
-
-
-def test_the_package_s_network_answers_as_torch_does(frame: Frame) -> None:
-    shipped = Path(module.__file__).parent / WEIGHTS_NAME
-    told = _told(read_network(shipped), input_planes(frame.rgb, UNIT_RAYS, frame.valid))
-    estimate = ScopeNetDepth().estimate(frame)
-    assert estimate.sigma is not None
-    np.testing.assert_allclose(np.log(estimate.values / UNIT_RAYS[..., 2]), told[0], atol=1e-5)
-    np.testing.assert_allclose(np.log(estimate.sigma / estimate.values / math.sqrt(2)), told[1], atol=1e-5)
 
 
 def test_what_is_shipped_is_what_the_model_card_describes() -> None:

@@ -52,10 +52,6 @@ def test_a_panel_is_filled() -> None:
     assert last.mean() < 1.6 * 100 * 30 / EVERYWHERE.size
 
 
-def test_tissue_alone_is_no_overlay() -> None:
-    assert not any(one is not None for one in found_in(clip(60)))
-
-
 def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
     rng = np.random.default_rng(0)
     still = clip(1, text())[0]
