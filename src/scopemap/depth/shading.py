@@ -13,6 +13,7 @@ import numpy as np
 from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.guided import filled, guided_filter
+from scopemap.depth.scopenet.planes import LINEAR
 from scopemap.frame import Frame
 
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
@@ -86,10 +87,8 @@ def relative_distance(frame: Frame, unit_z: np.ndarray, exponent: float) -> np.n
 
 
 def linear_brightness(rgb: np.ndarray) -> np.ndarray:
-    """Return the mean linear red and green 0..1 (H, W) float32 of an sRGB image (H, W, 3) uint8 (IEC 61966-2-1)."""
-    level = np.arange(256) / 255
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    return linear[rgb] @ _CHANNEL_WEIGHTS
+    """Return the mean linear red and green 0..1 (H, W) float32 of an sRGB image (H, W, 3) uint8."""
+    return LINEAR.astype(np.float32)[rgb] @ _CHANNEL_WEIGHTS
 
 
 def _glare(rgb: np.ndarray, log_brightness: np.ndarray, width_px: int) -> np.ndarray:

@@ -182,9 +182,7 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     # On brightness relative to its surround: distant tissue is dark, not without texture.
     level = local_mean(grey.astype(np.float32), _SURROUND_PX) + _DARKEST
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
-    usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
-    # A patch that touches a mask's edge has a corner that is not the tissue's.
-    usable = cv2.erode(usable.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0) > 0
+    usable = usable_pixels(frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm))
     strength = np.where(usable, strength, -1.0)
     height, width = (side // cell_px * cell_px for side in strength.shape)
     cells: np.ndarray = strength[:height, :width].reshape(height // cell_px, cell_px, width // cell_px, cell_px)
@@ -193,6 +191,12 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     row, column = np.divmod(np.arange(len(cells)), width // cell_px)
     pixels = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
     return pixels[cells.max(1) > 0]
+
+
+def usable_pixels(valid: np.ndarray) -> np.ndarray:
+    """Return where features may be, (H, W) bool: those at the edge of a mask or a highlight are not the tissue's."""
+    border = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(valid.astype(np.uint8), border, borderValue=0) > 0)
 
 
 def match_corners(

@@ -16,12 +16,13 @@ import numpy as np
 import onnxruntime
 
 from scopemap.errors import WeightsError
+from scopemap.flow.corners import usable_pixels
 from scopemap.frame import Frame
 from scopemap.geometry.local_contrast import local_mean
 from scopemap.geometry.warp import bilinear
 from scopemap.io.inference import open_network
 from scopemap.io.weights import sha256_of
-from scopemap.tracking.features import Features, points_at, usable_pixels
+from scopemap.tracking.features import Features, points_at
 
 STRIDE = 32  # of the network: both sides of its input are multiples
 _NETWORK = "alike.onnx"
@@ -47,10 +48,6 @@ class AlikeFeatures:
         scores, maps, head = network_answer(evenly_lit(frame.rgb))
         scores = scores[:height, :width]
         pixels = _keypoints(scores, usable_pixels(frame.valid))
-        if not len(pixels):
-            return Features(
-                np.zeros((0, 2)), np.zeros((0, len(head)), np.float32), np.zeros((0, 3)), max_ratio=self.max_ratio
-            )
         descriptors = descriptors_at(pixels, maps, head)
         return Features(pixels, descriptors, points_at(pixels, frame.depth_mm, frame.camera), max_ratio=self.max_ratio)
 

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.flow.corners import usable_pixels
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import se3, so3_exp
 
 _MAX_FEATURES = 500
 _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
 _MAX_EDGE_RATIO = 15.0
-_BORDER_PX = 3
 _MAX_RATIO = 0.8  # Lowe's ratio test
 _MAX_ITERATIONS = 500
 _CONFIDENCE = 0.999
@@ -89,20 +89,11 @@ class RelativePose:
     pairs: np.ndarray
 
 
-def usable_pixels(valid: np.ndarray) -> np.ndarray:
-    """Return where features may be, (H, W) bool: those at the edge of a mask or a highlight are not the tissue's."""
-    border = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(valid.astype(np.uint8), border, borderValue=0) > 0)
-
-
 def points_at(pixels: np.ndarray, depth_mm: np.ndarray | None, camera: PinholeCamera) -> np.ndarray:
     """Return the points (N, 3) mm in the camera at pixels (N, 2); NaN where the depth (H, W), mm, is unknown."""
     column, row = np.clip(np.rint(pixels).astype(int), 0, [camera.width - 1, camera.height - 1]).T
     known_mm = np.full(len(pixels), np.nan) if depth_mm is None else depth_mm[row, column]
-    ray = np.column_stack(
-        [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(pixels))]
-    )
-    return known_mm[:, None].astype(np.float64) * ray
+    return known_mm[:, None].astype(np.float64) * camera.unproject(pixels)
 
 
 def match_features(reference: Features, current: Features) -> np.ndarray:
@@ -132,22 +123,22 @@ def relative_pose_pnp(
     pairs = pairs[np.isfinite(reference.points_mm[pairs[:, 0]]).all(1)]
     if len(pairs) < max(min_inliers, 6):
         return None
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     points, pixels = reference.points_mm[pairs[:, 0]], current.pixels[pairs[:, 1]]
-    max_error_px = _INLIER_SHARE * camera.width
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points,
         pixels,
-        K,
+        camera.matrix,
         None,
         iterationsCount=_MAX_ITERATIONS,
-        reprojectionError=max_error_px,
+        reprojectionError=_INLIER_SHARE * camera.width,
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_P3P,
     )
     if not found or inliers is None or len(inliers) < min_inliers:
         return None
     inliers = inliers.ravel()
-    rotation, translation = cv2.solvePnPRefineLM(points[inliers], pixels[inliers], K, None, rotation, translation)
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[inliers], pixels[inliers], camera.matrix, None, rotation, translation
+    )
     T = se3(so3_exp(rotation.ravel()), translation.ravel())
     return RelativePose(T, pairs[inliers]) if np.isfinite(T).all() else None
