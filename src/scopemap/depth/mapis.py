@@ -111,9 +111,9 @@ class Mapis:
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
-        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where unknown; the first frame of
-        a sequence has no `correspondence`. With a motion the previous depth is transformed by it; with None its values
-        are warped unchanged, as in the paper. A frame just `anchored` to a metric depth starts a new chain of scales.
+        raw_mm : (H, W) float32; sigma_mm : its standard deviation, NaN or None where unknown. correspondence : None for
+        the first frame. T_current_previous : transforms the previous depth; None: it is warped unchanged, as in the
+        paper. anchored : whether the frame was just anchored to a metric depth, which starts a new chain of scales.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         if anchored:

@@ -71,9 +71,8 @@ class Correspondences2D3D:
 class KeyframeMatcher:
     """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow.
 
-    The flow to a frame is searched from that to the frame before. In small images it takes a quarter of the time;
-    patches of the whole ones, aligned from there, give poses of the same error. Where it matches few corners, flow
-    between the whole images matches more.
+    The flow to a frame is searched from that to the frame before, in small images; patches of the whole ones are then
+    aligned. Where that matches few corners, flow between the whole images is used.
     """
 
     def __init__(self, flow: FlowEstimator) -> None:

@@ -60,10 +60,7 @@ class AlikeFeatures:
 
 
 def evenly_lit(rgb: np.ndarray) -> np.ndarray:
-    """Return a picture (H, W, 3) uint8 over its local brightness: the lamp moves with the camera, the tissue does not.
-
-    What was a dark lumen is matched with the bright wall that it becomes.
-    """
+    """Return a picture (H, W, 3) uint8 over its local brightness: a dark lumen matches the bright tissue it becomes."""
     width = rgb.shape[1]
     brightest = cv2.max(cv2.max(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
     sigma_px = _LOW_RESOLUTION * max(_EVEN_SHARE * (width // _LOW_RESOLUTION), 1.0)

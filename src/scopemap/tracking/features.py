@@ -42,7 +42,7 @@ class Features:
 
 
 class FeatureDetector(Protocol):
-    """Protocol of what detects features: `SiftFeatures` and `AlikeFeatures`; any thread may call it."""
+    """Protocol of `SiftFeatures` and `AlikeFeatures`; any thread may call it."""
 
     name: str
     descriptor_size: int

@@ -1,4 +1,4 @@
-"""What becomes of a lost camera: features find it again in known keyframes; until then its rotation is followed."""
+"""Relocalisation of a lost camera in known keyframes; until then, in a close-up, its rotation is followed."""
 
 from __future__ import annotations
 
@@ -22,19 +22,16 @@ from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
-_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
+_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
 _EVERY_PX, _RANGE = 4, (5, 95)
 # Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
 _FLOW_EVERY_PX, _FOLLOWED_COVERAGE, _FOLLOWED_ERROR = 8, 0.25, 0.01
-_DEPTH_SIGMA = 0.2  # relative standard deviation of the wall's shape
+_DEPTH_SIGMA = 0.2  # relative standard deviation of depth in a close-up
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
 
 
 def is_close_up(frame: Frame, keyframe: Keyframe) -> bool:
-    """Whether a frame shows nothing but one near wall, by its predicted depth: it hardly varies beside the keyframe's.
-
-    How near the wall is depth networks do not tell; where depth is measured it is no reason to be lost.
-    """
+    """Return whether a frame's predicted depth hardly varies beside the keyframe's: a close-up without structure."""
     if keyframe.measured or frame.depth_mm is None:
         return False
     return _log_depth_range(frame) < _CLOSE_UP_RANGE * _log_depth_range(keyframe.frame)
@@ -80,11 +77,11 @@ def nearer_keyframe(keyframes: Iterable[Frame], T_world_camera: np.ndarray, curr
 
 
 class RotationFollower:
-    """Follows the rotation of a lost camera from frame to frame, where a wall fills the picture: its position is held.
+    """Follows the rotation of a lost camera from frame to frame in a close-up; its position is not known.
 
-    Near a wall translation moves the picture as much as rotation does, so that a rotation alone does not explain the
-    flow. The wall's predicted depth has a shape, but no scale: PnP of the last frame's points gives the rotation, and a
-    translation of which nothing is kept. Where flow matches little, or does not fit, the rotation is lost, too.
+    In a close-up translation moves the picture as much as rotation does. Predicted depth has a shape there, but no
+    scale: PnP of the last frame's points gives the rotation, and a translation that is dropped. Where flow matches
+    little, or does not fit, the rotation is lost, too.
     """
 
     def __init__(self) -> None:

@@ -44,8 +44,7 @@ class Motion(NamedTuple):
 class Alignment:
     """Relative pose of two frames, and how well it fits their images.
 
-    motion : relative pose and brightness. residual : robust standard deviation of the normalised channel's residuals
-    at the finest level, in local deviations of the grey value.
+    residual : robust standard deviation of the normalised channel's residuals at the finest level, in local deviations.
     inlier_share : share of the used pixels whose residual is below half a local deviation. correlation : -1..1, of
     both frames' normalised channel over these pixels; near 0 for noise, however well that fits.
     texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.

@@ -1,4 +1,4 @@
-"""Sharpness of a frame against the recent frames, and what its picture is worth: blur, smoke and fluid reduce both."""
+"""Sharpness of a frame against the recent frames, and its image quality: blur, smoke and fluid reduce both."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from scopemap.geometry.local_contrast import local_mean
 
 _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
 _FRAMES = 30
-# What its picture is worth is measured in a small copy, against the upper quartile of so many frames: unlike their
-# median, it is still that of clear ones where fluid stays for seconds.
+# Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
+# that of clear ones where fluid stays for seconds.
 _SMALL_PX, _NEIGHBOURS, _CLEAR_PERCENTILE = 320, 100, 75
 _LEAST_QUALITY = 0.01
 
 
 class SharpnessMonitor:
-    """Compares the sharpness of frames, in order, with the median of the last 30.
-
-    Unsharp frames count among those 30, too, so that a camera that approached a bare wall is soon usual again.
-    """
+    """Compares the sharpness of frames, in order, with the median of the last 30, unsharp ones included."""
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=_FRAMES)
@@ -35,7 +32,7 @@ class SharpnessMonitor:
 
 
 class PictureQuality:
-    """What the pictures of frames, in order, are worth beside those of the last 100.
+    """Image quality of frames, in order, beside that of the last 100.
 
     The product of three shares, each 1 at most, of the upper quartile of these frames: sharpness; usable pixels, which
     are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white.
