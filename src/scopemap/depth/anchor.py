@@ -135,7 +135,7 @@ class AnchoredDepth:
             return None, ""
         first_mm, details = None, ""
         source = self._source(estimate)
-        if source == "own":
+        if source == "estimate":
             self.conversion = DepthScale(1.0)
         elif source == "factor":
             self.conversion = self._from_factor(estimate, usable)
@@ -154,20 +154,22 @@ class AnchoredDepth:
             first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
         self.description = self._describe(source, estimate, frame) + details
-        network = self._settings.backend if source == "own" else self.reference.name if source == "reference" else ""
+        network = (
+            self._settings.backend if source == "estimate" else self.reference.name if source == "reference" else ""
+        )
         self.is_measured = estimate.kind == "measured"
         self.scale_is_known = self.is_measured or source == "near-far" or network == "depth-pro"
         return first_mm, ""
 
-    def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
+    def _source(self, estimate: DepthEstimate) -> Literal["estimate", "near-far", "factor", "reference"]:
         anchor = self._settings.anchor
         if estimate.kind == "measured" or anchor == self._settings.backend:
-            return "own"
+            return "estimate"
         if anchor == "factor":
             return "factor"
         if anchor == "near-far" or (anchor == "auto" and self._settings.near_far_mm is not None):
             return "near-far"
-        return "own" if anchor == "auto" and estimate.kind == "depth" else "reference"
+        return "estimate" if anchor == "auto" and estimate.kind == "depth" else "reference"
 
     def _from_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
         """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
@@ -205,7 +207,7 @@ class AnchoredDepth:
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
             return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.paper.factor:g}"
-        name = self._settings.backend if source == "own" else self.reference.name
+        name = self._settings.backend if source == "estimate" else self.reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
         return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"

@@ -69,7 +69,7 @@ class PerceptualResult:
 
 
 class PerceptualDistance(Protocol):
-    """Distance between two images as people see them."""
+    """Perceptual distance between two images."""
 
     name: str
 

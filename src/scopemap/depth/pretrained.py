@@ -1,4 +1,4 @@
-"""Depth networks of `transformers`: loaded from a folder, loudly where anything is amiss, and applied to a picture."""
+"""Depth networks of `transformers`: loaded from a folder, with an error where anything does not fit, and applied."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MM_PER_M = 1000.0
 
 
 class PretrainedNetwork:
-    """A network and its image processor. origin : what `load_pretrained` says of them."""
+    """A network and its image processor. origin : as `load_pretrained` returns it."""
 
     name = ""
 
@@ -87,9 +87,9 @@ def load_pretrained(class_name: str, model: str, name: str) -> tuple[Any, Any, d
         raise WeightsError(
             f"cannot load '{model}' from {folder}: {error}. Pull it again or name another folder"
         ) from error
-    amiss = {kind: sorted(map(str, report[kind])) for kind in ("missing_keys", "mismatched_keys") if report[kind]}
-    if amiss:
-        raise WeightsError(f"the weights in {folder} do not fit the network: {amiss}. Pull them again")
+    unfit = {kind: sorted(map(str, report[kind])) for kind in ("missing_keys", "mismatched_keys") if report[kind]}
+    if unfit:
+        raise WeightsError(f"the weights in {folder} do not fit the network: {unfit}. Pull them again")
     revision = "" if _is_local(model) else weights.recorded_revision(model)
     hashes = {f"sha256 {file.name}": weights.sha256_of(file) for file in sorted(folder.glob("*.safetensors"))}
     return network, processor, {"model": model, **({"revision": revision} if revision else {}), **hashes}

@@ -62,7 +62,7 @@ class FieldOfView:
 
 
 def hull_of_largest(lit: np.ndarray) -> np.ndarray:
-    """Return the convex hull, (H, W) bool, of the largest component; all of the image where that is hardly anything."""
+    """Return the convex hull, (H, W) bool, of the largest component; all of the image where that is tiny."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8))
     areas = stats[1:, cv2.CC_STAT_AREA]
     if areas.size == 0 or areas.max() < _MIN_FIELD_SHARE * lit.size:
@@ -78,7 +78,7 @@ class StoredMasks(Protocol):
 
     @property
     def notices(self) -> list[Notice]:
-        """What is to be said about the masks read so far."""
+        """Notices about the masks read so far."""
         ...
 
     def covered(self, index: int) -> np.ndarray | None:

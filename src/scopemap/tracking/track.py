@@ -13,7 +13,7 @@ from scopemap.trajectory.causes import LossCause
 
 Status = Literal["initial", "ok", "lost", "other-map", "rotation-only"]
 
-_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
+_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image with few usable pixels
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
@@ -82,7 +82,7 @@ class Track:
 
 
 def unusable(frame: Frame) -> TrackingLoss:
-    """Return why hardly a pixel of an image is usable: it is dark, overexposed, or something covers the view."""
+    """Return why few pixels of an image are usable: it is dark, overexposed, or something covers the view."""
     low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
     reason = f"only {frame.valid.mean():.0%} of the image is usable"
     if middle < _DARK_LEVEL:

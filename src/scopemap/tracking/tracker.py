@@ -294,15 +294,8 @@ class Tracker(FrameTracker):
     def _lost(self, frame: Frame, loss: TrackingLoss, alignment: Alignment | None = None) -> Track:
         self._motion.frames_lost += 1
         reference = self._keyframe.frame.index if self._keyframe else frame.index
-        track = Track(
-            frame.index,
-            "lost",
-            loss.reason,
-            self._motion.T_world_last,
-            reference,
-            map=self._motion.map,
-            cause=loss.cause,
-        )
+        T_world_camera, number = self._motion.T_world_last, self._motion.map
+        track = Track(frame.index, "lost", loss.reason, T_world_camera, reference, map=number, cause=loss.cause)
         return track if self._keyframe is None or alignment is None else _fitted(track, self._keyframe, alignment)
 
     def _new_map(self, frame: Frame) -> Track:

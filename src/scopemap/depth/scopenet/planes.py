@@ -8,7 +8,7 @@ import numpy as np
 from scopemap.errors import check_shape
 
 PLANES = 8
-INSTRUMENTS = "instruments"  # the name of the output that tells them
+INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3
