@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -51,24 +51,6 @@ def cauchy(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
 def huber_weight(residuals: np.ndarray, threshold: float) -> np.ndarray:
     """Return the weights of absolute residuals under Huber's kernel: 1 up to `threshold`, then threshold / residual."""
     return np.minimum(1.0, threshold / np.maximum(residuals, 1e-300))
-
-
-class Model(Protocol):
-    """Quadratic model of a cost, infinite where the state is impossible; gradient (n,), and Gauss-Newton hessian H."""
-
-    @property
-    def cost(self) -> float:
-        """Cost at the state."""
-
-    @property
-    def gradient(self) -> np.ndarray:
-        """First derivative (n,)."""
-
-    def gauss_newton_step(self) -> np.ndarray:
-        """Return the step (n,) to the minimum of the model."""
-
-    def curvature(self, step: np.ndarray) -> float:
-        """Return step^T H step."""
 
 
 class DenseModel(NamedTuple):
@@ -203,7 +185,7 @@ class CameraBlock(NamedTuple):
 
 @dataclass(frozen=True)
 class SchurModel:
-    """Model of a cost of camera unknowns and points, in this order; see `least_squares.Model`.
+    """Model of a cost of camera unknowns and points, in this order.
 
     cost : at the state. build : returns the blocks, called once and only where a step is needed. free : (F,) numbers
     of the camera unknowns that may change. cameras, points : how many unknowns there are of either.
@@ -271,3 +253,7 @@ class SchurModel:
             own, some = cameras[block.columns], points[block.points]
             total += float(own @ block.A @ own + 2 * some @ (block.E @ own) + some @ (block.h * some))
         return total
+
+
+Model = DenseModel | SchurModel
+"""Quadratic model of a cost around a state; the cost is infinite where the state is impossible."""
