@@ -20,8 +20,7 @@ from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate, DepthKind
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.io.decoding import read_decoded
-from scopemap.io.images import by_number, frame_number
+from scopemap.io.decoding import by_number, frame_number, read_decoded
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"

@@ -11,8 +11,7 @@ import numpy as np
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import MaskSettings
 from scopemap.errors import InputError, SettingsError
-from scopemap.io.decoding import read_decoded
-from scopemap.io.images import by_number, frame_number
+from scopemap.io.decoding import by_number, frame_number, read_decoded
 from scopemap.masking.masker import disc
 from scopemap.notices import Notice
 
