@@ -104,19 +104,6 @@ def test_unknown_mode_and_unequal_lengths_are_refused() -> None:
 
 
 @few
-@given(seeds)
-def test_scale_alone_is_that_of_the_sim3_fit_and_nothing_turns(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    estimated, reference = random_poses(rng), random_poses(rng)
-    aligned, similarity = align_trajectories(estimated, reference, "scale")
-    _, sim3 = align_trajectories(estimated, reference, "sim3")
-    assert similarity.scale == sim3.scale
-    np.testing.assert_array_equal(similarity.singular_values, sim3.singular_values)
-    np.testing.assert_array_equal(aligned[:, :3, :3], estimated[:, :3, :3])
-    np.testing.assert_allclose(aligned[:, :3, 3], sim3.scale * estimated[:, :3, 3])
-
-
-@few
 @given(seeds, st.sampled_from(["se3", "sim3", "scale"]))
 def test_the_first_frames_alone_decide_the_fit_and_all_are_moved(seed: int, mode: str) -> None:
     rng = np.random.default_rng(seed)
@@ -142,13 +129,3 @@ def test_what_cannot_be_fitted_is_refused() -> None:
         with pytest.raises(AlignmentError, match=r"on one line.*singular values"):
             align_trajectories(poses, poses, mode, first=6)  # type: ignore[arg-type]
         assert align_trajectories(poses, poses, mode)[1].scale == pytest.approx(1)  # type: ignore[arg-type]
-
-
-@few
-@given(seeds)
-def test_similarities_are_undone_and_done_one_after_the_other(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    first, second, poses = random_similarity(rng), random_similarity(rng), random_poses(rng)
-    moved = first.transform_poses(poses)
-    np.testing.assert_allclose(first.inverse().transform_poses(moved), poses, atol=1e-9)
-    np.testing.assert_allclose(second.after(first).transform_poses(poses), second.transform_poses(moved), atol=1e-8)

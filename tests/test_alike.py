@@ -46,52 +46,11 @@ def test_the_graph_is_the_network() -> None:
     np.testing.assert_allclose(found, dense[0].numpy()[:, pixels[:, 1], pixels[:, 0]].T, atol=1e-4)
 
 
-def test_an_exported_network_is_read_again(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("onnx")
-    from training.alike import export_alike, read_alike
-
-    network = read_alike(FILE)
-    export_alike(network, tmp_path / "again.onnx")
-    again = read_alike(tmp_path / "again.onnx").state_dict()
-    assert all(torch.equal(value, again[name]) for name, value in network.state_dict().items())
-
-
 def test_features_are_those_of_before() -> None:
     features = AlikeFeatures().detect(_frame(RGB))
     assert features.descriptors.shape == (len(features.pixels), 64)
     np.testing.assert_allclose(features.pixels[:3], EXPECTED_PIXELS, atol=0.02)
     np.testing.assert_allclose(features.descriptors[0, :4], EXPECTED_DESCRIPTOR, atol=2e-3)
-
-
-def test_what_the_network_sees_hardly_depends_on_the_lamp() -> None:
-    ramp = np.linspace(0.25, 1.0, RGB.shape[1])[:, None]
-    lit, dim = (alike.evenly_lit(rgb).astype(float) for rgb in (RGB, (RGB * ramp).astype(np.uint8)))
-    before = np.abs(RGB * (1 - ramp)).mean()
-    assert np.abs(lit - dim).mean() < before / 5
-    dark = alike.evenly_lit(np.zeros((20, 30, 3), np.uint8))
-    assert dark.shape == (20, 30, 3)
-    assert not dark.any()
-
-
-@pytest.mark.parametrize("size", [(41, 67), (32, 32), (100, 33)])
-def test_pictures_of_any_size(size: tuple[int, int]) -> None:
-    height, width = size
-    scores, maps, _ = network_answer(RGB[:height, :width])
-    assert scores.shape == (-(-height // 32) * 32, -(-width // 32) * 32)
-    assert [features.shape[0] for features in maps] == [16] * 4
-
-
-def test_keypoints_follow_the_picture_by_less_than_a_pixel() -> None:
-    """Each second keypoint of a picture is found in one that is smaller by a tenth, where it belongs."""
-    import cv2
-
-    smaller = cv2.resize(RGB, None, fx=0.9, fy=0.9, interpolation=cv2.INTER_AREA)
-    usable = np.pad(np.ones([side - 8 for side in smaller.shape[:2]], bool), 4)
-    whole = alike._keypoints(network_answer(RGB)[0][: RGB.shape[0], : RGB.shape[1]], _inside(RGB))
-    found = alike._keypoints(network_answer(smaller)[0][: smaller.shape[0], : smaller.shape[1]], usable)
-    away = np.linalg.norm((whole[:100, None] + 0.5) * 0.9 - 0.5 - found, axis=2).min(1)
-    assert np.median(away) < 0.5
 
 
 def test_an_installation_without_the_network_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,7 +76,3 @@ def test_the_notice_comes_with_the_weights() -> None:
 def _frame(rgb: np.ndarray) -> Frame:
     depth_mm = np.full(rgb.shape[:2], 50.0, np.float32)
     return Frame(0, 0.0, rgb, CAMERA, plane_scene.EVERYWHERE, depth_mm)
-
-
-def _inside(rgb: np.ndarray) -> np.ndarray:
-    return np.pad(np.ones([side - 8 for side in rgb.shape[:2]], bool), 4)

@@ -13,7 +13,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping import Mapper
 from scopemap.runner.backwards import _agree, _moved
-from scopemap.tracking.relocalisation import Keyframe
+from scopemap.tracking.keyframe_alignment import Keyframe, KeyframeAligner
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track, TrackingLoss
 from scopemap.tracking.tracker import Tracker
@@ -38,7 +38,7 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
 
     twice : frames of which every pose is refused later, too.
     """
-    track, reject = Tracker.track, Tracker._rejection
+    track, reject = Tracker.track, KeyframeAligner.rejection
     now, done = [-1], set[int]()
 
     def watched(self: Tracker, frame: Frame) -> Track:
@@ -47,14 +47,14 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
         done.add(frame.index)
         return found
 
-    def refusing(self: Tracker, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
+    def refusing(self: KeyframeAligner, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
         first = now[0] in (*LOST, LOST.stop) and now[0] not in done
         again = now[0] in twice and now[0] in done
         refused = TrackingLoss(LossCause.VIEW_CHANGED, "refused")
         return refused if first or again else reject(self, keyframe, alignment)
 
     monkeypatch.setattr(Tracker, "track", watched)
-    monkeypatch.setattr(Tracker, "_rejection", refusing)
+    monkeypatch.setattr(KeyframeAligner, "rejection", refusing)
     return reconstruct(open_sequence(phantom), with_true_depth(phantom, **LIGHT | changes))
 
 

@@ -16,9 +16,8 @@ from test_checkpoint import _through
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import MapisSettings, TrackingSettings
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis
+from scopemap.config import TrackingSettings
+from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping.submaps import Submap
@@ -148,12 +147,6 @@ def test_a_pose_after_a_wall_that_no_features_confirm_begins_a_new_map_later(mon
         "rejected: no features confirm the pose after a wall filled the picture"
     }
     assert tracks[17].map == 1
-
-
-def test_depth_goes_on_at_the_scale_that_is_told() -> None:
-    mapis, raw_mm = Mapis(MapisSettings()), np.full(EVERYWHERE.shape, 50.0, np.float32)
-    mapis.rescale(0.5)
-    assert mapis.refine(raw_mm, "depth", CAMERA, None, None).scale == 0.5
 
 
 # ---- what is written

@@ -15,8 +15,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.pseudo_stereo import AffineDisparity
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 
 CAMERA = PinholeCamera(60.0, 60.0, 29.5, 19.5, 60, 40)
@@ -50,6 +49,10 @@ def anchored(reference: Metric | None = None, **values: Any) -> AnchoredDepth:
     return AnchoredDepth(chosen(DepthSettings, **({"backend": "depth-anything"} | values)), reference or Metric())
 
 
+def depth_of(anchor: AnchoredDepth, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
+    return anchor.metric(estimate, frame).depth_mm
+
+
 def disparity(scale: float = 0.07, shift: float = 0.006) -> DepthEstimate:
     return DepthEstimate(((1 / TRUTH_MM - shift) / scale).astype(np.float32), "disparity")
 
@@ -59,9 +62,8 @@ def test_the_data_sets_own_convention_comes_back_from_near_and_far() -> None:
     levels = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
     levels[0], levels[1, 0] = 0.5, 0.0
     anchor = anchored(near_far_mm=(13.5, 100.0))
-    np.testing.assert_allclose(
-        anchor.depth_mm(DepthEstimate(levels, "disparity"), frame()), 15.6 / (levels + 0.156), rtol=5e-4
-    )
+    found_mm = depth_of(anchor, DepthEstimate(levels, "disparity"), frame())
+    np.testing.assert_allclose(found_mm, 15.6 / (levels + 0.156), rtol=5e-4)
     assert anchor.description == "near-far 13.5:100 mm"
 
 
@@ -69,16 +71,16 @@ def test_the_data_sets_own_convention_comes_back_from_near_and_far() -> None:
 @given(scale=st.floats(1e-4, 1), shift=st.floats(0, 0.009))
 def test_disparity_of_any_scale_and_shift_becomes_the_depth_of_the_reference(scale: float, shift: float) -> None:
     anchor = anchored(anchor="depth-pro")
-    np.testing.assert_allclose(anchor.depth_mm(disparity(scale, shift), frame(7)), TRUTH_MM, rtol=2e-3)
+    np.testing.assert_allclose(depth_of(anchor, disparity(scale, shift), frame(7)), TRUTH_MM, rtol=2e-3)
     assert anchor.description.startswith("Depth Pro on frame 7")
 
 
 def test_the_conversion_is_fitted_once_and_held() -> None:
     reference = Metric()
     anchor = anchored(reference, anchor="depth-pro")
-    anchor.depth_mm(disparity(), frame(0))
+    depth_of(anchor, disparity(), frame(0))
     nearer = DepthEstimate(disparity().values + np.float32(0.1), "disparity")
-    second_mm = anchor.depth_mm(nearer, frame(1))
+    second_mm = depth_of(anchor, nearer, frame(1))
     assert reference.asked == 1
     np.testing.assert_allclose(1 / second_mm - 1 / TRUTH_MM, 0.007, rtol=1e-2)
 
@@ -88,57 +90,24 @@ def test_a_metric_anchor_is_asked_again_where_that_is_wanted() -> None:
     anchor, fitted, depths = anchored(reference, anchor="depth-pro", reanchor_every=3), [], []
     for index in range(7):
         drifting = disparity(scale=0.07 * 1.1**index)
-        depths.append(np.nanmedian(anchor.depth_mm(drifting, frame(index))))
+        depths.append(np.nanmedian(depth_of(anchor, drifting, frame(index))))
         fitted.append(anchor.just_fitted)
     assert fitted == [True, False, False, True, False, False, True]
     np.testing.assert_allclose([depths[3], depths[6]], depths[0], rtol=1e-3)
     assert depths[2] != pytest.approx(depths[0], rel=1e-2)
 
 
-def test_a_range_is_of_frame_1_and_never_asked_again() -> None:
-    anchor = anchored(near_far_mm=(10.0, 60.0), reanchor_every=1)
-    anchor.depth_mm(disparity(), frame(0))
-    anchor.depth_mm(disparity(), frame(1))
-    assert not anchor.just_fitted
-
-
 def test_without_shift_it_is_the_papers_baseline_and_frame_1_keeps_the_metric_depth() -> None:
     anchor = anchored(anchor="depth-pro", fit_shift=False)
     estimate, first = disparity(), frame()
-    np.testing.assert_array_equal(anchor.depth_mm(estimate, first), TRUTH_MM)
-    second_mm = anchor.depth_mm(estimate, frame(1))
+    np.testing.assert_array_equal(depth_of(anchor, estimate, first), TRUTH_MM)
+    second_mm = depth_of(anchor, estimate, frame(1))
     used = first.valid & (estimate.values >= 0.1 * estimate.values[first.valid].max())
     per_baseline = 75.0 / estimate.values[used]
     baseline_mm = (TRUTH_MM[used] * per_baseline).sum() / (per_baseline**2).sum()
     known = np.isfinite(second_mm)
     assert known.mean() > 0.9
     np.testing.assert_allclose(second_mm[known], (75.0 * baseline_mm / estimate.values)[known], rtol=1e-4)
-
-
-def test_the_floor_of_disparity_leaves_the_far_end_out_of_the_baseline() -> None:
-    """Half of the pixels have a twentieth of the largest disparity, and a depth that no baseline explains."""
-    levels = np.ones((40, 60), np.float32)
-    levels[20:] = 0.05
-    metric = Metric()
-    for floor, expected_mm in ((0.1, 50.0), (0.0, 200.0)):
-        anchor = anchored(metric, anchor="depth-pro", fit_shift=False, disparity_floor=floor, max_depth_mm=1e5)
-        with pytest.MonkeyPatch.context() as patch:
-            depth_mm = np.where(levels == 1, np.float32(50.0), np.float32(200.0 * 20))
-            patch.setattr(metric, "estimate", lambda frame, d=depth_mm: DepthEstimate(d, "depth", 75.0))
-            anchor.depth_mm(DepthEstimate(levels, "disparity"), frame())
-        nearest_mm = anchor.depth_mm(DepthEstimate(levels, "disparity"), frame(1))[1, 1]
-        assert nearest_mm == pytest.approx(expected_mm, rel=0.02)
-
-
-def test_a_partly_clipped_anchor_names_the_share_and_the_setting() -> None:
-    anchor = anchored(anchor="depth-pro", max_depth_mm=60.0)
-    assert np.isfinite(anchor.depth_mm(disparity(), frame())).any()
-    share = np.mean(TRUTH_MM[1:] > 60)
-    assert f"; {share:.0%} of its depth is beyond depth.max_depth_mm = 60 (median" in anchor.description
-    assert anchor.description.endswith("and left the fit")
-    whole = anchored(anchor="depth-pro")
-    whole.depth_mm(disparity(), frame())
-    assert "max_depth_mm" not in whole.description
 
 
 def test_an_anchor_beyond_the_limit_says_so() -> None:
@@ -161,7 +130,7 @@ def test_an_anchor_beyond_the_limit_says_so() -> None:
 )
 def test_the_description_says_what_scaled_depth_pro(focal_px: float | None, whose: str, words: str) -> None:
     anchor = anchored(Metric(focal_px=focal_px), anchor="depth-pro", depth_pro_focal=whose)
-    anchor.depth_mm(disparity(), frame())
+    depth_of(anchor, disparity(), frame())
     assert anchor.description == f"Depth Pro on frame 0{words}"
 
 
@@ -169,52 +138,21 @@ def test_the_description_says_what_scaled_depth_pro(focal_px: float | None, whos
 def test_predicted_depth_is_scaled_to_the_anchor(factor: float) -> None:
     floating = DepthEstimate((factor * TRUTH_MM).astype(np.float32), "depth")
     for values in ({"near_far_mm": (13.5, 100.0)}, {"anchor": "depth-pro"}):
-        np.testing.assert_allclose(anchored(**values).depth_mm(floating, frame()), TRUTH_MM, rtol=1e-5)
-
-
-def test_a_range_that_disagrees_with_predicted_depth_is_met_half_way() -> None:
-    """One factor cannot fit both ends: the relative error of both becomes the same."""
-    depth_mm = anchored(near_far_mm=(13.5, 200.0)).depth_mm(DepthEstimate(TRUTH_MM, "depth"), frame())
-    assert np.nanmin(depth_mm) / 13.5 == pytest.approx(200.0 / np.nanmax(depth_mm), rel=1e-5)
+        np.testing.assert_allclose(depth_of(anchored(**values), floating, frame()), TRUTH_MM, rtol=1e-5)
 
 
 def test_measured_depth_is_never_touched() -> None:
     anchor = anchored(near_far_mm=(1.0, 2.0), anchor="near-far")
-    np.testing.assert_array_equal(anchor.depth_mm(DepthEstimate(TRUTH_MM, "measured"), frame()), TRUTH_MM)
+    np.testing.assert_array_equal(depth_of(anchor, DepthEstimate(TRUTH_MM, "measured"), frame()), TRUTH_MM)
     assert anchor.description == "measured depth"
     room_mm = 50 * TRUTH_MM
-    np.testing.assert_array_equal(anchor.depth_mm(DepthEstimate(room_mm, "measured"), frame()), room_mm)
-
-
-def test_a_few_pixels_do_not_fix_the_scale() -> None:
-    anchor = anchored(reference=Metric())
-    few = np.zeros((40, 60), bool)
-    few[20, 10:50] = True
-    assert np.isnan(anchor.depth_mm(disparity(), replace(frame(), valid=few))).all()
-    assert anchor.conversion is None
-    np.testing.assert_allclose(anchor.depth_mm(disparity(), frame(1)), TRUTH_MM, rtol=1e-3)
-
-
-def test_the_shading_back_end_is_its_own_anchor() -> None:
-    for choice in ("auto", "shading"):
-        reference = Metric()
-        anchor = anchored(reference, backend="shading", anchor=choice, shading_median_mm=40.0)
-        np.testing.assert_array_equal(anchor.depth_mm(DepthEstimate(TRUTH_MM, "depth"), frame()), TRUTH_MM)
-        assert anchor.description == "shading prior, median distance 40 mm"
-        assert reference.asked == 0
-
-
-def test_without_a_range_disparity_is_anchored_by_the_shading_prior() -> None:
-    anchor = anchored(Metric("shading", None))
-    anchor.depth_mm(disparity(), frame())
-    assert anchor.description == "shading prior, median distance 35 mm"
-    assert isinstance(anchor.conversion, AffineDisparity)
+    np.testing.assert_array_equal(depth_of(anchor, DepthEstimate(room_mm, "measured"), frame()), room_mm)
 
 
 def test_depth_beyond_the_limit_and_nonsense_are_unknown() -> None:
     values = TRUTH_MM.copy()
     values[3, 3], values[4, 4], values[8, 8] = np.nan, -2.0, 90.0
-    depth_mm = anchored(backend="depth-pro", max_depth_mm=80.0).depth_mm(DepthEstimate(values, "depth"), frame())
+    depth_mm = depth_of(anchored(backend="depth-pro", max_depth_mm=80.0), DepthEstimate(values, "depth"), frame())
     assert depth_mm.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(depth_mm), ~((values > 0) & (values <= 80.0)))
 
@@ -222,16 +160,11 @@ def test_depth_beyond_the_limit_and_nonsense_are_unknown() -> None:
 def test_an_unusable_first_frame_leaves_the_anchor_to_the_next() -> None:
     anchor = anchored(anchor="depth-pro")
     blind = replace(frame(0), valid=np.zeros((40, 60), bool))
-    assert np.isnan(anchor.depth_mm(disparity(), blind)).all()
+    assert np.isnan(depth_of(anchor, disparity(), blind)).all()
     assert anchor.conversion is None
     assert "not anchored" in anchor.description
-    assert np.isfinite(anchor.depth_mm(disparity(), frame(1))).all()
+    assert np.isfinite(depth_of(anchor, disparity(), frame(1))).all()
     assert anchor.description.startswith("Depth Pro on frame 1")
-
-
-def test_constant_disparity_is_refused() -> None:
-    with pytest.raises(InputError, match="constant"):
-        anchored(near_far_mm=(10.0, 50.0)).depth_mm(DepthEstimate(np.full((40, 60), 0.5), "disparity"), frame())
 
 
 @pytest.mark.parametrize(
@@ -254,11 +187,6 @@ def test_a_factor_divides_and_nothing_else_is_fitted(factor: float, nearest_mm: 
     inverse = DepthEstimate((7.0 / TRUTH_MM).astype(np.float32), "disparity")
     for estimate in (inverse, DepthEstimate(0.2 * TRUTH_MM, "depth")):
         anchor = anchored(anchor="factor", factor=factor, backend="elsewhere", max_depth_mm=1e4)
-        depth_mm = anchor.depth_mm(estimate, frame())
+        depth_mm = depth_of(anchor, estimate, frame())
         np.testing.assert_allclose(depth_mm, TRUTH_MM * (nearest_mm / seen.min()), rtol=1e-5)
         assert "arbitrary" in anchor.description
-
-
-def test_a_factor_needs_something_positive() -> None:
-    with pytest.raises(InputError, match="positive"):
-        anchored(anchor="factor").depth_mm(DepthEstimate(np.zeros((40, 60), np.float32), "disparity"), frame())

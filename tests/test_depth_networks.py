@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from chosen_settings import chosen
 from small_networks import saved, small_depth_anything, small_depth_pro
 
 from scopemap.cameras.camera import PinholeCamera
@@ -62,21 +60,6 @@ def test_metric_depth_anything_gives_millimetres(frame: Frame) -> None:
     np.testing.assert_allclose(estimate.values, 1000 * _by_hand(pair, frame)["predicted_depth"].numpy(), rtol=1e-4)
 
 
-def test_depth_pro_with_its_own_focal_length(frame: Frame, tmp_path: Path) -> None:
-    pair = small_depth_pro()
-    estimator = DepthPro.from_folder_or_hub(str(saved(pair, tmp_path)), "cpu", use_known_focal=False)
-    estimate = estimator.estimate(frame)
-    expected = _by_hand(pair, frame)
-    assert estimate.kind == "depth"
-    assert estimate.values.dtype == np.float32
-    assert estimate.values.shape == (HEIGHT, WIDTH)
-    assert np.isfinite(estimate.values).all()
-    assert np.ptp(estimate.values) > 0
-    np.testing.assert_allclose(estimate.values, 1000 * expected["predicted_depth"].numpy(), rtol=1e-4)
-    assert estimate.focal_px == pytest.approx(float(expected["focal_length"]), rel=1e-5)
-    np.testing.assert_array_equal(estimator.estimate(frame).values, estimate.values)
-
-
 def test_depth_pro_scales_with_the_known_focal_length(frame: Frame) -> None:
     pair = small_depth_pro()
     own = DepthPro(*pair, device="cpu", use_known_focal=False).estimate(frame)
@@ -95,14 +78,6 @@ def test_depth_pro_without_a_field_of_view_needs_the_camera(frame: Frame) -> Non
     np.testing.assert_allclose(estimate.values, 1000 * canonical_depth * frame.camera.fx / WIDTH, rtol=1e-4)
     with pytest.raises(WeightsError, match="focal length"):
         DepthPro(*pair, device="cpu", use_known_focal=False)
-
-
-def test_provenance_names_the_weights(tmp_path: Path) -> None:
-    estimator = DepthAnything.from_folder_or_hub(str(saved(small_depth_anything(), tmp_path)), "cpu")
-    provenance = estimator.provenance()
-    assert provenance["depth"] == "depth-anything"
-    assert len(provenance["sha256 model.safetensors"]) == 64
-    assert DepthPro(*small_depth_pro(), device="cpu").provenance()["focal"] == "camera"
 
 
 @pytest.mark.parametrize("adapter", [DepthAnything, DepthPro])
@@ -139,14 +114,6 @@ def test_incomplete_and_broken_weights_are_refused(tmp_path: Path) -> None:
         DepthAnything.from_folder_or_hub(str(folder), "cpu")
 
 
-def test_the_hub_s_own_name_of_the_processor_loads(frame: Frame, tmp_path: Path) -> None:
-    folder = saved(small_depth_pro(), tmp_path)
-    settings = folder / "preprocessor_config.json"
-    content = json.loads(settings.read_text()) | {"image_processor_type": "DepthProImageProcessorFast"}
-    settings.write_text(json.dumps(content))
-    assert DepthPro.from_folder_or_hub(str(folder), "cpu").estimate(frame).values.shape == (HEIGHT, WIDTH)
-
-
 def test_one_image_goes_through_depth_pro_once(frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run reads the focal length of frame 1 first, then its depth with the camera that follows from it."""
     network, processor = small_depth_pro()
@@ -178,21 +145,3 @@ def test_depth_pro_by_hand(
     facts = estimator.provenance()
     assert len(facts["sha256 model.safetensors"]) == 64
     assert "revision" not in facts  # nothing tells which one was copied
-
-
-def test_the_error_about_depth_pro_names_folder_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
-    with pytest.raises(WeightsError) as caught:
-        create_anchor(DepthSettings(anchor="depth-pro", backend="depth-anything"), "cpu")
-    for words in ("models pull depth-pro", "apple/DepthPro-hf", str(tmp_path / "depth-pro"), "depth.anchor_model"):
-        assert words in str(caught.value)
-
-
-def test_depth_pro_is_scaled_by_the_focal_length_of_the_settings(frame: Frame, tmp_path: Path) -> None:
-    folder = str(saved(small_depth_pro(), tmp_path))
-    depths = {}
-    for focal in ("camera", "network"):
-        settings = chosen(DepthSettings, anchor="depth-pro", anchor_model=folder, depth_pro_focal=focal)
-        depths[focal] = create_anchor(settings, "cpu").reference.estimate(frame)
-    ratio = frame.camera.fx / depths["network"].focal_px
-    np.testing.assert_allclose(depths["camera"].values, ratio * depths["network"].values, rtol=1e-4)

@@ -16,9 +16,9 @@ from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
-from scopemap.depth.correspondence import DenseMatcher
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.files import FilesDepth
+from scopemap.depth.mapis import DenseMatcher
 from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.errors import InputError
 from scopemap.frame import Frame

@@ -38,9 +38,3 @@ def test_what_is_read_back_is_what_was_first_returned(tmp_path: Path) -> None:
         assert one.dtype == other.dtype
     assert np.median(first[0][..., 0][first[1]]) < -1.5
     assert [file.name for file in (tmp_path / "dis").iterdir()] == ["000007.npz"]
-
-
-def test_without_a_folder_nothing_is_kept_and_nothing_changes(tmp_path: Path) -> None:
-    kept = flow_to_previous(DisFlow(), 1, *pair(), tmp_path)
-    passing = flow_to_previous(DisFlow(), 1, *pair())
-    np.testing.assert_array_equal(kept[0], passing[0])

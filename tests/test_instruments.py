@@ -5,30 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from chosen_settings import chosen
 from tiny_phantom import write_tiny
 
-from scopemap import open_sequence, reconstruct
+from scopemap import open_sequence
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import Config, MaskSettings
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.scopenet import estimator as module
-from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
+from scopemap.depth.scopenet.estimator import WEIGHTS_NAME
 from scopemap.errors import SettingsError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker, without_instruments
-from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
-from scopemap.report.frame_pictures import FramePictures
-from training.export import export, read_network
-from training.network import ScopeNet
+from training.export import read_network
 
 HEIGHT, WIDTH = 70, 94
 CAMERA = PinholeCamera(60.0, 60.0, 47.0, 35.0, WIDTH, HEIGHT)
@@ -50,57 +46,16 @@ def _bar(level: float, rest: float = 0.0) -> np.ndarray:
 # ---- the network
 
 
-@pytest.fixture(scope="module")
-def with_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(5)
-    network = ScopeNet(widths=(8, 8, 16, 16, 16), instruments=True).eval()
-    torch.nn.init.normal_(network.head.weight, 0.0, 0.05)
-    network.load_state_dict({name: value.half() for name, value in network.state_dict().items()})
-    folder = tmp_path_factory.mktemp("networks")
-    export(network, folder / "with.onnx", {})
-    torch.save(network.state_dict(), folder / "state.pt")
-    network.instruments = None
-    export(network, folder / "without.onnx", {})
-    return folder
-
-
-def test_the_head_changes_no_bit_of_depth(with_head: Path) -> None:
-    frame = _frame()
-    with_it, without = (ScopeNetDepth(str(with_head / f"{name}.onnx")).estimate(frame) for name in ("with", "without"))
-    assert without.instruments is None
-    assert with_it.instruments is not None
-    assert with_it.instruments.shape == (HEIGHT, WIDTH)
-    np.testing.assert_array_equal(with_it.values, without.values)
-    np.testing.assert_array_equal(with_it.sigma, without.sigma)
-
-
-def test_the_runtime_finds_instruments_as_torch_does(with_head: Path) -> None:
-    network = ScopeNet(widths=(8, 8, 16, 16, 16), instruments=True).eval()
-    network.load_state_dict(torch.load(with_head / "state.pt", weights_only=True))
-    planes = np.random.default_rng(1).normal(0, 0.3, (8, 96, 64)).astype(np.float32)
+def test_the_runtime_finds_instruments_as_torch_does() -> None:
+    network, planes = read_network(SHIPPED), np.random.default_rng(1).normal(0, 0.3, (8, 96, 64)).astype(np.float32)
     assert network.instruments is not None
     with torch.no_grad():
         given = torch.from_numpy(planes)[None]
-        told = torch.sigmoid(network.instruments(given, network.features(given)))[0, 0].numpy()
-    session = module.load_network(with_head / "with.onnx")
-    answer, instruments = session.run(None, {"planes": planes[None]})
+        expected = torch.sigmoid(network.instruments(given, network.features(given)))[0, 0].numpy()
+    _, instruments = module.load_network(SHIPPED).run(None, {"planes": planes[None]})
     assert instruments.shape == (1, 1, 48, 32)
-    assert np.ptp(told) > 1e-3
-    np.testing.assert_allclose(instruments[0, 0], told, atol=1e-5)
-    with torch.no_grad():
-        np.testing.assert_allclose(answer, network(torch.from_numpy(planes)[None]).numpy(), atol=1e-4)
-
-
-def test_the_package_s_depth_is_that_of_its_trunk_alone(tmp_path: Path) -> None:
-    network = read_network(SHIPPED)
-    assert network.instruments is not None
-    assert sum(part.numel() for part in network.instruments.parameters()) <= 200_000
-    network.instruments = None
-    export(network, tmp_path / "trunk.onnx", {})
-    frame = _frame()
-    shipped, alone = ScopeNetDepth().estimate(frame), ScopeNetDepth(str(tmp_path / "trunk.onnx")).estimate(frame)
-    np.testing.assert_array_equal(shipped.values, alone.values)
-    np.testing.assert_array_equal(shipped.sigma, alone.sigma)
+    assert np.ptp(expected) > 1e-3
+    np.testing.assert_allclose(instruments[0, 0], expected, atol=1e-4)
 
 
 # ---- from probabilities to a mask
@@ -229,60 +184,3 @@ def test_instruments_have_no_depth_and_are_not_usable_and_a_covered_frame_says_s
         assert covered.reason == "only 0% of the image is usable: instruments cover 100%"
         network.columns = slice(0, 0)
         assert pipeline.step(pipeline.preprocess(third)).track.status != "lost"
-
-
-def test_a_killed_run_goes_on_with_the_instruments_of_the_frame_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All frames but the first show a bar that only a mask before it holds: forgotten, the rest would differ."""
-    real = ScopeNetDepth.estimate
-
-    def with_bar(self: ScopeNetDepth, frame: Frame) -> DepthEstimate:
-        found = np.zeros(frame.valid.shape, np.float32)
-        found[:, :12] = 0.03 if frame.index else 0.9
-        found[:3, :12] = 0.9
-        return replace(real(self, frame), instruments=found)
-
-    class Killed(BaseException):
-        pass
-
-    def kill(step: Step) -> None:
-        if step.frame.index >= 4:
-            raise Killed
-
-    monkeypatch.setattr(ScopeNetDepth, "estimate", with_bar)
-    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
-    monkeypatch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
-    folder = write_tiny(tmp_path / "phantom")
-    seen: dict[int, np.ndarray] = {}
-    looked_for = Config.load(settings={"mask.instruments": "auto"})
-    reconstruct(
-        open_sequence(folder),
-        looked_for,
-        out=tmp_path / "whole",
-        observers=(lambda s: seen.update({s.frame.index: s.frame.valid}),),
-    )
-    assert not any(valid[30:, :12].any() for valid in seen.values())
-    with pytest.raises(Killed):
-        reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again", observers=(kill,))
-    resumed = reconstruct(open_sequence(folder), looked_for, out=tmp_path / "again")
-    assert resumed.provenance["resumed_after_frame"] is not None
-    whole, again = (
-        {file.relative_to(out): file.read_bytes() for file in sorted(out.rglob("*")) if file.is_file()}
-        for out in (tmp_path / "whole", tmp_path / "again")
-    )
-    of_its_time = {Path("provenance.json"), Path("SHA256SUMS")}
-    assert whole.keys() == again.keys()
-    assert not [file for file in whole if whole[file] != again[file] and file not in of_its_time]
-
-
-def test_pictures_of_frames_show_instruments_grey(tmp_path: Path) -> None:
-    pictures, frame = FramePictures(), _frame()
-    instruments = _bar(1.0) > 0.5
-    pictures.put(0, frame.rgb, frame.valid & ~instruments, instruments)
-    pictures.put(1, frame.rgb, frame.valid)
-    pictures.save(tmp_path)
-    shown, bare = (cv2.imread(str(tmp_path / f"frames/00000{n}_mask.png"), cv2.IMREAD_GRAYSCALE) for n in (0, 1))
-    assert set(np.unique(shown[:, 30:50])) == {90}
-    assert set(np.unique(shown[:, 50:])) == {255}
-    assert set(np.unique(bare)) == {255}

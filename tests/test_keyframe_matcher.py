@@ -14,9 +14,7 @@ from scopemap.config import TrackingSettings
 from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
-from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.tracking.relocalisation import EarlierKeyframes, Keyframe
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -24,16 +22,11 @@ HERE = plane_scene.pose()
 THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
 
 
-def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
-    view = plane_scene.see(T_world_camera)
-    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, T_world_camera)
-
-
 def test_corners_are_matched_where_the_plane_projects() -> None:
     matcher = KeyframeMatcher(DisFlow())
-    assert matcher.match(_frame(1, THERE)) is None
-    matcher.set_keyframe(_frame(4, HERE))
-    found = matcher.match(_frame(5, THERE))
+    assert matcher.match(plane_scene.frame(THERE, 1)) is None
+    matcher.set_keyframe(plane_scene.frame(HERE, 4))
+    found = matcher.match(plane_scene.frame(THERE, 5))
     assert found is not None
     assert found.reference == 4
     assert 0.8 < found.coverage <= 1
@@ -41,43 +34,19 @@ def test_corners_are_matched_where_the_plane_projects() -> None:
     errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.25
     matcher.set_keyframe(None)
-    assert matcher.match(_frame(5, THERE)) is None
+    assert matcher.match(plane_scene.frame(THERE, 5)) is None
 
 
 def test_corners_of_masked_or_unknown_tissue_are_not_matched() -> None:
-    matcher, frame = KeyframeMatcher(DisFlow()), _frame(0, HERE)
+    matcher, frame = KeyframeMatcher(DisFlow()), plane_scene.frame(HERE, 0)
     half = plane_scene.EVERYWHERE.copy()
     half[:, 120:] = False
     matcher.set_keyframe(frame)
-    found = matcher.match(replace(_frame(1, HERE), valid=half))
+    found = matcher.match(replace(plane_scene.frame(HERE, 1), valid=half))
     assert found is not None
     assert found.pixels[:, 0].max() < 120.5
     matcher.set_keyframe(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
-    assert matcher.match(_frame(1, THERE)) is None
-
-
-class _Started(NoFlow):
-    """Notes the starts that it is given."""
-
-    def __init__(self) -> None:
-        self.starts: list[FlowPair | None] = []
-
-    def estimate_checked(
-        self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        self.starts.append(start)
-        return super().estimate_checked(rgb_from, rgb_to)
-
-
-def test_flow_begins_at_that_of_the_frame_before_unless_this_matched_few_corners() -> None:
-    flow, frame = _Started(), _frame(0, HERE)
-    matcher, nothing = KeyframeMatcher(flow), np.zeros_like(plane_scene.EVERYWHERE)
-    matcher.set_keyframe(frame)
-    for valid in (plane_scene.EVERYWHERE, nothing, plane_scene.EVERYWHERE):
-        matcher.match(replace(frame, valid=valid))
-    matcher.set_keyframe(frame)
-    matcher.match(frame)
-    assert [start is not None for start in flow.starts] == [False, True, False, False]
+    assert matcher.match(plane_scene.frame(THERE, 1)) is None
 
 
 class _InHalf(DisFlow):
@@ -100,9 +69,9 @@ def test_flow_between_small_images_is_enough_for_as_exact_corners() -> None:
     T, errors_px = inverse(THERE) @ HERE, []
     for flow in (DisFlow(), _InHalf(blind=False)):
         matcher = KeyframeMatcher(flow)
-        matcher.set_keyframe(_frame(0, HERE))
+        matcher.set_keyframe(plane_scene.frame(HERE, 0))
         for index in (1, 2):
-            found = matcher.match(_frame(index, THERE))
+            found = matcher.match(plane_scene.frame(THERE, index))
         assert found is not None
         assert found.coverage > 0.8
         errors = CAMERA.project(found.points_mm @ T[:3, :3].T + T[:3, 3]) - found.pixels
@@ -114,8 +83,8 @@ def test_flow_between_small_images_is_enough_for_as_exact_corners() -> None:
 def test_where_flow_between_small_images_fails_the_whole_ones_are_used() -> None:
     matcher, flow = KeyframeMatcher(blind := _InHalf(blind=True)), KeyframeMatcher(DisFlow())
     for each in (matcher, flow):
-        each.set_keyframe(_frame(0, HERE))
-    found, wanted = matcher.match(_frame(1, THERE)), flow.match(_frame(1, THERE))
+        each.set_keyframe(plane_scene.frame(HERE, 0))
+    found, wanted = matcher.match(plane_scene.frame(THERE, 1)), flow.match(plane_scene.frame(THERE, 1))
     assert blind.widths == [120, 240]
     assert found is not None
     assert wanted is not None
@@ -136,9 +105,9 @@ class _Shifted(DisFlow):
 
 def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
     tracker = Tracker(chosen(TrackingSettings, finest_level=0, **changes), flow)
-    tracker.track(_frame(0, HERE))
-    assert tracker.insert_keyframe(_frame(0, HERE), measured=measured)
-    return tracker.track(_frame(1, THERE))
+    tracker.track(plane_scene.frame(HERE, 0))
+    assert tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=measured)
+    return tracker.track(plane_scene.frame(THERE, 1))
 
 
 def test_the_pose_is_the_corners_and_no_alignment_is_needed() -> None:
@@ -174,9 +143,9 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
     narrow[:, 64:] = False
     for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
         tracker = Tracker(chosen(TrackingSettings, finest_level=0, min_keyframe_agreement=0.0), DisFlow())
-        tracker.track(_frame(0, HERE))
-        tracker.insert_keyframe(_frame(0, HERE), measured=False)
-        assert tracker.track(replace(_frame(1, THERE), valid=valid)).status == "ok"
+        tracker.track(plane_scene.frame(HERE, 0))
+        tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=False)
+        assert tracker.track(replace(plane_scene.frame(THERE, 1), valid=valid)).status == "ok"
         assert tracker.needs_keyframe() == wanted
 
 
@@ -185,7 +154,7 @@ def _to_and_fro(tracker: Tracker) -> list[Track]:
     tracks: list[Track] = []
     keyframes = 0
     for index, way in enumerate([*range(9), *range(7, -1, -1)]):
-        frame = _frame(index, plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)))
+        frame = plane_scene.frame(plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)), index)
         track = tracker.track(replace(frame, T_world_camera=None))
         assert track.status != "lost", track.reason
         if tracker.needs_keyframe():
@@ -203,25 +172,7 @@ def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(mon
     assert again[-1].keyframe == 0
     assert len({track.keyframe for track in again}) <= 6
     assert np.linalg.norm(again[-1].T_world_camera[:3, 3]) < 0.1
-    monkeypatch.setattr("scopemap.tracking.relocalisation.EarlierKeyframes.nearer", lambda *_: None)
+    monkeypatch.setattr("scopemap.tracking.tracker.nearer_keyframe", lambda *_: None)
     onwards = _to_and_fro(Tracker(settings, DisFlow()))
     assert np.linalg.norm(onwards[-1].T_world_camera[:3, 3]) > 0.5
     assert onwards[-1].keyframe > 10
-
-
-def test_the_nearest_passed_keyframe_is_asked_for_where_it_is_clearly_nearer() -> None:
-    earlier = EarlierKeyframes()
-    current = Keyframe(
-        _frame(9, plane_scene.pose(at_mm=(20.0, 0, 0))), plane_scene.pose(at_mm=(20.0, 0, 0)), [], 50.0, False, 0
-    )
-    assert earlier.nearer(HERE, current) is None
-    for index, x_mm in enumerate((0.0, 8.0, 20.0)):
-        earlier.add(_frame(index, plane_scene.pose(at_mm=(x_mm, 0, 0))))
-
-    def nearer(x_mm: float) -> int | None:
-        found = earlier.nearer(plane_scene.pose(at_mm=(x_mm, 0, 0)), current)
-        return None if found is None else found.index
-
-    assert [nearer(x_mm) for x_mm in (0.0, 7.0, 13.0, 16.0, 19.0, -16.0)] == [0, 1, None, None, None, None]
-    earlier.clear()
-    assert nearer(0.0) is None

@@ -15,8 +15,8 @@ from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.acceptance import is_obscured
 from scopemap.tracking.alike import AlikeFeatures
+from scopemap.tracking.keyframe_alignment import is_obscured
 from scopemap.tracking.rtdl import Alignment, Motion
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker

@@ -14,7 +14,6 @@ from plane_scene import CAMERA
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.sharpness import SharpnessMonitor, sharpness
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -22,11 +21,6 @@ SETTINGS = chosen(TrackingSettings, keyframe_every=3, finest_level=0)
 # Slowly on, then, unseen, far away and turned.
 NEAR = [plane_scene.pose(at_mm=(1.0 * n, 0.3 * n, 0.0), turn_rad=(0.0, 0.0, 0.005 * n)) for n in range(8)]
 FAR = [plane_scene.pose(at_mm=(27.0 + n, 8.0, 4.0), turn_rad=(0.05, -0.1, 0.3)) for n in range(3)]
-
-
-def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
-    view = plane_scene.see(T_world_camera)
-    return Frame(index, index / 30, view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm)
 
 
 def _smoked(frame: Frame) -> Frame:
@@ -55,7 +49,7 @@ def _off(track: Track, T_world_camera: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("spoil", [_smoked, _blurred])
 def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: ignore[no-untyped-def]
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     spoilt = [*frames[:4], spoil(frames[4]), spoil(frames[5]), *frames[6:]]
     tracks = _tracked(spoilt)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 3 + ["lost"] * 2 + ["ok"] * 2
@@ -66,17 +60,14 @@ def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: i
     assert way_mm < 0.3
 
 
-def test_the_gate_can_be_opened() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
-    frames[4] = _smoked(frames[4])
-    opened = SETTINGS.model_copy(update={"min_sharpness": 0.0})
-    assert not [track for track in _tracked(frames, opened) if "sharpness" in track.reason]
-
-
 @pytest.mark.parametrize("remembered", [10, 0])
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
-    dark = replace(_frame(8, NEAR[-1]), valid=np.zeros_like(plane_scene.EVERYWHERE))
-    frames = [*(_frame(n, T) for n, T in enumerate(NEAR)), dark, *(_frame(9 + n, T) for n, T in enumerate(FAR))]
+    dark = replace(plane_scene.frame(NEAR[-1], 8), valid=np.zeros_like(plane_scene.EVERYWHERE))
+    frames = [
+        *(plane_scene.frame(T, n) for n, T in enumerate(NEAR)),
+        dark,
+        *(plane_scene.frame(T, 9 + n) for n, T in enumerate(FAR)),
+    ]
     tracks = _tracked(frames, SETTINGS.model_copy(update={"relocalisation_keyframes": remembered}))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
@@ -91,45 +82,15 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
         assert tracks[9].status == "lost" or way_mm > 2
 
 
-def test_relative_sharpness_is_a_share_of_the_recent_median() -> None:
-    frame = _frame(0, NEAR[0])
-
-    def after_itself(other: Frame) -> float:
-        monitor = SharpnessMonitor()
-        assert monitor.relative_sharpness(frame.rgb, frame.valid) == 1.0
-        assert monitor.relative_sharpness(frame.rgb, frame.valid) == pytest.approx(1.0)
-        return monitor.relative_sharpness(other.rgb, other.valid)
-
-    assert after_itself(_blurred(frame)) < 0.5
-    assert after_itself(_smoked(frame)) < 0.3
-    # A dimmer lamp shows the same detail.
-    assert after_itself(replace(frame, rgb=(0.7 * frame.rgb).astype(np.uint8))) == pytest.approx(1.0, abs=0.1)
-
-
-def test_what_is_unsharp_for_long_becomes_usual() -> None:
-    sharp, soft, monitor = _frame(0, NEAR[0]), _blurred(_frame(0, NEAR[0])), SharpnessMonitor()
-    for _ in range(30):
-        monitor.relative_sharpness(sharp.rgb, sharp.valid)
-    shares = [monitor.relative_sharpness(soft.rgb, soft.valid) for _ in range(30)]
-    assert shares[9] < 0.6
-    assert shares[-1] == pytest.approx(1.0)
-
-
-def test_nothing_usable_is_not_sharp() -> None:
-    frame = _frame(0, NEAR[0])
-    assert sharpness(frame.rgb, np.zeros_like(frame.valid)) == 0.0
-    assert sharpness(np.zeros_like(frame.rgb), frame.valid) == 0.0
-
-
 def _elsewhere(index: int, n: int) -> Frame:
     """A frame of another place, far beyond what any of the others shows."""
-    return _frame(index, plane_scene.pose(at_mm=(-58.0 + n, -50.0, -10.0), turn_rad=(0.0, 0.0, 2.0)))
+    return plane_scene.frame(plane_scene.pose(at_mm=(-58.0 + n, -50.0, -10.0), turn_rad=(0.0, 0.0, 2.0)), index)
 
 
 def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_again() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(9)]
-    back = [_frame(17 + n, T) for n, T in enumerate(NEAR[:3])]
+    back = [plane_scene.frame(T, 17 + n) for n, T in enumerate(NEAR[:3])]
     tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
     assert tracks[11].reason == "new map"
@@ -146,9 +107,9 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
 
 
 def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_found() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
-    back = [_frame(20 + n, T) for n, T in enumerate(NEAR[:4])]
+    back = [plane_scene.frame(T, 20 + n) for n, T in enumerate(NEAR[:4])]
     tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 0, "search_every": 3}))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
@@ -162,7 +123,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
 
 @pytest.mark.parametrize("unseen", ["dark", "smoked"])
 def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     last = frames[-1]
     nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
     spoilt = [replace(nothing, index=8 + n) for n in range(12)]
@@ -189,35 +150,3 @@ def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
     assert track.status == "lost"
     assert "weakly constrained" in track.reason
     assert abs(track.correlation) < 0.15
-
-
-def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
-    frames = [_frame(n, T) for n, T in enumerate(NEAR)]
-    rng = np.random.default_rng(4)
-    # As clear as tissue, and nothing that lasts.
-    shape = frames[0].rgb.shape[:2]
-    soft = [cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 1.5) for _ in range(70)]
-    nothing = [
-        replace(
-            frames[0],
-            index=8 + n,
-            rgb=np.repeat((128 + 40 * grey / grey.std()).clip(0, 255).astype(np.uint8)[..., None], 3, 2),
-        )
-        for n, grey in enumerate(soft)
-    ]
-    tracks = _tracked(
-        [*frames, *nothing, replace(frames[4], index=78)], SETTINGS.model_copy(update={"new_map_after": 1})
-    )
-    assert max(track.map for track in tracks) > 20
-    assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "relocalised", 0)
-    turn, way_mm = _off(tracks[-1], NEAR[4])
-    assert turn < np.radians(0.4)
-    assert way_mm < 0.3
-
-
-def test_no_map_begins_with_an_unsharp_frame() -> None:
-    tracker, frame = Tracker(SETTINGS), _frame(0, NEAR[0])
-    assert tracker.track(frame).status == "initial"
-    # Not inserted, for want of depth: the next one fixes the world, unless it shows nothing.
-    assert tracker.track(replace(_smoked(frame), index=1)).status == "lost"
-    assert tracker.track(replace(frame, index=2)).status == "initial"

@@ -7,13 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from chosen_settings import chosen
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MapisSettings
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis, RefinedDepth, robust_scale
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth, robust_scale
 from scopemap.geometry.se3 import se3
 
 SHAPE = (48, 64)
@@ -40,16 +37,6 @@ def _link(distance: np.ndarray | float = 0.0, flow_x: float = 0.0) -> DenseCorre
 def _second(mapis: Mapis, link: DenseCorrespondence, T: np.ndarray | None = None, kind: Any = "depth") -> RefinedDepth:
     mapis.refine(DEPTH, kind, CAMERA, None, None)
     return mapis.refine(OTHER, kind, CAMERA, link, T)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.floats(0.05, 20.0), st.floats(0.0, 0.45), st.integers(0, 2**32 - 1))
-def test_robust_scale_finds_the_factor_under_outliers(factor: float, share: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    warped = DEPTH * np.float32(factor)
-    wild = rng.random(SHAPE) < share
-    warped = np.where(wild, warped * rng.uniform(0.1, 10, SHAPE), warped)
-    assert robust_scale(DEPTH, warped, 7.0) == pytest.approx(factor, rel=0.02 if share else 1e-5)
 
 
 def test_robust_scale_in_closed_form() -> None:
@@ -87,21 +74,6 @@ def test_each_blend_follows_its_formula(blend: str, weight: np.ndarray) -> None:
     assert refined.warped_share == 1.0
 
 
-def test_tau_and_the_constant_weight_are_heard() -> None:
-    weight = np.exp(-DISTANCE / 0.6)
-    refined = _second(_mapis(blend="exponential", tau=0.6), _link(DISTANCE))
-    np.testing.assert_allclose(refined.depth_mm, weight * DEPTH + (1 - weight) * OTHER, rtol=1e-5)
-    np.testing.assert_allclose(_second(_mapis(constant_weight=1.0), _link()).depth_mm, DEPTH, rtol=1e-6)
-
-
-def test_text_and_equation_of_the_paper_are_opposites() -> None:
-    text, equation = _mapis(blend="linear"), _mapis(blend="paper-equation")
-    np.testing.assert_allclose(_second(text, _link(0.0)).depth_mm, DEPTH, rtol=1e-6)
-    np.testing.assert_allclose(_second(equation, _link(0.0)).depth_mm, OTHER, rtol=1e-6)
-    np.testing.assert_allclose(_second(text, _link(1.0)).depth_mm, OTHER, rtol=1e-6)
-    np.testing.assert_allclose(_second(equation, _link(1.0)).depth_mm, DEPTH, rtol=1e-6)
-
-
 @pytest.mark.parametrize("motion", [None, APPROACH])
 def test_measured_depth_is_left_alone(motion: np.ndarray | None) -> None:
     mapis = Mapis(Config().mapis)
@@ -109,14 +81,6 @@ def test_measured_depth_is_left_alone(motion: np.ndarray | None) -> None:
         refined = mapis.refine(depth, "measured", CAMERA, _link(), motion)
         np.testing.assert_array_equal(refined.depth_mm, depth)
         assert refined.scale == 1.0
-
-
-def test_measured_depth_is_scaled_and_blended_only_on_demand() -> None:
-    mapis = _mapis(frame_scale="robust", blend="none")
-    mapis.refine(DEPTH, "measured", CAMERA, None, None)
-    assert mapis.refine(2 * DEPTH, "measured", CAMERA, _link(), None).scale == pytest.approx(0.5, rel=1e-5)
-    mixed = _second(_mapis(), _link(), kind="measured")
-    np.testing.assert_allclose(mixed.depth_mm, (DEPTH + OTHER) / 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["depth", "disparity"])
@@ -165,21 +129,6 @@ def test_scale_with_the_motion_keeps_an_approach_and_without_cancels_it() -> Non
         assert refined.scale == pytest.approx(depth_mm / (1.7 * 35), rel=1e-5)
 
 
-def test_scale_is_not_compounded() -> None:
-    """The factor is that of the raw depth, so a constant wrong factor gives a constant scale."""
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
-    mapis.refine(DEPTH, "depth", CAMERA, None, None)
-    scales = [mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None).scale for _ in range(4)]
-    np.testing.assert_allclose(scales, 0.5, rtol=1e-5)
-
-
-def test_values_are_copied_without_a_motion_and_moved_with_one() -> None:
-    whole = _mapis(constant_weight=1.0)
-    np.testing.assert_allclose(_second(whole, _link()).depth_mm, DEPTH, rtol=1e-6)
-    whole = _mapis(constant_weight=1.0)
-    np.testing.assert_allclose(_second(whole, _link(), APPROACH).depth_mm, DEPTH - 5, rtol=1e-6)
-
-
 def test_values_are_pulled_along_the_flow() -> None:
     refined = _second(_mapis(constant_weight=1.0), _link(flow_x=3.0))
     np.testing.assert_allclose(refined.depth_mm[:, :-3], DEPTH[:, 3:], rtol=1e-6)
@@ -217,12 +166,6 @@ def test_an_anchored_frame_starts_the_chain_anew() -> None:
     assert after.scale == pytest.approx(3.0, rel=1e-5)
 
 
-def test_the_first_frame_is_its_raw_depth() -> None:
-    refined = Mapis(Config().mapis).refine(DEPTH, "depth", CAMERA, None, None)
-    np.testing.assert_array_equal(refined.depth_mm, DEPTH)
-    assert (refined.scale, refined.warped_share) == (1.0, 0.0)
-
-
 def test_without_a_warped_value_the_scaled_raw_depth_stands() -> None:
     mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
     holed = DEPTH.copy()
@@ -236,39 +179,3 @@ def test_without_a_warped_value_the_scaled_raw_depth_stands() -> None:
     np.testing.assert_array_equal(refined.depth_mm[:, :7], (4 * OTHER * np.float32(refined.scale))[:, :7])
     np.testing.assert_allclose(refined.depth_mm[10:, 7:], DEPTH[10:, 7:], rtol=1e-5)
     assert refined.warped_share == pytest.approx(38 * 57 / (48 * 64))
-
-
-def test_an_unknown_raw_pixel_does_not_spread() -> None:
-    mapis = Mapis(Config().mapis)
-    mapis.refine(DEPTH, "depth", CAMERA, None, None)
-    raw = OTHER.copy()
-    raw[20:23, 30:33] = np.nan
-    known = np.isfinite(mapis.refine(raw, "depth", CAMERA, _link(DISTANCE), None).depth_mm)
-    assert known[np.isfinite(raw)].all()
-
-
-def test_nothing_known_stays_nothing() -> None:
-    nothing = np.full(SHAPE, np.nan, np.float32)
-    mapis = Mapis(Config().mapis)
-    mapis.refine(DEPTH, "depth", CAMERA, None, None)
-    refined = mapis.refine(nothing, "depth", CAMERA, _link(), None)
-    assert refined.scale == 1.0
-    assert mapis.refine(OTHER, "depth", CAMERA, _link(), None).scale == pytest.approx(1.0, abs=0.2)
-
-
-def test_the_bilateral_filter_calms_what_is_warped() -> None:
-    noisy = (40 + RNG.normal(0, 0.5, SHAPE)).astype(np.float32)
-    mapis = _mapis(filter_sigma_px=2.0, constant_weight=1.0)
-    mapis.refine(noisy, "depth", CAMERA, None, None)
-    assert mapis.refine(OTHER, "depth", CAMERA, _link(), None).depth_mm.std() < 0.4 * noisy.std()
-
-
-def test_the_paper_preset_carries_unrefined_values() -> None:
-    paper = Config.load("paper").mapis
-    assert (paper.advanced.frame_scale, paper.paper.blend) == ("none", "linear")
-    assert (paper.paper.recursive, paper.paper.order) == (False, "refine-first")
-
-
-def test_depth_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="raw_mm"):
-        _mapis().refine(DEPTH[:-1], "depth", CAMERA, None, None)

@@ -48,13 +48,6 @@ def test_what_is_not_zero_is_masked_at_the_working_size(level: int, tmp_path: Pa
     assert not covered[:, 160:].any()
 
 
-def test_masks_are_widened(tmp_path: Path) -> None:
-    folder = write_masks(tmp_path / "masks", {"7.png": left_half()})
-    covered = MaskFiles(folder, RECTIFIER, grow_px=4).covered(7)
-    assert covered[:, :164].all()
-    assert not covered[:, 164:].any()
-
-
 def test_noise_of_a_jpeg_is_no_mask_and_colours_and_alpha_are_read(tmp_path: Path) -> None:
     coloured = np.zeros((480, 640, 4), np.uint8)
     coloured[:, :320, 2], coloured[..., 3] = 200, 255
@@ -63,12 +56,6 @@ def test_noise_of_a_jpeg_is_no_mask_and_colours_and_alpha_are_read(tmp_path: Pat
     for index in (1, 2):
         assert masks.covered(index)[:, :158].all()
         assert not masks.covered(index)[:, 162:].any()
-
-
-def test_a_frame_without_a_mask_has_none(tmp_path: Path) -> None:
-    masks = MaskFiles(write_masks(tmp_path / "masks", {"3.png": left_half()}), RECTIFIER)
-    assert masks.provenance() == {"masks": f"1 files in {tmp_path / 'masks'}"}
-    assert masks.covered(4) is None
 
 
 def test_masks_that_fit_no_frame_are_told(tmp_path: Path) -> None:
@@ -88,7 +75,7 @@ def test_folders_that_do_not_do_are_told(tmp_path: Path) -> None:
         MaskFiles(tmp_path / "nowhere", RECTIFIER)
     with pytest.raises(InputError, match="no image with a number"):
         MaskFiles(write_masks(tmp_path / "names", {"tool.png": left_half(), "text.png": left_half()}), RECTIFIER)
-    with pytest.raises(InputError, match="two masks for frame 1"):
+    with pytest.raises(InputError, match="have the same number"):
         MaskFiles(write_masks(tmp_path / "twice", {"a1.png": left_half(), "b1.png": left_half()}), RECTIFIER)
     damaged = write_masks(tmp_path / "damaged", {"1.png": left_half()})
     (damaged / "1.png").write_bytes(b"nothing")

@@ -27,7 +27,7 @@ from scopemap.io.decoding import read_decoded
 from scopemap.odometry import Step
 from scopemap.runner.provenance import motion_notices
 from scopemap.tracking.at_rest import CameraAtRest
-from scopemap.tracking.reprojection import nonrigidity
+from scopemap.tracking.corner_pose import nonrigidity
 from scopemap.tracking.track import MOVING_SIGMAS, Track
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events

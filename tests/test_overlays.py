@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from chosen_settings import chosen
-from drawn_clips import SIZE, Change, black, clip, during, inside, octagon, text, tissue
+from drawn_clips import SIZE, Change, clip, text, tissue
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, MaskSettings
@@ -40,12 +40,6 @@ def test_text_is_found_causally_and_little_else() -> None:
     assert not (last & ~near).any()
 
 
-def test_a_black_beginning_is_no_hindrance() -> None:
-    last = found_in(clip(50, during(0, 9, black), text()))[-1]
-    assert last is not None
-    assert last[strokes(text())].mean() > 0.97
-
-
 def test_a_panel_is_filled() -> None:
     def panel(_: int, picture: np.ndarray) -> np.ndarray:
         out = picture.copy()
@@ -58,10 +52,6 @@ def test_a_panel_is_filled() -> None:
     assert last.mean() < 1.6 * 100 * 30 / EVERYWHERE.size
 
 
-def test_tissue_alone_is_no_overlay() -> None:
-    assert not any(one is not None for one in found_in(clip(60)))
-
-
 def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
     rng = np.random.default_rng(0)
     still = clip(1, text())[0]
@@ -72,24 +62,6 @@ def test_a_camera_at_rest_makes_no_overlay_whatever_moves_before_it() -> None:
         cv2.rectangle(noisy, (60 + 3 * (number % 40), 80), (110 + 3 * (number % 40), 160), (150, 150, 160), -1)
         pictures.append(np.clip(noisy * (1 + 0.1 * np.sin(number)), 0, 255).astype(np.uint8))
     assert not any(one is not None for one in found_in(pictures))
-
-
-def test_the_rim_of_the_field_is_no_overlay() -> None:
-    masker, changes = Masker(chosen(MaskSettings, highlights=False)), (inside(octagon),)
-    without = Masker(chosen(MaskSettings, highlights=False, overlays=False))
-    for number, picture in enumerate(clip(40, *changes)):
-        frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
-        np.testing.assert_array_equal(masker(frame).valid, without(frame).valid)
-
-
-def test_what_goes_is_forgotten_and_another_size_begins_anew() -> None:
-    pictures = clip(40, text()) + clip(70)[40:]
-    finder = OverlayFinder()
-    found = [finder(picture, EVERYWHERE) for picture in pictures]
-    assert found[39] is not None
-    assert found[-1] is None
-    assert finder(clip(1, size=(160, 120))[0], EVERYWHERE[::2, ::2]) is None
-    assert finder.count == 1
 
 
 def with_vessels(picture: np.ndarray) -> np.ndarray:
@@ -119,26 +91,16 @@ def breathing(count: int, share: float) -> list[np.ndarray]:
     return pictures
 
 
-@pytest.mark.parametrize("share", [0.15, 0.2, 0.28])
-def test_tissue_that_rests_while_the_rest_breathes_is_no_overlay(share: float) -> None:
+def test_tissue_that_rests_while_the_rest_breathes_is_no_overlay() -> None:
     finder = OverlayFinder()
-    assert not any(finder(picture, EVERYWHERE) is not None for picture in breathing(100, share))
+    assert not any(finder(picture, EVERYWHERE) is not None for picture in breathing(100, 0.2))
     assert finder.count > 20
 
 
-def test_text_over_tissue_that_rests_hides_none_of_it_and_text_over_breathing_tissue_is_found() -> None:
-    change = text()
-    last = found_in([change(number, picture) for number, picture in enumerate(breathing(100, 0.25))])[-1]
-    assert last is not None
-    assert last[strokes(change)].mean() > 0.97
-    assert not last[:, round(0.75 * SIZE[0]) :].any()
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.8, 1.2), (0.5, 1.3), (0.3, 1.2)])
-def test_the_light_going_up_and_down_before_a_camera_at_rest_moves_nothing(low: float, high: float) -> None:
+def test_the_light_going_up_and_down_before_a_camera_at_rest_moves_nothing() -> None:
     still, finder = with_vessels(clip(1)[0]), OverlayFinder()
-    for number in range(90):
-        gain = low + (high - low) * (0.5 + 0.5 * np.sin(2 * np.pi * number / 30))
+    for number in range(60):
+        gain = 0.75 + 0.45 * np.sin(2 * np.pi * number / 30)
         assert finder(noisy(gain * still, number), EVERYWHERE) is None
     assert finder.count == 1
 
@@ -160,33 +122,6 @@ def test_an_overlay_that_has_gone_is_not_kept_by_a_camera_at_rest() -> None:
     assert shown is not None
     assert shown[strokes(menu)].mean() > 0.97
     assert finder(tissue(39), EVERYWHERE) is None
-
-
-@pytest.mark.parametrize("at", [(4, 14), (4, 236), (230, 125)])
-def test_text_near_the_rim_is_found(at: tuple[int, int]) -> None:
-    change = text("DOE 77", at)
-    last = found_in(clip(40, change))[-1]
-    assert last is not None
-    inner = np.s_[3:-3, 3:-3]
-    assert last[inner][strokes(change)[inner]].mean() > 0.97
-
-
-def test_text_in_the_middle_of_a_box_is_found() -> None:
-    def box(number: int, picture: np.ndarray) -> np.ndarray:
-        out = picture.copy()
-        cv2.rectangle(out, (80, 70), (240, 150), (12, 12, 30), -1)
-        return text("MENU 4", (125, 115))(number, out)
-
-    last = found_in(clip(40, box))[-1]
-    assert last is not None
-    assert last[72:149, 82:239].all()
-
-
-@pytest.mark.parametrize("size", [(32, 32), (33, 400), (400, 33)])
-def test_odd_sizes(size: tuple[int, int]) -> None:
-    finder = OverlayFinder()
-    for picture in clip(20, size=size):
-        assert finder(picture, np.ones(size[::-1], bool)) is None
 
 
 def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:

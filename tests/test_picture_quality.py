@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +14,6 @@ from test_fusion import LENIENT, plane_frame
 
 from scopemap.config import MaskSettings, TrackingSettings
 from scopemap.frame import Frame
-from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.volume import TsdfVolume
 from scopemap.masking.masker import Masker
 from scopemap.tracking.sharpness import PictureQuality
@@ -49,11 +47,6 @@ def _after_clear(rgb: np.ndarray) -> float:
     masker, quality = Masker(MaskSettings(overlays=False)), PictureQuality()
     frames = [masker(Frame(n, n / 30, shown, CAMERA, EVERYWHERE)) for n, shown in enumerate([TISSUE] * 10 + [rgb])]
     return [quality(frame.rgb, frame.valid) for frame in frames][-1]
-
-
-def test_clear_pictures_are_worth_all() -> None:
-    assert PictureQuality()(TISSUE, EVERYWHERE) == 1.0
-    assert _after_clear(TISSUE) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("spoilt", [_blurred, _hazy, _overexposed, _dark])
@@ -109,10 +102,3 @@ def test_an_unclear_frame_waits_for_a_clear_one_to_become_the_keyframe_but_not_f
     assert keyframes([1.0] * 8) == [0, 3, 6]
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.9, 1.0, 1.0]) == [0, 5]
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5]) == [0, 6]
-
-
-def test_the_store_keeps_it(tmp_path: Path) -> None:
-    store = FrameStore(tmp_path)
-    store.put(replace(plane_frame(np.array([0.0, 0.0, 1.0]), 50.0), quality=0.37))
-    assert store.frame(0).quality == 0.37
-    store.close()

@@ -66,13 +66,6 @@ def test_what_is_behind_the_camera_or_nowhere_is_a_hole() -> None:
         assert not seen.rgb.any()
 
 
-def test_a_texture_is_refused() -> None:
-    ball = trimesh.creation.icosphere(1)
-    ball.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(ball.vertices), 2)))
-    with pytest.raises(ValueError, match="vertex colours"):
-        render_mesh(ball, CAMERA, np.eye(4))
-
-
 def test_points_colour_the_pixels_that_their_squares_touch() -> None:
     z = 20.0
     pixels = np.array([[10.0, 12.0], [30.5, 20.0], [50.0, 40.25]])

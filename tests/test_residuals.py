@@ -54,95 +54,53 @@ def _moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return se3_exp(twist) @ MOTION, AFFINE + parameters[6:]
 
 
-def _residuals_at(parameters: np.ndarray, loss: Loss) -> np.ndarray:
-    return residual_images(REFERENCE, CURRENT, *_moved(parameters), loss).astype(np.float64)
-
-
-def _by_hand(loss: Loss) -> np.ndarray:
-    """Residuals by cv2.remap and plain numpy."""
-    h, w = REFERENCE.weight.shape
-    fx, fy, cx, cy = REFERENCE.intrinsics
-    v, u = np.mgrid[:h, :w].astype(np.float64)
-    points = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1) * REFERENCE.depth_mm[..., None]
-    moved = points @ MOTION[:3, :3].T + MOTION[:3, 3]
-    x, y = fx * moved[..., 0] / moved[..., 2] + cx, fy * moved[..., 1] / moved[..., 2] + cy
-    lamp = _lamp(points, moved, MOTION, loss.gamma)
-    out = []
-    for c in range(2):
-        i, j = np.floor(x), np.floor(y)
-        inside = (i >= 0) & (j >= 0) & (x < w - 1) & (y < h - 1)
-        i, j = np.where(inside, i, 0).astype(int), np.where(inside, j, 0).astype(int)
-        a, b, image = x - i, y - j, CURRENT.channels[c].astype(np.float64)
-        value = (1 - b) * ((1 - a) * image[j, i] + a * image[j, i + 1]) + b * (
-            (1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
-        )
-        weights = [CURRENT.weight[j + dj, i + di] for dj in (0, 1) for di in (0, 1)]
-        usable = inside & (np.min(weights, axis=0) > 0) & (REFERENCE.weight > 0) & np.isfinite(REFERENCE.depth_mm)
-        expected = REFERENCE.channels[c]
-        if c == 0:
-            expected = AFFINE[0] * lamp * expected + AFFINE[1]
-        out.append(np.where(usable, value - expected, np.nan))
-    return np.stack(out)
-
-
-def test_residuals_agree_with_plain_numpy() -> None:
-    loss = _loss()
-    np.testing.assert_allclose(_residuals_at(np.zeros(8), loss), _by_hand(loss), atol=2e-5)
-
-
-@pytest.mark.parametrize("gamma", [0.0, 0.4, 1.0])
-def test_jacobians_agree_with_finite_differences(gamma: float) -> None:
-    loss, step = _loss(gamma=gamma), 1e-4
-    here, residuals = _by_hand_jacobian(loss, step), _residuals_at(np.zeros(8), loss)
-    used = np.isfinite(residuals) & np.isfinite(here).all(axis=-1)
-    information = (loss.share / loss.sigma**2)[:, None, None] * np.ones_like(residuals)
-    weight = np.where(np.isfinite(residuals[0]), 1, 0).sum()
-    J, r, w = here[used], residuals[used], information[used]
-    equations = normal_equations(REFERENCE, CURRENT, MOTION, AFFINE, loss, UNIT_MM)
-    hessian, gradient = (J * w[:, None]).T @ J / weight, J.T @ (w * r) / weight
-    scale = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
-    np.testing.assert_allclose(equations.hessian / scale, hessian / scale, atol=1e-4)
-    np.testing.assert_allclose(
-        equations.gradient / np.sqrt(np.diag(hessian)), gradient / np.sqrt(np.diag(hessian)), atol=1e-4
-    )
-    assert equations.weight == weight
-
-
-def _by_hand_jacobian(loss: Loss, step: float) -> np.ndarray:
-    """Central differences of a float64 residual, on pixels that stay within their bilinear cell."""
-    columns = []
-    for k in range(8):
-        ahead, behind = np.zeros(8), np.zeros(8)
-        ahead[k], behind[k] = step, -step
-        columns.append((_smooth_residuals(ahead, loss) - _smooth_residuals(behind, loss)) / (2 * step))
-    return np.stack(columns, -1)
-
-
-def _smooth_residuals(parameters: np.ndarray, loss: Loss) -> np.ndarray:
-    """Residuals in float64 with the bilinear cell frozen at the unperturbed motion, so that they are smooth."""
+def _by_hand(loss: Loss, parameters: np.ndarray | None = None) -> np.ndarray:
+    """Residuals in plain numpy, in the bilinear cell of the unperturbed motion, so that they are smooth."""
     h, w = REFERENCE.weight.shape
     fx, fy, cx, cy = REFERENCE.intrinsics
     v, u = np.mgrid[:h, :w].astype(np.float64)
     points = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1) * REFERENCE.depth_mm[..., None]
 
-    def land(T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def land(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved = points @ T[:3, :3].T + T[:3, 3]
-        return moved, fx * moved[..., 0] / moved[..., 2] + cx, fy * moved[..., 1] / moved[..., 2] + cy
+        return moved, moved[..., :2] / moved[..., 2:] * [fx, fy] + [cx, cy]
 
-    _, x0, y0 = land(MOTION)
-    T, affine = _moved(parameters)
-    moved, x, y = land(T)
-    i = np.clip(np.nan_to_num(np.floor(x0)), 0, w - 2).astype(int)
-    j = np.clip(np.nan_to_num(np.floor(y0)), 0, h - 2).astype(int)
-    a, b = x - i, y - j
-    lamp = _lamp(points, moved, T, loss.gamma)
-    out = []
+    T, affine = _moved(np.zeros(8) if parameters is None else parameters)
+    (_, unperturbed), (moved, pixel) = land(MOTION), land(T)
+    inside = ((unperturbed >= 0) & (unperturbed < [w - 1, h - 1])).all(-1)
+    i, j = np.moveaxis(np.where(inside[..., None], np.floor(unperturbed), 0).astype(int), -1, 0)
+    a, b = pixel[..., 0] - i, pixel[..., 1] - j
+    there = np.min([CURRENT.weight[j + dj, i + di] for dj in (0, 1) for di in (0, 1)], axis=0)
+    used = inside & (there > 0) & (REFERENCE.weight > 0) & np.isfinite(REFERENCE.depth_mm)
+    lamp, out = _lamp(points, moved, T, loss.gamma), []
     for c in range(2):
         image, expected = CURRENT.channels[c].astype(np.float64), REFERENCE.channels[c].astype(np.float64)
         top = image[j, i] + a * (image[j, i + 1] - image[j, i])
         bottom = image[j + 1, i] + a * (image[j + 1, i + 1] - image[j + 1, i])
-        out.append(top + b * (bottom - top) - (affine[0] * lamp * expected + affine[1] if c == 0 else expected))
+        expected = affine[0] * lamp * expected + affine[1] if c == 0 else expected
+        out.append(np.where(used, top + b * (bottom - top) - expected, np.nan))
     return np.stack(out)
+
+
+def test_residuals_agree_with_plain_numpy() -> None:
+    found = residual_images(REFERENCE, CURRENT, MOTION, AFFINE, _loss())
+    np.testing.assert_allclose(found, _by_hand(_loss()), atol=2e-5)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.4])
+def test_jacobians_agree_with_finite_differences(gamma: float) -> None:
+    loss, residuals = _loss(gamma=gamma), _by_hand(_loss(gamma=gamma))
+    ahead, behind = (np.stack([_by_hand(loss, side * d) for d in 1e-4 * np.eye(8)], -1) for side in (1, -1))
+    used = np.isfinite(residuals)
+    J, r = ((ahead - behind) / 2e-4)[used], residuals[used]
+    w = ((loss.share / loss.sigma**2)[:, None, None] * np.ones_like(residuals))[used]
+    weight = used[0].sum()
+    equations = normal_equations(REFERENCE, CURRENT, MOTION, AFFINE, loss, UNIT_MM)
+    hessian, gradient = (J * w[:, None]).T @ J / weight, J.T @ (w * r) / weight
+    scale = np.sqrt(np.diag(hessian))
+    np.testing.assert_allclose(equations.hessian / np.outer(scale, scale), hessian / np.outer(scale, scale), atol=1e-4)
+    np.testing.assert_allclose(equations.gradient / scale, gradient / scale, atol=1e-4)
+    assert equations.weight == weight
 
 
 def test_gradient_is_that_of_the_huber_loss() -> None:

@@ -106,15 +106,3 @@ def test_orthonormalised_is_the_nearest_rotation(axis: np.ndarray, angle: float,
     np.testing.assert_allclose(clean[:3, :3], orthogonal_procrustes(np.eye(3), noisy[:3, :3])[0], atol=1e-12)
     assert np.linalg.det(clean[:3, :3]) == pytest.approx(1)
     np.testing.assert_array_equal(clean[:3, 3], [7, 8, 9])
-
-
-def test_orthonormalised_turns_a_reflection_into_a_proper_rotation() -> None:
-    R = orthonormalised(np.diag([1.0, 1.0, -0.9, 1.0]))[:3, :3]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(R) == pytest.approx(1)
-
-
-@pytest.mark.parametrize(("call", "shape"), [(se3_exp, (3,)), (se3_log, (3, 3)), (so3_log, (4, 4))])
-def test_shapes_are_checked(call: object, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="expected an array of shape"):
-        call(np.zeros(shape))  # type: ignore[operator]

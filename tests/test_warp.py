@@ -11,29 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.se3 import inverse, se3, se3_exp, transform
-from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull, resampled
+from scopemap.geometry.se3 import se3, se3_exp
+from scopemap.geometry.warp import bilateral_filtered, moved_depth, resampled
 
 CAMERA = PinholeCamera(70.0, 75.0, 30.2, 22.9, 64, 48)
 SHAPE = (48, 64)
 STILL = np.zeros((*SHAPE, 2), np.float32)
-MOTION = se3_exp(np.array([0.03, -0.05, 0.02, 1.5, -1.0, 2.5]))  # T_current_previous
-PLANE = (np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93]), 40.0)  # n x = d in the previous camera
-
-
-def _plane_depth(normal: np.ndarray, offset_mm: float) -> np.ndarray:
-    return offset_mm / (CAMERA.rays.astype(np.float64) @ normal)
-
-
-def _plane_seen_by_both() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth of the plane in the previous and in the current camera, and the exact flow between them."""
-    normal, offset_mm = PLANE
-    R, t = MOTION[:3, :3], MOTION[:3, 3]
-    current = _plane_depth(R @ normal, offset_mm + (R @ normal) @ t)
-    points = CAMERA.rays * current[..., None]
-    pixels = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), -1)
-    to_previous = CAMERA.project(transform(inverse(MOTION), points)) - pixels
-    return _plane_depth(normal, offset_mm), current, to_previous.astype(np.float32)
 
 
 def test_resampled_depth_keeps_a_planes_inverse_slope_and_its_holes() -> None:
@@ -53,23 +36,6 @@ def test_resampled_depth_keeps_a_planes_inverse_slope_and_its_holes() -> None:
     np.testing.assert_array_equal(resampled(ramp, CAMERA), ramp)
 
 
-def test_a_slanted_plane_keeps_its_place() -> None:
-    previous, current, to_previous = _plane_seen_by_both()
-    moved = moved_depth(pull(previous.astype(np.float32), to_previous), to_previous, CAMERA, MOTION)
-    known = np.isfinite(moved)
-    assert known.mean() > 0.75
-    # What is left is the bilinear sampling of a depth that is not linear in the pixels.
-    np.testing.assert_allclose(moved[known], current[known], rtol=2e-4)
-    copied = pull(previous.astype(np.float32), to_previous)
-    assert np.median(np.abs(copied - current)[known]) > 1.0
-
-
-def test_exact_samples_give_exact_depth() -> None:
-    _, current, to_previous = _plane_seen_by_both()
-    sampled = transform(inverse(MOTION), CAMERA.rays * current[..., None])[..., 2].astype(np.float32)
-    np.testing.assert_allclose(moved_depth(sampled, to_previous, CAMERA, MOTION), current, rtol=2e-6)
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_moved_depth_is_the_points_own(seed: int) -> None:
@@ -84,19 +50,6 @@ def test_moved_depth_is_the_points_own(seed: int) -> None:
         assert moved[v, u] == pytest.approx((T @ [*(depth[v, u] * ray), 1])[2], rel=1e-5)
 
 
-def test_no_motion_changes_nothing() -> None:
-    depth = np.random.default_rng(1).uniform(5, 200, SHAPE).astype(np.float32)
-    depth[3, 4] = np.nan
-    flow = np.random.default_rng(2).normal(0, 3, (*SHAPE, 2)).astype(np.float32)
-    np.testing.assert_array_equal(moved_depth(depth, flow, CAMERA, np.eye(4)), depth)
-
-
-def test_an_approach_shortens_depth_by_the_way() -> None:
-    depth = np.full(SHAPE, 50.0, np.float32)
-    nearer = moved_depth(depth, STILL, CAMERA, se3(np.eye(3), np.array([9.0, -7.0, -12.0])))
-    np.testing.assert_allclose(nearer, 38.0, rtol=1e-6)
-
-
 def test_what_falls_behind_the_camera_is_unknown() -> None:
     depth = np.full(SHAPE, 50.0, np.float32)
     depth[:, :10] = 10.0
@@ -104,14 +57,6 @@ def test_what_falls_behind_the_camera_is_unknown() -> None:
     assert np.isnan(moved[:, :10]).all()
     np.testing.assert_allclose(moved[:, 10:], 40.0, rtol=1e-6)
     assert np.isnan(moved_depth(depth, STILL, CAMERA, se3(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))).all()
-
-
-def test_shapes_are_checked() -> None:
-    depth = np.ones(SHAPE, np.float32)
-    with pytest.raises(ValueError, match="depth_previous_mm"):
-        moved_depth(depth.T, STILL, CAMERA, np.eye(4))
-    with pytest.raises(ValueError, match="to_previous"):
-        moved_depth(depth, STILL[:-1], CAMERA, np.eye(4))
 
 
 def test_filter_keeps_unknown_pixels_and_their_neighbours() -> None:
@@ -122,24 +67,6 @@ def test_filter_keeps_unknown_pixels_and_their_neighbours() -> None:
     np.testing.assert_array_equal(np.isnan(filtered), np.isnan(depth))
     np.testing.assert_allclose(filtered[np.isfinite(depth)], 40.0, rtol=1e-5)
     assert filtered.dtype == np.float32
-
-
-def test_filter_does_not_mix_across_an_edge() -> None:
-    depth = np.full(SHAPE, 30.0, np.float32)
-    depth[:, 32:] = 60.0
-    filtered = bilateral_filtered(depth, 2.0, 2.0)
-    np.testing.assert_allclose(filtered, depth, atol=0.01)
-    blurred = bilateral_filtered(depth, 2.0, 1000.0)
-    assert 40 < blurred[24, 32] < 50
-
-
-def test_filter_reduces_noise() -> None:
-    rng = np.random.default_rng(5)
-    noise = rng.normal(0, 0.5, SHAPE).astype(np.float32)
-    filtered = bilateral_filtered(40 + noise, 2.0, 2.0)
-    assert filtered.std() < 0.35 * noise.std()
-    assert filtered.mean() == pytest.approx(40.0, abs=0.05)
-    assert bilateral_filtered(40 + noise, 3.0, 2.0).std() < filtered.std()
 
 
 def test_filter_matches_its_formula_at_one_pixel() -> None:

@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     __version__: str
 
     from scopemap.config import Config
-    from scopemap.depth.own import OwnDepth
+    from scopemap.depth.custom import OwnDepth
     from scopemap.errors import ScopemapError
     from scopemap.frame import Frame, Truth
     from scopemap.io.opening import open_sequence
@@ -104,7 +104,7 @@ __all__ = [
 _HOMES = {
     "Config": "config",
     "Frame": "frame",
-    "OwnDepth": "depth.own",
+    "OwnDepth": "depth.custom",
     "Reconstruction": "reconstruction",
     "Reconstructor": "runner.reconstructor",
     "ScopemapError": "errors",

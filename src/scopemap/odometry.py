@@ -11,14 +11,13 @@ from typing import ClassVar
 import numpy as np
 
 from scopemap.config import Config
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.mapis import Mapis, RefinedDepth
+from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.faults import StageFaults
 from scopemap.frame import Frame
 from scopemap.mapping.submaps import Mapper
 from scopemap.preprocessing import PreprocessedFrame, with_depth, without_depth
 from scopemap.tracking.relocalisation import RotationFollower
-from scopemap.tracking.smoothing import create_smoother
+from scopemap.tracking.smoothing import Wema
 from scopemap.tracking.track import FrameTracker, Track, motion_between
 from scopemap.trajectory.causes import LossCause
 
@@ -48,7 +47,7 @@ class Odometry:
     def __init__(self, config: Config, tracker: FrameTracker, mapper: Mapper) -> None:
         self._config, self._tracker, self.mapper = config, tracker, mapper
         self._mapis = Mapis(config.mapis)
-        self._smooth = create_smoother(config.smoothing)
+        self._smooth = Wema(config.smoothing)
         self._rotation = RotationFollower()
         self._last_track: Track | None = None
         self._last_frame: tuple[Frame, Track] | None = None

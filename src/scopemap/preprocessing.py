@@ -10,9 +10,8 @@ import numpy as np
 
 from scopemap.config import Config
 from scopemap.depth.anchor import AnchoredDepth, depth_downscale
-from scopemap.depth.correspondence import DenseCorrespondence, DenseMatcher
 from scopemap.depth.estimate import DepthEstimator, DepthKind, PerceptualDistance
-from scopemap.depth.mapis import Mapis
+from scopemap.depth.mapis import DenseCorrespondence, DenseMatcher, Mapis
 from scopemap.faults import StageFaults
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame

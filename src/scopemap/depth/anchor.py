@@ -12,12 +12,10 @@ from typing import Literal
 import numpy as np
 
 from scopemap.config import DepthSettings
-from scopemap.depth.estimate import DepthEstimate, DepthEstimator
+from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
-
-"""The source of the scale where depth is measured."""
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02
@@ -58,15 +56,6 @@ class MetricDepth:
     limit_note: str = ""
 
 
-@dataclass(frozen=True)
-class _Target:
-    """Pairs to fit: estimated values (N,) and their metric depth (N,), mm."""
-
-    values: np.ndarray
-    depth_mm: np.ndarray
-    focal_px: float
-
-
 class AnchoredDepth:
     """Converts the estimates of one sequence to raw metric depth.
 
@@ -77,55 +66,29 @@ class AnchoredDepth:
 
     `settings.advanced.reanchor_every` repeats the fit to the reference, which bounds drift.
 
-    reference : metric estimator for anchors other than the range and the estimate itself.
     Raises `SettingsError` where `near-far` is chosen without a valid range.
+
+    Attributes
+    ----------
+    reference : metric estimator for anchors other than the range and the estimate itself.
+    conversion : of the sequence; None until it is fitted. description : the source of the scale, for people.
+    is_measured : whether depth is measured, and so needs no anchor. scale_is_known : whether it is, or is anchored to a
+    stated range or by Depth Pro; the millimetres of other networks, the shading prior and a factor are a guess.
     """
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
-        self._reference = reference
-        self._conversion: AffineDisparity | DepthScale | None = None
-        self._description = "not anchored: no usable frame yet"
-        self._is_known = self._is_measured = False
+        self.reference = reference
+        self.conversion: AffineDisparity | DepthScale | None = None
+        self.description = "not anchored: no usable frame yet"
+        self.scale_is_known = self.is_measured = False
         self._frames_held = 0
-
-    @property
-    def description(self) -> str:
-        """The source of the scale, for people: for instance "near-far 13.5:100 mm"."""
-        return self._description
-
-    @property
-    def scale_is_known(self) -> bool:
-        """Whether depth is measured, or anchored to a stated range or by Depth Pro; False: its millimetres are a guess.
-
-        What a network without an anchor, the shading prior or a factor says is a guess.
-        """
-        return self._is_known
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether depth is measured, and so needs no anchor."""
-        return self._is_measured
-
-    @property
-    def reference(self) -> DepthEstimator:
-        """The metric estimator for anchors other than the range and the estimate itself."""
-        return self._reference
 
     @property
     def just_fitted(self) -> bool:
         """Whether the last frame determined the conversion, so that its depth needs no scale from earlier frames."""
-        return self._conversion is not None and self._frames_held == 0
-
-    @property
-    def conversion(self) -> AffineDisparity | DepthScale | None:
-        """The conversion of the sequence; None until it is fitted."""
-        return self._conversion
-
-    def depth_mm(self, estimate: DepthEstimate, frame: Frame) -> np.ndarray:
-        """Return the depth of `metric` alone."""
-        return self.metric(estimate, frame).depth_mm
+        return self.conversion is not None and self._frames_held == 0
 
     def metric(self, estimate: DepthEstimate, frame: Frame) -> MetricDepth:
         """Return metric depth (H, W) float32, mm, NaN = unknown, with its standard deviation where it is estimated.
@@ -136,10 +99,10 @@ class AnchoredDepth:
         """
         self._frames_held += 1
         first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
-        if self._conversion is None:
+        if self.conversion is None:
             return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None, limit_note)
-        depth_mm = self._conversion.depth_mm(estimate.values) if first_mm is None else first_mm
-        sigma_mm = self._conversion.sigma_mm(estimate.sigma) if first_mm is None else None
+        depth_mm = self.conversion.depth_mm(estimate.values) if first_mm is None else first_mm
+        sigma_mm = self.conversion.sigma_mm(estimate.sigma) if first_mm is None else None
         if estimate.kind != "measured":
             share, note = self._beyond_limit(depth_mm, frame.valid)
             limit_note = note if share > _MAX_SHARE_BEYOND else ""
@@ -156,7 +119,7 @@ class AnchoredDepth:
         return share, f"{share:.0%} of its depth is beyond {limit} (median {np.median(positive_mm):.0f} mm)"
 
     def _is_due(self, estimate: DepthEstimate) -> bool:
-        if self._conversion is None:
+        if self.conversion is None:
             return True
         every = self._settings.advanced.reanchor_every
         return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
@@ -172,40 +135,41 @@ class AnchoredDepth:
             return None, ""
         first_mm, details = None, ""
         source = self._source(estimate)
-        if source == "own":
-            self._conversion = DepthScale(1.0)
+        if source == "estimate":
+            self.conversion = DepthScale(1.0)
         elif source == "factor":
-            self._conversion = self._from_factor(estimate, usable)
+            self.conversion = self._from_factor(estimate, usable)
         elif source == "near-far":
-            self._conversion = self._fitted(estimate, self._range_target(estimate, usable, frame))
+            self.conversion = self._fitted_to_range(estimate, usable, frame)
         else:
-            reference = self._reference.estimate(frame)
+            reference = self.reference.estimate(frame)
             _, limit_note = self._beyond_limit(reference.values, usable)
             known = usable & (reference.values > 0) & (reference.values <= max_depth_mm(self._settings))
             if known.mean() < _MIN_SHARE:
-                return None, f"no scale by {self._reference.name}: {limit_note}" if limit_note else ""
+                return None, f"no scale by {self.reference.name}: {limit_note}" if limit_note else ""
             details = self._details(reference, frame) + (f"; {limit_note}, and left the fit" if limit_note else "")
             focal_px = reference.focal_px or frame.camera.fx
-            target = _Target(estimate.values[known], reference.values[known], focal_px)
-            self._conversion = self._fitted(estimate, target)
+            self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
             first_mm = None if self._settings.paper.fit_shift else reference.values
         self._frames_held = 0
-        self._description = self._describe(source, estimate, frame) + details
-        network = self._settings.backend if source == "own" else self._reference.name if source == "reference" else ""
-        self._is_measured = estimate.kind == "measured"
-        self._is_known = self._is_measured or source == "near-far" or network == "depth-pro"
+        self.description = self._describe(source, estimate, frame) + details
+        network = (
+            self._settings.backend if source == "estimate" else self.reference.name if source == "reference" else ""
+        )
+        self.is_measured = estimate.kind == "measured"
+        self.scale_is_known = self.is_measured or source == "near-far" or network == "depth-pro"
         return first_mm, ""
 
-    def _source(self, estimate: DepthEstimate) -> Literal["own", "near-far", "factor", "reference"]:
+    def _source(self, estimate: DepthEstimate) -> Literal["estimate", "near-far", "factor", "reference"]:
         anchor = self._settings.anchor
         if estimate.kind == "measured" or anchor == self._settings.backend:
-            return "own"
+            return "estimate"
         if anchor == "factor":
             return "factor"
         if anchor == "near-far" or (anchor == "auto" and self._settings.near_far_mm is not None):
             return "near-far"
-        return "own" if anchor == "auto" and estimate.kind == "depth" else "reference"
+        return "estimate" if anchor == "auto" and estimate.kind == "depth" else "reference"
 
     def _from_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
         """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
@@ -217,19 +181,24 @@ class AnchoredDepth:
             return AffineDisparity(1 / (nearest_mm * float(positive.max())), 0.0)
         return DepthScale(nearest_mm / float(positive.min()))
 
-    def _range_target(self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame) -> _Target:
+    def _fitted_to_range(
+        self, estimate: DepthEstimate, usable: np.ndarray, frame: Frame
+    ) -> AffineDisparity | DepthScale:
         values = estimate.values[usable]
         near_far = (values.max(), values.min()) if estimate.kind == "disparity" else (values.min(), values.max())
-        return _Target(np.array(near_far, np.float64), np.array(self._settings.near_far_mm), frame.camera.fx)
+        range_mm = np.array(self._settings.near_far_mm)
+        return self._fitted(estimate.kind, np.array(near_far, np.float64), range_mm, frame.camera.fx)
 
-    def _fitted(self, estimate: DepthEstimate, target: _Target) -> AffineDisparity | DepthScale:
-        if estimate.kind == "depth":
-            return DepthScale(float(np.exp(np.median(np.log(target.depth_mm / target.values)))))
+    def _fitted(
+        self, kind: DepthKind, values: np.ndarray, depth_mm: np.ndarray, focal_px: float
+    ) -> AffineDisparity | DepthScale:
+        """Return the conversion of estimated values (N,) to their metric depth (N,), mm."""
+        if kind == "depth":
+            return DepthScale(float(np.exp(np.median(np.log(depth_mm / values)))))
         if self._settings.paper.fit_shift:
-            return fit_affine_disparity(target.depth_mm, target.values, max_depth_mm(self._settings))
-        floor = self._settings.paper.disparity_floor
-        baseline_mm = fit_baseline_lbfgsb(target.depth_mm, target.values, target.focal_px, floor)
-        return AffineDisparity.from_baseline(baseline_mm, target.focal_px)
+            return fit_affine_disparity(depth_mm, values, max_depth_mm(self._settings))
+        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.paper.disparity_floor)
+        return AffineDisparity.from_baseline(baseline_mm, focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
         if estimate.kind == "measured":
@@ -238,7 +207,7 @@ class AnchoredDepth:
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
             return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.paper.factor:g}"
-        name = self._settings.backend if source == "own" else self._reference.name
+        name = self._settings.backend if source == "estimate" else self.reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
         return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"

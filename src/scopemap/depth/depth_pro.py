@@ -8,20 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.pretrained import load_pretrained
+from scopemap.depth.pretrained import MM_PER_M, PretrainedNetwork, load_pretrained
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
-from scopemap.io.device import choose_device, need_packages
 
 if TYPE_CHECKING:
     import torch
     from transformers import DepthProForDepthEstimation, DepthProImageProcessor
 
-MM_PER_M = 1000.0
 
-
-class DepthPro:
-    """A Depth Pro network and its image processor behind the `DepthEstimator` contract.
+class DepthPro(PretrainedNetwork):
+    """A Depth Pro network behind the `DepthEstimator` contract.
 
     The network gives canonical inverse depth c and a field of view; depth is f / (W c) with the focal length f and the
     width W in px (paper, section 3.2). `use_known_focal` takes f from the frame's camera instead of the network: set
@@ -45,12 +42,8 @@ class DepthPro:
             raise WeightsError(
                 "this Depth Pro model finds no focal length: name another, or set depth.paper.depth_pro_focal=camera"
             )
+        super().__init__(network, processor, device=device, origin=origin)
         self.use_known_focal = use_known_focal
-        self._device = choose_device(device)
-        untyped: Any = network
-        self._network = untyped.to(self._device).eval()
-        self._processor: Any = processor
-        self._origin = origin or {}
         self._last: tuple[np.ndarray, Any, torch.Tensor | None] | None = None
 
     @classmethod
@@ -59,10 +52,7 @@ class DepthPro:
 
         Never downloads. Raises `WeightsError` with the name to pull.
         """
-        need_packages(f"depth by {cls.name}", "torch", "torchvision", "transformers", "safetensors")
-        from transformers import DepthProForDepthEstimation
-
-        network, processor, origin = load_pretrained(DepthProForDepthEstimation, model or cls.name)
+        network, processor, origin = load_pretrained("DepthProForDepthEstimation", model, cls.name)
         return cls(network, processor, device=device, use_known_focal=use_known_focal, origin=origin)
 
     def estimate(self, frame: Frame) -> DepthEstimate:
@@ -74,9 +64,7 @@ class DepthPro:
         import torch
 
         if self._last is None or not np.array_equal(self._last[0], frame.rgb):
-            inputs = self._processor(images=frame.rgb, input_data_format="channels_last", return_tensors="pt")
-            with torch.inference_mode():
-                outputs = self._network(inputs["pixel_values"].to(self._device))
+            outputs = self._answer(frame.rgb)
             self._last = frame.rgb.copy(), outputs, outputs.field_of_view
         _, outputs, found_deg = self._last
         outputs.field_of_view = found_deg
@@ -84,10 +72,8 @@ class DepthPro:
         if self.use_known_focal:
             known_deg = 2.0 * math.degrees(math.atan(0.5 * width / frame.camera.fx))
             outputs.field_of_view = torch.tensor([known_deg], device=self._device)
-        size = (frame.camera.height, width)
-        result = self._processor.post_process_depth_estimation(outputs, target_sizes=[size])[0]
         focal_px = None if found_deg is None else 0.5 * width / math.tan(0.5 * math.radians(float(found_deg)))
-        return DepthEstimate(result["predicted_depth"].float().cpu().numpy() * MM_PER_M, "depth", focal_px)
+        return DepthEstimate(self._values(outputs, frame) * MM_PER_M, "depth", focal_px)
 
     def provenance(self) -> dict[str, str]:
         """Return the name, whose focal length scaled the depth, the model, its commit and its weights' hashes."""

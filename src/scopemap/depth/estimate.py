@@ -17,8 +17,6 @@ DepthKind = Literal["disparity", "depth", "measured"]
 class DepthEstimate:
     """Depth or disparity of one frame.
 
-    Attributes
-    ----------
     values : (H, W) float32, NaN = unknown; meaning and unit by `kind`.
     kind : "disparity": unitless, larger is nearer, known up to a scale and a shift; "depth": predicted, mm along the
         optical axis, with a scale that may change from frame to frame; "measured": mm, reliable.
@@ -71,7 +69,7 @@ class PerceptualResult:
 
 
 class PerceptualDistance(Protocol):
-    """Distance between two images as people see them."""
+    """Perceptual distance between two images."""
 
     name: str
 

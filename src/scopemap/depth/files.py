@@ -20,7 +20,7 @@ from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate, DepthKind
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.io.decoding import read_decoded
+from scopemap.io.decoding import by_number, frame_number, read_decoded
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"
@@ -145,28 +145,25 @@ def depth_files(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         raise InputError(f"reading depth files: {folder} is no folder; give files:FOLDER with the folder of the files")
     candidates = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in (*_IMAGES, _NUMPY) and f.name[0] != "."]
-    numbered = [f for f in candidates if re.search(r"\d", f.stem) and not _OTHER_CONTENT.search(f.stem)]
+    numbered = [f for f in candidates if frame_number(f) is not None and not _OTHER_CONTENT.search(f.stem)]
     named = [f for f in numbered if _NAMED_DEPTH.search(f.stem)]
-    found: dict[int, Path] = {}
-    for file in named or numbered:
-        number = int(re.findall(r"\d+", file.stem)[-1])
-        if number in found:
-            raise InputError(f"two depth files for frame {number} in {folder}: {found[number].name} and {file.name}")
-        found[number] = file
-    if not found:
+    if not numbered:
         raise InputError(
             f"reading depth files: {folder} holds no png, tif, jpg or npy file with a number in its name that could be "
             "depth; the number is the frame's"
         )
-    return dict(sorted(found.items()))
+    return by_number(named or numbered)
 
 
 def _read(file: Path) -> np.ndarray:
     """Return (h, w) uint8, uint16 or floating; raises `InputError` for other content."""
     try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False) if file.suffix.lower() == _NUMPY else _read_image(file)
+        is_array = file.suffix.lower() == _NUMPY
+        array = np.load(file, mmap_mode="r", allow_pickle=False) if is_array else read_decoded(file)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"cannot read the depth file {file}: {error}") from None
+    if array is None:
+        raise InputError(f"cannot read the depth file {file}: not an image, or damaged")
     array = np.squeeze(array)
     if array.ndim == 3 and (array[..., :3] == array[..., :1]).all():
         array = array[..., 0]
@@ -175,13 +172,6 @@ def _read(file: Path) -> np.ndarray:
             f"the depth file {file} holds {array.dtype} of shape {array.shape}: expected one channel of 8 or 16 bit "
             "or floats; a colour-mapped depth picture cannot be converted to depth"
         )
-    return array
-
-
-def _read_image(file: Path) -> np.ndarray:
-    array = read_decoded(file)
-    if array is None:
-        raise ValueError("not an image, or damaged")
     return array
 
 

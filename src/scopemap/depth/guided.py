@@ -13,14 +13,7 @@ from scopemap.errors import check_shape
 
 
 def masked_mean(image: np.ndarray, known: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return the mean of the known pixels in a square window around every pixel.
-
-    image : (H, W) float32; what it holds where `known` is False does not matter, NaN included.
-    known : (H, W) bool.
-    radius_px : the window is 2 radius + 1 wide.
-
-    Returns (H, W) float32, NaN where the window holds no known pixel.
-    """
+    """Return the mean (H, W) float32 of the `known` (H, W) pixels in windows of 2 radius + 1 px; NaN where none is."""
     check_shape("known", known, np.shape(image))
     window = (2 * radius_px + 1, 2 * radius_px + 1)
     share = cv2.boxFilter(known.astype(np.float32), -1, window, borderType=cv2.BORDER_REFLECT)
@@ -31,14 +24,10 @@ def masked_mean(image: np.ndarray, known: np.ndarray, radius_px: int) -> np.ndar
 
 
 def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: float) -> np.ndarray:
-    """Smooth an image with itself as guide: differences well below `edge` go, those well above stay.
+    """Smooth an image (H, W) with itself as guide, eq. 5-8 of He et al. with p = I and epsilon = edge^2; float32.
 
-    image : (H, W) float32.
-    known : (H, W) bool; other pixels are ignored and NaN in the result.
-    radius_px : radius of the window.
-    edge : standard deviation within a window that counts as an edge, unit of the image.
-
-    Returns (H, W) float32. Eq. 5-8 of He et al. with p = I and epsilon = edge^2.
+    known : (H, W) bool; other pixels are ignored and NaN in the result. edge : standard deviation in a window, in the
+    image's unit: smaller differences go, larger ones stay.
     """
     mean = masked_mean(image, known, radius_px)
     variance = np.maximum(masked_mean(image**2, known, radius_px) - mean**2, 0)
@@ -48,13 +37,9 @@ def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: fl
 
 
 def filled(image: np.ndarray, known: np.ndarray, max_distance_px: int) -> np.ndarray:
-    """Fill unknown pixels from the nearest known ones, window by growing window.
+    """Fill pixels of an image (H, W) that are not `known` from the nearest known ones, window by growing window.
 
-    image : (H, W) float32.
-    known : (H, W) bool.
     max_distance_px : pixels farther than this (along rows or columns) from every known one stay NaN.
-
-    Returns (H, W) float32.
     """
     result = np.where(known, image, np.nan).astype(np.float32)
     radius_px = 1

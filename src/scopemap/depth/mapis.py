@@ -17,9 +17,9 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MapisSettings
-from scopemap.depth.correspondence import DenseCorrespondence
-from scopemap.depth.estimate import DepthKind
+from scopemap.depth.estimate import DepthKind, PerceptualDistance
 from scopemap.errors import check_shape
+from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.geometry.uncertainty import blended_sigma, by_variance, faded_sigma, relative_sigma
 from scopemap.geometry.warp import bilateral_filtered, moved_depth, pull
 
@@ -28,11 +28,50 @@ _MIN_OVERLAP = 0.2
 
 
 @dataclass(frozen=True)
+class DenseCorrespondence:
+    """Dense correspondence of a frame with the previous one.
+
+    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, flow check passed.
+    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant for a single score.
+    usable_share : share of the current image that shows tissue.
+    """
+
+    to_previous: np.ndarray
+    consistent: np.ndarray
+    distance: np.ndarray
+    usable_share: float = 1.0
+
+
+class DenseMatcher:
+    """Matches masked images, in order, with the previous one."""
+
+    def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
+        self._settings, self._flow, self._perceptual = settings, flow, perceptual
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
+
+    def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
+        """Return the correspondence of an image (H, W, 3) uint8 with valid pixels (H, W) to the previous one.
+
+        None for the first image and where it is not `wanted`.
+        """
+        previous, self._previous = self._previous, (rgb, valid)
+        if previous is None or not wanted:
+            return None
+        rgb_previous, valid_previous = previous
+        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.advanced.consistency_px)
+        # Masked pixels of either image show no tissue.
+        seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
+        compared = pull(rgb_previous, flow.to_previous) if self._settings.paper.compare_warped else rgb_previous
+        distance = self._perceptual.compare(compared, rgb)
+        values = np.full_like(distance.map, distance.score) if self._settings.paper.perceptual_score else distance.map
+        consistent = flow.consistent & seen & valid
+        return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
+
+
+@dataclass(frozen=True)
 class RefinedDepth:
     """Depth of one frame after the consistency stage.
 
-    Attributes
-    ----------
     depth_mm : (H, W) float32, NaN = unknown. scale : factor applied to the raw depth.
     warped_share : share of the image with a warped previous depth. sigma_mm : (H, W) float32, one standard
     deviation of the depth, NaN = unknown.
@@ -72,9 +111,9 @@ class Mapis:
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
-        `raw_mm` is (H, W) float32 and `sigma_mm` its standard deviation, NaN or None where unknown; the first frame of
-        a sequence has no `correspondence`. With a motion the previous depth is transformed by it; with None its values
-        are warped unchanged, as in the paper. A frame just `anchored` to a metric depth starts a new chain of scales.
+        raw_mm : (H, W) float32; sigma_mm : its standard deviation, NaN or None where unknown. correspondence : None for
+        the first frame. T_current_previous : transforms the previous depth; None: it is warped unchanged, as in the
+        paper. anchored : whether the frame was just anchored to a metric depth, which starts a new chain of scales.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         if anchored:

@@ -23,8 +23,6 @@ PACKAGES = ("torch", "torchvision", "lpips")
 
 # lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
 _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
-
-
 _WINDOW_PX = 7
 _SAMPLE = _WINDOW_PX**2 / (_WINDOW_PX**2 - 1)  # of a sample's covariance
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang, section III.B
@@ -98,7 +96,9 @@ class LpipsAlex:
             network = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
         state = torch.load(self._checkpoint, map_location="cpu", weights_only=True)
         try:
-            network.net.load_state_dict({_slice_name(name): t for name, t in state.items() if _is_convolution(name)})
+            network.net.load_state_dict(
+                {_slice_name(n): t for n, t in state.items() if re.match(r"features\.\d+\.", n)}
+            )
         except RuntimeError as error:
             raise WeightsError(f"{self._checkpoint} does not hold AlexNet's convolutions: {error}") from None
         self._network = network.to(self._device).eval()
@@ -125,10 +125,6 @@ class LpipsAlex:
             "weights": self._checkpoint.name,
             "sha256": weights.sha256_of(self._checkpoint),
         }
-
-
-def _is_convolution(name: str) -> bool:
-    return re.match(r"features\.\d+\.", name) is not None
 
 
 def _slice_name(name: str) -> str:

@@ -19,10 +19,7 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True)
 class AffineDisparity:
-    """Depth from disparity by 1 / D = scale * d + shift, both in 1/mm per unit of disparity and 1/mm.
-
-    The pseudo-stereo form D = f B / d is `scale = 1 / (f B)`, `shift = 0`.
-    """
+    """Depth from disparity by 1 / D = scale * d + shift; the pseudo-stereo form D = f B / d is scale = 1 / (f B)."""
 
     scale: float
     shift: float

@@ -1,10 +1,8 @@
 """Depth from near-field shading: an estimator that needs no weights.
 
-In endoscopy the lamp sits at the camera and is the only light, so brightness falls with the square of the distance
-along the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away
-from the lamp the farther it is down a lumen, which makes it darker still, and light bounces between the walls, which
-makes it brighter: the exponent is therefore a setting, chosen on real frames
-(scopemap_bench/scripts/depth_without_download.py).
+In endoscopy the lamp is at the camera and is the only light, so brightness falls with the square of the distance along
+the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away from the
+lamp down a lumen, and light bounces between its walls: the exponent is chosen on real frames.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ import numpy as np
 from scopemap.config import DepthSettings
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.guided import filled, guided_filter
+from scopemap.depth.scopenet.planes import LINEAR
 from scopemap.frame import Frame
 
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
@@ -88,10 +87,8 @@ def relative_distance(frame: Frame, unit_z: np.ndarray, exponent: float) -> np.n
 
 
 def linear_brightness(rgb: np.ndarray) -> np.ndarray:
-    """Return the mean linear red and green 0..1 (H, W) float32 of an sRGB image (H, W, 3) uint8 (IEC 61966-2-1)."""
-    level = np.arange(256) / 255
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    return linear[rgb] @ _CHANNEL_WEIGHTS
+    """Return the mean linear red and green 0..1 (H, W) float32 of an sRGB image (H, W, 3) uint8."""
+    return LINEAR.astype(np.float32)[rgb] @ _CHANNEL_WEIGHTS
 
 
 def _glare(rgb: np.ndarray, log_brightness: np.ndarray, width_px: int) -> np.ndarray:

@@ -16,7 +16,9 @@ import numpy as np
 from scopemap.errors import check_shape
 from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame
+from scopemap.geometry.local_contrast import local_contrast, local_mean
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.geometry.warp import bilinear
 
 _CORNER_BLOCK_PX = 5
 _BORDER_PX = 3
@@ -52,8 +54,6 @@ _QUICK = _Search(11, 10, 0.03)  # a third of the time, and poses of the same err
 class Correspondences2D3D:
     """Points of a reference frame, and the pixels of the current frame where optical flow observes them.
 
-    Attributes
-    ----------
     points_mm : (N, 3) float64, in the camera of the reference. pixels : (N, 2) float64 x, y in the current frame.
     coverage : share of the reference's corners that were matched, 0..1. reference : index of the reference frame.
     """
@@ -71,9 +71,8 @@ class Correspondences2D3D:
 class KeyframeMatcher:
     """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow.
 
-    The flow to a frame is searched from that to the frame before. In small images it takes a quarter of the time;
-    patches of the whole ones, aligned from there, give poses of the same error. Where it matches few corners, flow
-    between the whole images matches more.
+    The flow to a frame is searched from that to the frame before, in small images; patches of the whole ones are then
+    aligned. Where that matches few corners, flow between the whole images is used.
     """
 
     def __init__(self, flow: FlowEstimator) -> None:
@@ -180,11 +179,9 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     assert frame.depth_mm is not None
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     # On brightness relative to its surround: distant tissue is dark, not without texture.
-    level = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 8.0) + 8.0
+    level = local_mean(grey.astype(np.float32), _SURROUND_PX) + _DARKEST
     strength = cv2.cornerMinEigenVal(grey / level, _CORNER_BLOCK_PX)
-    usable = frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm)
-    # A patch that touches a mask's edge has a corner that is not the tissue's.
-    usable = cv2.erode(usable.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8), borderValue=0) > 0
+    usable = usable_pixels(frame.valid & (frame.depth_mm > 0) & np.isfinite(frame.depth_mm))
     strength = np.where(usable, strength, -1.0)
     height, width = (side // cell_px * cell_px for side in strength.shape)
     cells: np.ndarray = strength[:height, :width].reshape(height // cell_px, cell_px, width // cell_px, cell_px)
@@ -193,6 +190,12 @@ def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
     row, column = np.divmod(np.arange(len(cells)), width // cell_px)
     pixels = np.column_stack([column * cell_px + best % cell_px, row * cell_px + best // cell_px])
     return pixels[cells.max(1) > 0]
+
+
+def usable_pixels(valid: np.ndarray) -> np.ndarray:
+    """Return where features may be, (H, W) bool: those at the edge of a mask or a highlight are not the tissue's."""
+    border = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(valid.astype(np.uint8), border, borderValue=0) > 0)
 
 
 def match_corners(
@@ -216,37 +219,17 @@ def match_corners(
 
 
 def sample_flow(flow: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside.
-
-    OpenCV's remap is not used: it fails for no points and for more than 32767.
-    """
-    height, width = flow.shape[:2]
-    inside = ((pixel >= 0) & (pixel <= [width - 1, height - 1])).all(axis=1, keepdims=True)
-    place = np.where(inside, pixel, 0.0)
-    corner = np.clip(np.floor(place).astype(int), 0, [width - 2, height - 2])
-    x, y = corner.T
-    a, b = (place - corner).T[..., None]
-    top = (1 - a) * flow[y, x] + a * flow[y, x + 1]
-    bottom = (1 - a) * flow[y + 1, x] + a * flow[y + 1, x + 1]
-    return np.where(inside, (1 - b) * top + b * bottom, np.nan)
+    """Return the flow (n, 2) at pixels (n, 2), bilinear; NaN outside."""
+    inside = ((pixel >= 0) & (pixel <= [flow.shape[1] - 1, flow.shape[0] - 1])).all(axis=1, keepdims=True)
+    return np.where(inside, bilinear(flow, np.where(inside, pixel, 0.0)), np.nan)
 
 
 def normalised_brightness(rgb: np.ndarray) -> np.ndarray:
     """Return grey values (H, W) uint8 of an (H, W, 3) uint8 image, less their local mean, over their local contrast."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    relative = grey / (_surround(grey) + _DARKEST) - 1
-    contrast = np.sqrt(_surround(relative**2)) + _LEAST_CONTRAST
-    return np.clip(128 + _CONTRAST * relative / contrast, 0, 255).astype(np.uint8)
-
-
-def _surround(values: np.ndarray) -> np.ndarray:
-    """Return the local mean (H, W) float32 of values (H, W) float32."""
-    height, width = values.shape
-    small = (max(1, width // _LOW_RESOLUTION), max(1, height // _LOW_RESOLUTION))
-    mean = cv2.GaussianBlur(
-        cv2.resize(values, small, interpolation=cv2.INTER_AREA), (0, 0), _SURROUND_PX / _LOW_RESOLUTION
-    )
-    return cv2.resize(mean, (width, height))
+    relative = grey / (local_mean(grey, _SURROUND_PX, downscale=_LOW_RESOLUTION) + _DARKEST) - 1
+    contrast = local_contrast(relative, _SURROUND_PX, unit=_CONTRAST, least=_LEAST_CONTRAST, downscale=_LOW_RESOLUTION)
+    return np.clip(128 + contrast, 0, 255).astype(np.uint8)
 
 
 def refined_corners(

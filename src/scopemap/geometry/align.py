@@ -22,13 +22,8 @@ _RANK_TOLERANCE = 1e-12
 
 @dataclass(frozen=True)
 class Similarity:
-    """Takes points x to `scale * R x + t`.
+    """Takes points x to `scale * R x + t`; R (3, 3), t (3,) mm.
 
-    Attributes
-    ----------
-    scale : > 0, unitless.
-    R : (3, 3) rotation.
-    t : (3,) translation, mm.
     singular_values : (3,) of the covariance that was fitted, largest first; None where nothing was fitted.
     """
 
@@ -92,9 +87,8 @@ def umeyama(points_from: np.ndarray, points_to: np.ndarray, with_scale: bool) ->
 
 
 def _refuse_degenerate(singular_values: np.ndarray, magnitude: float) -> None:
-    largest = singular_values[0]
-    moving = largest > _RANK_TOLERANCE * magnitude
-    rank = int(np.sum(singular_values > _RANK_TOLERANCE * largest)) if moving else 0
+    moving = singular_values[0] > _RANK_TOLERANCE * magnitude
+    rank = int(np.sum(singular_values > _RANK_TOLERANCE * singular_values[0])) if moving else 0
     if rank < 2:
         values = ", ".join(f"{value:.3g}" for value in singular_values)
         raise AlignmentError(
@@ -115,19 +109,14 @@ def align_trajectories(
     """
     check_shape("estimated", estimated, (None, 4, 4))
     check_shape("reference", reference, (len(estimated), 4, 4))
-    if first is not None:
-        _refuse_useless_first(first, mode)
-    similarity = _fit(estimated[:first], reference[:first], mode)
-    return similarity.transform_poses(estimated), similarity
-
-
-def _refuse_useless_first(first: int, mode: AlignMode) -> None:
-    if mode in ("none", "origin"):
+    if first is not None and mode in ("none", "origin"):
         raise AlignmentError(
             f"cannot fit the first {first} frames: alignment '{mode}' fits none; use se3, sim3 or scale"
         )
-    if first < 3:
+    if first is not None and first < 3:
         raise AlignmentError(f"cannot fit the first {first} frames: a rotation needs at least 3 positions")
+    similarity = _fit(estimated[:first], reference[:first], mode)
+    return similarity.transform_poses(estimated), similarity
 
 
 def _fit(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode) -> Similarity:

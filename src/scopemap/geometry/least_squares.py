@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -51,24 +51,6 @@ def cauchy(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
 def huber_weight(residuals: np.ndarray, threshold: float) -> np.ndarray:
     """Return the weights of absolute residuals under Huber's kernel: 1 up to `threshold`, then threshold / residual."""
     return np.minimum(1.0, threshold / np.maximum(residuals, 1e-300))
-
-
-class Model(Protocol):
-    """Quadratic model of a cost around a state: cost, gradient (n,), and products with its Gauss-Newton hessian."""
-
-    @property
-    def cost(self) -> float:
-        """Cost at the state, infinite where the state is impossible."""
-
-    @property
-    def gradient(self) -> np.ndarray:
-        """First derivative (n,)."""
-
-    def gauss_newton_step(self) -> np.ndarray:
-        """Return the step (n,) to the minimum of the model."""
-
-    def curvature(self, step: np.ndarray) -> float:
-        """Return step^T H step."""
 
 
 class DenseModel(NamedTuple):
@@ -203,7 +185,7 @@ class CameraBlock(NamedTuple):
 
 @dataclass(frozen=True)
 class SchurModel:
-    """Model of a cost of camera unknowns and points, in this order; see `least_squares.Model`.
+    """Model of a cost of camera unknowns and points, in this order.
 
     cost : at the state. build : returns the blocks, called once and only where a step is needed. free : (F,) numbers
     of the camera unknowns that may change. cameras, points : how many unknowns there are of either.
@@ -223,14 +205,14 @@ class SchurModel:
     @cached_property
     def gradient(self) -> np.ndarray:
         """First derivative (cameras + points,); 0 for fixed unknowns."""
-        own, points = np.zeros(self.cameras), np.zeros(self.points)
+        cameras, points = np.zeros(self.cameras), np.zeros(self.points)
         for block in self.blocks[0]:
-            own[block.columns] += block.scores.sum(0)
+            cameras[block.columns] += block.scores.sum(0)
             points[block.points] = block.g
         for prior in self.blocks[1]:
-            own[prior.columns] += prior.b
+            cameras[prior.columns] += prior.b
         free = np.zeros(self.cameras)
-        free[self.free] = own[self.free]
+        free[self.free] = cameras[self.free]
         return np.concatenate([free, points])
 
     def gauss_newton_step(self) -> np.ndarray:
@@ -252,8 +234,8 @@ class SchurModel:
         def add(columns: np.ndarray, A: np.ndarray, b: np.ndarray) -> None:
             rhs[columns] -= b
             kept = np.flatnonzero(place[columns] >= 0)
-            own = place[columns[kept]]
-            matrix[np.ix_(own, own)] += A[np.ix_(kept, kept)]
+            free = place[columns[kept]]
+            matrix[np.ix_(free, free)] += A[np.ix_(kept, kept)]
 
         for prior in self.blocks[1]:
             add(*prior)
@@ -265,9 +247,13 @@ class SchurModel:
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""
-        own, points = step[: self.cameras], step[self.cameras :]
-        total = sum(float(own[prior.columns] @ prior.A @ own[prior.columns]) for prior in self.blocks[1])
+        cameras, points = step[: self.cameras], step[self.cameras :]
+        total = sum(float(cameras[prior.columns] @ prior.A @ cameras[prior.columns]) for prior in self.blocks[1])
         for block in self.blocks[0]:
-            cameras, some = own[block.columns], points[block.points]
-            total += float(cameras @ block.A @ cameras + 2 * some @ (block.E @ cameras) + some @ (block.h * some))
+            own, some = cameras[block.columns], points[block.points]
+            total += float(own @ block.A @ own + 2 * some @ (block.E @ own) + some @ (block.h * some))
         return total
+
+
+Model = DenseModel | SchurModel
+"""Quadratic model of a cost around a state; the cost is infinite where the state is impossible."""

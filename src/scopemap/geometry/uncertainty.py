@@ -31,10 +31,8 @@ def relative_sigma(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndar
 def depth_trust(depth_mm: np.ndarray, sigma_mm: np.ndarray | None, floor_share: float) -> np.ndarray:
     """Return the weight of each pixel's depth relative to the image's median pixel, (H, W) float32, positive.
 
-    (f^2 + m^2) / (f^2 + s^2) with s the pixel's `relative_sigma`, m its median over the image and f the
-    `floor_share`: the minimum relative error of every pixel. That is the inverse variance of both errors together, 1 at
-    the median: sigma in proportion to depth changes nothing, and neither does any sigma where f is large. 1 where sigma
-    is unknown.
+    (f^2 + m^2) / (f^2 + s^2) with s the pixel's `relative_sigma`, m its median over the image and f the `floor_share`,
+    the minimum relative error of every pixel. 1 where sigma is unknown.
     """
     sigma = relative_sigma(depth_mm, sigma_mm)
     known = np.isfinite(sigma)
@@ -68,9 +66,8 @@ def by_variance(weight: np.ndarray, sigma: np.ndarray, sigma_other: np.ndarray) 
 def blended_sigma(weight: np.ndarray, sigma: np.ndarray, sigma_other: np.ndarray) -> np.ndarray:
     """Return the relative sigma of weight * one + (1 - weight) * other, (H, W) float32, their errors correlated.
 
-    weight * sigma + (1 - weight) * sigma_other: the standard deviation of a sum of fully correlated errors, since a
-    network errs alike on neighbouring frames and their mean is no better than they are. The known one where the other
-    is NaN, whatever the weight.
+    weight * sigma + (1 - weight) * sigma_other, since a network errs alike on neighbouring frames. The known one where
+    the other is NaN, whatever the weight.
     """
     one = np.where(np.isfinite(sigma), sigma, sigma_other)
     other = np.where(np.isfinite(sigma_other), sigma_other, sigma)

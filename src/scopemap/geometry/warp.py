@@ -1,4 +1,4 @@
-"""Carrying images and depth from one frame to the next along known correspondences and motion."""
+"""Images and depth warped from one frame to the next along known correspondences and motion."""
 
 from __future__ import annotations
 
@@ -73,21 +73,10 @@ def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
 def moved_depth(
     depth_previous_mm: np.ndarray, to_previous: np.ndarray, camera: PinholeCamera, T_current_previous: np.ndarray
 ) -> np.ndarray:
-    """Return the depth that points, sampled from the previous frame, have as seen from the current camera.
+    """Return the depth (H, W) float32, mm, of the previous frame's points in the current camera; NaN: unknown, behind.
 
-    A warp alone carries values unchanged although the camera moved: here each value becomes a point, the point is
-    moved, and its new depth is what counts.
-
-    Parameters
-    ----------
     depth_previous_mm : (H, W) float32, the previous depth already sampled on the current grid, NaN = unknown.
-    to_previous : (H, W, 2) float32 px, where in the previous image each pixel's depth was sampled.
-    camera : of both frames.
-    T_current_previous : (4, 4) takes points of the previous camera to the current one.
-
-    Returns
-    -------
-    (H, W) float32 in mm, NaN = unknown or behind the camera.
+    to_previous : (H, W, 2) float32 px, where in the previous image each pixel's depth was sampled. camera : of both.
     """
     check_shape("depth_previous_mm", depth_previous_mm, (camera.height, camera.width))
     check_shape("to_previous", to_previous, (camera.height, camera.width, 2))
@@ -97,6 +86,19 @@ def moved_depth(
     y = rays[..., 1] + to_previous[..., 1] / np.float32(camera.fy)
     moved = depth_previous_mm * (slope[0] * x + slope[1] * y + slope[2]) + np.float32(T_current_previous[2, 3])
     return np.where(moved > 0, moved, np.float32(np.nan))
+
+
+def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, C) at places (N, 2) x, y within it, (N, C), bilinear.
+
+    OpenCV's remap is not used: it fails for no points and for more than 32767.
+    """
+    corner = np.clip(np.floor(places).astype(int), 0, [image.shape[1] - 2, image.shape[0] - 2])
+    x, y = corner.T
+    a, b = (places - corner).T[..., None]
+    top = (1 - a) * image[y, x] + a * image[y, x + 1]
+    bottom = (1 - a) * image[y + 1, x] + a * image[y + 1, x + 1]
+    return np.asarray((1 - b) * top + b * bottom)
 
 
 def resampled(values: np.ndarray, camera: PinholeCamera) -> np.ndarray:

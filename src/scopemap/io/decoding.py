@@ -9,7 +9,9 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import warnings
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -119,3 +121,22 @@ def _claimed_pixels(content: bytes) -> float:
         return math.inf
     except Exception:  # damaged headers end in exceptions of any kind
         return 0
+
+
+def frame_number(path: Path) -> int | None:
+    """Return the last number in a file's name, or None."""
+    numbers = re.findall(r"\d+", path.stem)
+    return int(numbers[-1]) if numbers else None
+
+
+def by_number(files: Iterable[Path]) -> dict[int, Path]:
+    """Return files by the last number in their names, ascending; `InputError` without one, or with one twice."""
+    found: dict[int, Path] = {}
+    for file in sorted(file for file in files if file.is_file()):
+        number = frame_number(file)
+        if number is None:
+            raise InputError(f"reading {file}: its name holds no number, which would be the frame's")
+        if number in found:
+            raise InputError(f"reading {file.parent}: {found[number].name} and {file.name} have the same number")
+        found[number] = file
+    return dict(sorted(found.items()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.decoding import decoded, read_decoded
+from scopemap.io.decoding import by_number, decoded, frame_number, read_decoded
 from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -26,12 +26,6 @@ def numeric_order(path: Path) -> list[tuple[int, int, str]]:
     """Sorting key: digits in the name count as numbers, so that 10 comes after 9."""
     parts = re.split(r"(\d+)", path.stem)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
-
-
-def frame_number(path: Path) -> int | None:
-    """Return the last number in a file's name, or None."""
-    numbers = re.findall(r"\d+", path.stem)
-    return int(numbers[-1]) if numbers else None
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -51,19 +45,6 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     None where there is no folder. Raises `InputError` where two images have the same number.
     """
     return by_number(file for file in _images_in(folder) if frame_number(file) is not None)
-
-
-def by_number(files: Iterable[Path]) -> dict[int, Path]:
-    """Return files by the last number in their names, ascending; `InputError` without one, or with one twice."""
-    found: dict[int, Path] = {}
-    for file in sorted(file for file in files if file.is_file()):
-        number = frame_number(file)
-        if number is None:
-            raise InputError(f"reading {file}: its name holds no number, which would be the frame's")
-        if number in found:
-            raise InputError(f"reading {file.parent}: {found[number].name} and {file.name} have the same number")
-        found[number] = file
-    return dict(sorted(found.items()))
 
 
 def read_image(file: Path) -> np.ndarray | None:

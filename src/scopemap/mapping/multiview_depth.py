@@ -19,6 +19,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.flow.estimator import FlowEstimator
+from scopemap.geometry.local_contrast import local_contrast, local_mean
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.triangulation import (
     VIEW_SIGMA,
@@ -86,10 +87,8 @@ class _Estimate(NamedTuple):
 def normalised_contrast(rgb: np.ndarray) -> np.ndarray:
     """Return grey values (H, W, 3) uint8 without local mean and contrast, so that lamp and exposure cancel."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), _CONTRAST_PX)
-    spread = np.sqrt(cv2.GaussianBlur(centred**2, (0, 0), _CONTRAST_PX))
-    normalised = np.clip(128 + 40 * centred / (spread + 2), 0, 255).astype(np.uint8)
-    return cv2.merge([normalised] * 3)
+    contrast = local_contrast(grey - local_mean(grey, _CONTRAST_PX), _CONTRAST_PX, unit=40.0, least=2.0)
+    return cv2.merge([np.clip(128 + contrast, 0, 255).astype(np.uint8)] * 3)
 
 
 def choose_neighbours(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from functools import cached_property
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import MaskSettings
 from scopemap.errors import InputError, SettingsError
-from scopemap.io.decoding import read_decoded
+from scopemap.io.decoding import by_number, frame_number, read_decoded
 from scopemap.masking.masker import disc
 from scopemap.notices import Notice
 
@@ -102,14 +101,9 @@ def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:
         raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
     files = (file for file in sorted(folder.iterdir()) if not file.name.startswith("."))
     images = [file for file in files if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
-    found: dict[int, Path] = {}
-    for file in images:
-        for number in map(int, re.findall(r"\d+", file.stem)[-1:]):
-            if number in found:
-                raise InputError(f"two masks for frame {number} in {folder}: {found[number].name} and {file.name}")
-            found[number] = file
-    if found:
-        return found, None
+    numbered = [file for file in images if frame_number(file) is not None]
+    if numbered:
+        return by_number(numbered), None
     if len(images) == 1:
         return {}, images[0]
     raise InputError(

@@ -36,8 +36,8 @@ _NEAR_SHARE, _RIM_SHARE = 0.02, 0.008
 class FieldOfView:
     """The convex hull (circle, octagon and rectangle are convex) of the largest area that was lit in any frame so far.
 
-    Dark tissue in the lumen is thus not taken for the surround. The hull is shrunk by `BORDER_PX`, from pixels that the
-    rectification could not fill too, but not from the image's own edge.
+    Dark tissue in the lumen is thus not taken for the surround. The hull is shrunk by `BORDER_PX`, and keeps
+    as far from pixels that the rectification could not fill, but not from the image's own edge.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class FieldOfView:
 
 
 def hull_of_largest(lit: np.ndarray) -> np.ndarray:
-    """Return the convex hull, (H, W) bool, of the largest component; all of the image where that is hardly anything."""
+    """Return the convex hull, (H, W) bool, of the largest component; all of the image where that is tiny."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8))
     areas = stats[1:, cv2.CC_STAT_AREA]
     if areas.size == 0 or areas.max() < _MIN_FIELD_SHARE * lit.size:
@@ -78,7 +78,7 @@ class StoredMasks(Protocol):
 
     @property
     def notices(self) -> list[Notice]:
-        """What is to be said about the masks read so far."""
+        """Notices about the masks read so far."""
         ...
 
     def covered(self, index: int) -> np.ndarray | None:
@@ -106,9 +106,8 @@ class Masker:
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.
 
-        Under-exposed is a pixel whose brightest channel is at most `dark_level`, its own or the mean around it: noise
-        lifts single pixels of a black image. Over-exposed is one whose second brightest channel reaches
-        `BRIGHT_LEVEL`: red alone clips on sound tissue, and leaves two channels to see by.
+        Under-exposed is a pixel whose brightest channel, or the mean around it, is at most `dark_level`; over-exposed
+        one whose second brightest channel reaches `BRIGHT_LEVEL`: red alone clips on sound tissue.
         """
         darkest, middle = _darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
@@ -131,10 +130,9 @@ class Masker:
         return replace(frame, valid=valid & field, highlights=highlights)
 
     def instruments(self, probability: np.ndarray | None) -> np.ndarray | None:
-        """Return the instruments, (H, W) bool, of the frame that was masked last; None where nobody is to find them.
+        """Return the instruments, (H, W) bool, of the frame that was masked last; None where none are looked for.
 
-        probability : (H, W), 0..1, of each pixel of it. They are widened by a rim, which is blurred, and held where
-        those of the frame before were.
+        probability : (H, W), 0..1. They are widened by a rim, and held where those of the frame before were.
         """
         if probability is None or self.settings.instruments != "auto" or self._from_file:
             self._instruments = None
@@ -164,9 +162,8 @@ def without_instruments(frame: Frame, instruments: np.ndarray) -> Frame:
 def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:
     """Return specular highlights, (H, W) bool.
 
-    Tissue is red, a mirror image of the lamp is white: the darkest channel, (H, W) uint8, stands out from its local
-    median, 1.5 times as bright. What is outside `field`, (H, W) bool, takes no part: it would make a highlight of
-    the rim.
+    Tissue is red, a mirror image of the lamp is white: the darkest channel, (H, W) uint8, is 1.5 times as bright as its
+    local median in `field`, (H, W) bool.
     """
     if not field.any():
         return np.zeros_like(field)

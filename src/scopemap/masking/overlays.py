@@ -49,10 +49,10 @@ class _Found:
 class OverlayFinder:
     """Detects static edges in a sequence of images of one size while the camera moves.
 
-    It keeps a running mean of the image and of the absolute deviation from it. An image is used once the texture has
-    changed in most parts of the field since the last one used. A static edge is an overlay only where its surroundings
-    are not static, so tissue at rest is not masked. Nothing is found before 12 images; the memory is 40 images.
-    Transparent overlays, and overlays whose content changes all the time, are not found.
+    It keeps a running mean of the image and of the deviation from it, over 40 images; nothing is found before 12. An
+    image is used once the texture has changed in most parts of the field since the last one used. A static edge is an
+    overlay only where its surroundings are not static, so tissue at rest is not masked. Transparent overlays, and
+    overlays whose content changes all the time, are not found.
     """
 
     def __init__(self) -> None:

@@ -15,7 +15,7 @@ from scopemap.config import Config
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.errors import SettingsError
 from scopemap.estimators import OwnEstimators, scale_facts
-from scopemap.flow.own import OwnFlow
+from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.io.sequence import Sequence

@@ -16,10 +16,13 @@ import numpy as np
 import onnxruntime
 
 from scopemap.errors import WeightsError
+from scopemap.flow.corners import usable_pixels
 from scopemap.frame import Frame
+from scopemap.geometry.local_contrast import local_mean
+from scopemap.geometry.warp import bilinear
 from scopemap.io.inference import open_network
 from scopemap.io.weights import sha256_of
-from scopemap.tracking.features import Features, points_at, usable_pixels
+from scopemap.tracking.features import Features, points_at
 
 STRIDE = 32  # of the network: both sides of its input are multiples
 _NETWORK = "alike.onnx"
@@ -45,10 +48,6 @@ class AlikeFeatures:
         scores, maps, head = network_answer(evenly_lit(frame.rgb))
         scores = scores[:height, :width]
         pixels = _keypoints(scores, usable_pixels(frame.valid))
-        if not len(pixels):
-            return Features(
-                np.zeros((0, 2)), np.zeros((0, len(head)), np.float32), np.zeros((0, 3)), max_ratio=self.max_ratio
-            )
         descriptors = descriptors_at(pixels, maps, head)
         return Features(pixels, descriptors, points_at(pixels, frame.depth_mm, frame.camera), max_ratio=self.max_ratio)
 
@@ -61,15 +60,11 @@ class AlikeFeatures:
 
 
 def evenly_lit(rgb: np.ndarray) -> np.ndarray:
-    """Return a picture (H, W, 3) uint8 over its local brightness: the lamp moves with the camera, the tissue does not.
-
-    What was a dark lumen is matched with the bright wall that it becomes.
-    """
-    height, width = rgb.shape[:2]
+    """Return a picture (H, W, 3) uint8 over its local brightness: a dark lumen matches the bright tissue it becomes."""
+    width = rgb.shape[1]
     brightest = cv2.max(cv2.max(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
-    size = (max(1, width // _LOW_RESOLUTION), max(1, height // _LOW_RESOLUTION))
-    small = cv2.resize(brightest, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    local = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(_EVEN_SHARE * size[0], 1.0)), (width, height))
+    sigma_px = _LOW_RESOLUTION * max(_EVEN_SHARE * (width // _LOW_RESOLUTION), 1.0)
+    local = local_mean(brightest, sigma_px, downscale=_LOW_RESOLUTION)
     return np.clip(rgb * (_EVEN_LEVEL / (local + _DARKEST))[..., None], 0, 255).astype(np.uint8)
 
 
@@ -93,19 +88,9 @@ def descriptors_at(pixels: np.ndarray, maps: list[np.ndarray], head: np.ndarray)
     for features in maps:
         # The corners of all scales lie on each other, as in the network's training.
         last = np.array([features.shape[2] - 1, features.shape[1] - 1])
-        parts.append(_sampled(features, pixels * last / [width - 1, height - 1]))
+        parts.append(bilinear(np.moveaxis(features, 0, -1), pixels * last / [width - 1, height - 1]))
     descriptors = np.concatenate(parts, 1) @ head.T
     return (descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)).astype(np.float32)
-
-
-def _sampled(features: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return features (C, h, w) at places (N, 2) x, y within them, (N, C), bilinear."""
-    corner = np.clip(np.floor(places).astype(int), 0, [features.shape[2] - 2, features.shape[1] - 2])
-    x, y = corner.T
-    a, b = (places - corner).T
-    top = (1 - a) * features[:, y, x] + a * features[:, y, x + 1]
-    bottom = (1 - a) * features[:, y + 1, x] + a * features[:, y + 1, x + 1]
-    return np.asarray(((1 - b) * top + b * bottom).T)
 
 
 def _keypoints(scores: np.ndarray, usable: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from scopemap.config import TrackingSettings
 from scopemap.flow.corners import KeyframeMatcher
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
-from scopemap.tracking.reprojection import nonrigidity
+from scopemap.tracking.corner_pose import nonrigidity
 from scopemap.tracking.track import FrameTracker, Track
 
 

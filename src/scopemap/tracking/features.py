@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.flow.corners import usable_pixels
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import se3, so3_exp
 
 _MAX_FEATURES = 500
 _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
 _MAX_EDGE_RATIO = 15.0
-_BORDER_PX = 3
 _MAX_RATIO = 0.8  # Lowe's ratio test
 _MAX_ITERATIONS = 500
 _CONFIDENCE = 0.999
@@ -30,8 +30,6 @@ _INLIER_SHARE = 1 / 80  # largest reprojection error of an inlier, share of the 
 class Features:
     """Features of a frame, strongest first.
 
-    Attributes
-    ----------
     pixels : (N, 2) float64 x, y. descriptors : (N, D) float32 of unit length. points_mm : (N, 3) float64 in the
     camera frame, NaN where the depth is unknown. max_ratio : of the distances to the nearest and to the second nearest
     descriptor, above which a feature is not matched; 1: mutual nearest neighbours are matched however close others are.
@@ -44,7 +42,7 @@ class Features:
 
 
 class FeatureDetector(Protocol):
-    """Protocol of what detects features: `SiftFeatures` and `AlikeFeatures`; any thread may call it."""
+    """Protocol of `SiftFeatures` and `AlikeFeatures`; any thread may call it."""
 
     name: str
     descriptor_size: int
@@ -64,8 +62,16 @@ class SiftFeatures:
     name, descriptor_size, max_ratio = "sift", 128, _MAX_RATIO
 
     def detect(self, frame: Frame) -> Features:
-        """Return features in the usable pixels of a frame, with depth where the frame has it."""
-        return detect_features(frame)
+        """Return at most 500 features in the usable pixels of a frame, with depth where the frame has it."""
+        sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST, edgeThreshold=_MAX_EDGE_RATIO)
+        usable = 255 * usable_pixels(frame.valid).astype(np.uint8)
+        corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), usable)
+        if descriptors is None:
+            return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
+        order = np.argsort([-corner.response for corner in corners], kind="stable")
+        pixels = np.array([corner.pt for corner in corners], dtype=np.float64)[order]
+        rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
+        return Features(pixels, rooted.astype(np.float32), points_at(pixels, frame.depth_mm, frame.camera))
 
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""
@@ -74,45 +80,20 @@ class SiftFeatures:
 
 @dataclass(frozen=True)
 class RelativePose:
-    """Relative pose of two frames and its inlier matches.
+    """Relative pose (4, 4), mm of the reference's depth, and its inliers.
 
-    Attributes
-    ----------
-    T_current_reference : (4, 4), mm of the reference's depth. pairs : (M, 2) int, indices of the inlier
-    features in the reference and in the current frame.
+    pairs : (M, 2) int, indices of the inlier features in the reference and in the current frame.
     """
 
     T_current_reference: np.ndarray
     pairs: np.ndarray
 
 
-def detect_features(frame: Frame) -> Features:
-    """Return at most 500 RootSIFT features in the usable pixels of a frame, with depth where the frame has it."""
-    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST, edgeThreshold=_MAX_EDGE_RATIO)
-    usable = 255 * usable_pixels(frame.valid).astype(np.uint8)
-    corners, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), usable)
-    if descriptors is None:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
-    order = np.argsort([-corner.response for corner in corners], kind="stable")
-    pixels = np.array([corner.pt for corner in corners], dtype=np.float64)[order]
-    rooted = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
-    return Features(pixels, rooted.astype(np.float32), points_at(pixels, frame.depth_mm, frame.camera))
-
-
-def usable_pixels(valid: np.ndarray) -> np.ndarray:
-    """Return where features may be, (H, W) bool: those at the edge of a mask or a highlight are not the tissue's."""
-    border = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(valid.astype(np.uint8), border, borderValue=0) > 0)
-
-
 def points_at(pixels: np.ndarray, depth_mm: np.ndarray | None, camera: PinholeCamera) -> np.ndarray:
     """Return the points (N, 3) mm in the camera at pixels (N, 2); NaN where the depth (H, W), mm, is unknown."""
     column, row = np.clip(np.rint(pixels).astype(int), 0, [camera.width - 1, camera.height - 1]).T
     known_mm = np.full(len(pixels), np.nan) if depth_mm is None else depth_mm[row, column]
-    ray = np.column_stack(
-        [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(pixels))]
-    )
-    return known_mm[:, None].astype(np.float64) * ray
+    return known_mm[:, None].astype(np.float64) * camera.unproject(pixels)
 
 
 def match_features(reference: Features, current: Features) -> np.ndarray:
@@ -142,22 +123,22 @@ def relative_pose_pnp(
     pairs = pairs[np.isfinite(reference.points_mm[pairs[:, 0]]).all(1)]
     if len(pairs) < max(min_inliers, 6):
         return None
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     points, pixels = reference.points_mm[pairs[:, 0]], current.pixels[pairs[:, 1]]
-    max_error_px = _INLIER_SHARE * camera.width
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points,
         pixels,
-        K,
+        camera.matrix,
         None,
         iterationsCount=_MAX_ITERATIONS,
-        reprojectionError=max_error_px,
+        reprojectionError=_INLIER_SHARE * camera.width,
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_P3P,
     )
     if not found or inliers is None or len(inliers) < min_inliers:
         return None
     inliers = inliers.ravel()
-    rotation, translation = cv2.solvePnPRefineLM(points[inliers], pixels[inliers], K, None, rotation, translation)
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[inliers], pixels[inliers], camera.matrix, None, rotation, translation
+    )
     T = se3(so3_exp(rotation.ravel()), translation.ravel())
     return RelativePose(T, pairs[inliers]) if np.isfinite(T).all() else None

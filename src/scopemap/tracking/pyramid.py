@@ -11,6 +11,7 @@ from numba import njit
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import TrackingSettings
 from scopemap.frame import Frame
+from scopemap.geometry.local_contrast import local_contrast, local_mean
 from scopemap.tracking.residuals import View
 
 _GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
@@ -52,15 +53,8 @@ def build_pyramid(
             camera = camera.resized(width, height)
         if level >= finest:
             slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
-            views.append(
-                View(
-                    _channels(grey, weight),
-                    weight,
-                    depth,
-                    slope,
-                    np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-                )
-            )
+            intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+            views.append(View(_channels(grey, weight), weight, depth, slope, intrinsics))
     return views
 
 
@@ -77,8 +71,10 @@ def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
 
 
 def _channels(grey: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Grey values and locally normalised grey values, (2, H, W) float32."""
-    return np.stack([grey / _GREY_UNIT, _normalised(grey, weight)]).astype(np.float32)
+    """Grey values, and those less their local mean over their local deviation, (2, H, W) float32."""
+    detail = (grey - local_mean(grey, _NORMALISE_SIGMA_PX, weight)) * weight
+    normalised = local_contrast(detail, _NORMALISE_SIGMA_PX, weight, noise=_NOISE_LEVEL)
+    return np.stack([grey / _GREY_UNIT, normalised]).astype(np.float32)
 
 
 def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -107,12 +103,3 @@ def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
             if count > 0:
                 out[row, column] = total / count
     return out
-
-
-def _normalised(grey: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Grey values minus their local mean, over their local deviation, both over usable pixels only."""
-    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), _NORMALISE_SIGMA_PX), 1e-6)
-    mean = cv2.GaussianBlur(grey * weight, (0, 0), _NORMALISE_SIGMA_PX) / share
-    high_pass = (grey - mean) * weight
-    variance = cv2.GaussianBlur(high_pass * high_pass, (0, 0), _NORMALISE_SIGMA_PX) / share
-    return high_pass / np.sqrt(variance + _NOISE_LEVEL**2)

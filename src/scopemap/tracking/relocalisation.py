@@ -1,59 +1,37 @@
-"""What becomes of a lost camera: features find it again in known keyframes; until then its rotation is followed."""
+"""Relocalisation of a lost camera in known keyframes; until then, in a close-up, its rotation is followed."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import TrackingSettings
-from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.flow.corners import Correspondences2D3D
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
+from scopemap.tracking.corner_pose import pose_from_correspondences, reprojection_error_px
 from scopemap.tracking.features import FeatureDetector, Features, RelativePose, points_at, relative_pose_pnp
-from scopemap.tracking.reprojection import pose_from_correspondences, reprojection_error_px
-from scopemap.tracking.residuals import View
+from scopemap.tracking.keyframe_alignment import Keyframe
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
-_EARLIER_KEYFRAMES = 64
-_MAX_APART, _NEARER = 0.3, 0.7  # distance of a passed keyframe's view, at most, and over that of the current one
-_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less shows one wall alone
+_MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
+_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
 _EVERY_PX, _RANGE = 4, (5, 95)
 # Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
 _FLOW_EVERY_PX, _FOLLOWED_COVERAGE, _FOLLOWED_ERROR = 8, 0.25, 0.01
-_DEPTH_SIGMA = 0.2  # relative standard deviation of the wall's shape
+_DEPTH_SIGMA = 0.2  # relative standard deviation of depth in a close-up
 _MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
 
 
-@dataclass(frozen=True)
-class Keyframe:
-    """A frame with depth that later frames are aligned to.
-
-    Attributes
-    ----------
-    frame : with `depth_mm`. T_world_camera : (4, 4), in the world of its map. pyramid : of the frame, with depth.
-    depth_mm : mean depth. measured : whether the depth is measured, not predicted. map : number of its map.
-    """
-
-    frame: Frame
-    T_world_camera: np.ndarray
-    pyramid: list[View]
-    depth_mm: float
-    measured: bool
-    map: int
-
-
 def is_close_up(frame: Frame, keyframe: Keyframe) -> bool:
-    """Whether a frame shows nothing but one near wall, by its predicted depth: it hardly varies beside the keyframe's.
-
-    How near the wall is depth networks do not tell; where depth is measured it is no reason to be lost.
-    """
+    """Return whether a frame's predicted depth hardly varies beside the keyframe's: a close-up without structure."""
     if keyframe.measured or frame.depth_mm is None:
         return False
     return _log_depth_range(frame) < _CLOSE_UP_RANGE * _log_depth_range(keyframe.frame)
@@ -80,44 +58,30 @@ def depth_ratio(keyframe: Keyframe, frame: Frame, T_world_camera: np.ndarray) ->
     return float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else float("nan")
 
 
-class EarlierKeyframes:
-    """Earlier keyframes of the current map, 64 at most, that the camera may come back to."""
+def nearer_keyframe(keyframes: Iterable[Frame], T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
+    """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
 
-    def __init__(self) -> None:
-        self._frames: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
+    The distance of two views is the rotation, rad, plus the translation over the scene's depth.
+    """
 
-    def add(self, frame: Frame) -> None:
-        """Add a keyframe with its pose and its depth."""
-        self._frames.append(replace(frame, depth_sigma_mm=None))
+    def distance(T_world_other: np.ndarray | None) -> float:
+        assert T_world_other is not None
+        T = inverse(T_world_other) @ T_world_camera
+        return float(rotation_angle_rad(T[:3, :3])) + float(np.linalg.norm(T[:3, 3])) / current.depth_mm
 
-    def clear(self) -> None:
-        """Forget them: the world is another one."""
-        self._frames.clear()
-
-    def nearer(self, T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
-        """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
-
-        The distance of two views is the turn, rad, plus the way over the scene's depth.
-        """
-
-        def distance(T_world_other: np.ndarray | None) -> float:
-            assert T_world_other is not None
-            T = inverse(T_world_other) @ T_world_camera
-            return float(rotation_angle_rad(T[:3, :3])) + float(np.linalg.norm(T[:3, 3])) / current.depth_mm
-
-        nearest = min(self._frames, key=lambda frame: distance(frame.T_world_camera), default=None)
-        if nearest is None or nearest.index == current.frame.index:
-            return None
-        limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
-        return nearest if distance(nearest.T_world_camera) <= limit else None
+    nearest = min(keyframes, key=lambda frame: distance(frame.T_world_camera), default=None)
+    if nearest is None or nearest.index == current.frame.index:
+        return None
+    limit = min(_MAX_APART, _NEARER * distance(current.T_world_camera))
+    return nearest if distance(nearest.T_world_camera) <= limit else None
 
 
 class RotationFollower:
-    """Follows the rotation of a lost camera from frame to frame, where a wall fills the picture: its position is held.
+    """Follows the rotation of a lost camera from frame to frame in a close-up; its position is not known.
 
-    Near a wall translation moves the picture as much as rotation does, so that a rotation alone does not explain the
-    flow. The wall's predicted depth has a shape, but no scale: PnP of the last frame's points gives the rotation, and a
-    translation of which nothing is kept. Where flow matches little, or does not fit, the rotation is lost, too.
+    In a close-up translation moves the picture as much as rotation does. Predicted depth has a shape there, but no
+    scale: PnP of the last frame's points gives the rotation, and a translation that is dropped. Where flow matches
+    little, or does not fit, the rotation is lost, too.
     """
 
     def __init__(self) -> None:
@@ -170,20 +134,23 @@ class Relocaliser:
         self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
         self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
+        self._frames_of_map: Counter[int] = Counter()
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of the current map."""
         self._keyframes.append(keyframe)
 
-    def enter_map(self, number: int, frames: Counter[int]) -> None:
-        """Make a map the current one; `frames` counts the tracked frames per map, and maps of few are dropped."""
-        known = [*self._of_other_maps, *self._keyframes]
+    def count(self, number: int) -> None:
+        """Count a tracked frame of a map."""
+        self._frames_of_map[number] += 1
+
+    def enter_map(self, number: int) -> None:
+        """Make a map the current one; others with few tracked frames are dropped."""
+        known, frames = [*self._of_other_maps, *self._keyframes], self._frames_of_map
         self._keyframes.clear()
         self._of_other_maps.clear()
         self._keyframes.extend(keyframe for keyframe in known if keyframe.map == number)
-        self._of_other_maps.extend(
-            keyframe for keyframe in known if keyframe.map != number and frames[keyframe.map] >= _MIN_MAP_FRAMES
-        )
+        self._of_other_maps.extend(k for k in known if k.map != number and frames[k.map] >= _MIN_MAP_FRAMES)
 
     def find(
         self,

@@ -35,8 +35,6 @@ _MAX_DEPTH_DIFFERENCE = 0.1  # of associated points, relative
 class View(NamedTuple):
     """One image of one pyramid level, the input of the kernels.
 
-    Attributes
-    ----------
     channels : (C, H, W) float32; `Loss` has the parameters of each.
     weight : (H, W) float32, 0 where a pixel must not be used; the current image's 0 or 1.
     slope : (H, W, 2) float32, 1/mm: derivative of inverse depth along the ray's x and y; 0 = parallel to the image,
@@ -55,8 +53,6 @@ class View(NamedTuple):
 class Loss(NamedTuple):
     """Robust loss of each channel: 0.5 (r/s)^2 for |r| <= threshold * s, linear beyond (Huber).
 
-    Attributes
-    ----------
     sigma : (C,) float64, robust standard deviation s of each channel's residuals. threshold : in units of s.
     share : (C,) float64, weight of each channel.
     lit : (C,) bool, whether gain, bias and the lamp apply to the channel. gamma : exponent of the lamp, 0 = no lamp.
@@ -75,8 +71,6 @@ class Loss(NamedTuple):
 class NormalEquations(NamedTuple):
     """Weighted means over the pixels that project into the current image.
 
-    Attributes
-    ----------
     hessian : (8, 8) float64, mean of w J^T J. gradient : (8,) float64, mean of w J^T r.
     cost : mean loss. weight : sum of the pixels' weights.
     """

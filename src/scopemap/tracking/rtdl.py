@@ -44,16 +44,14 @@ class Motion(NamedTuple):
 class Alignment:
     """Relative pose of two frames, and how well it fits their images.
 
-    Attributes
-    ----------
-    motion : relative pose and brightness. residual : robust standard deviation of the normalised channel's residuals
-    at the finest level, in local deviations of the grey value.
+    residual : robust standard deviation of the normalised channel's residuals at the finest level, in local deviations.
     inlier_share : share of the used pixels whose residual is below half a local deviation. correlation : -1..1, of
     both frames' normalised channel over these pixels; near 0 for noise, however well that fits.
     texture : root mean square of that channel in the reference, 1 where tissue has texture everywhere.
     overlap : share of the reference's usable pixels that project into usable pixels. iterations : over all levels.
-    is_supported : whether matched corners confirm the motion. matches : inliers of the features that it was found by.
-    nonrigidity : as `tracking.track.Track` has it.
+    is_supported : whether matched corners confirm the motion. coverage : share of the keyframe's corners that are
+    matched, 1 where they are not used. matches : inliers of the features that it was found by. nonrigidity : as in
+    `Track`.
     """
 
     motion: Motion
@@ -64,6 +62,7 @@ class Alignment:
     overlap: float
     iterations: int
     is_supported: bool = False
+    coverage: float = 1.0
     matches: int = 0
     nonrigidity: np.ndarray | None = None
 

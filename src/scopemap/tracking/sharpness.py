@@ -1,4 +1,4 @@
-"""Sharpness of a frame against the recent frames, and what its picture is worth: blur, smoke and fluid reduce both."""
+"""Sharpness of a frame against the recent frames, and its image quality: blur, smoke and fluid reduce both."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from collections import deque
 import cv2
 import numpy as np
 
+from scopemap.geometry.local_contrast import local_mean
+
 _FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
 _FRAMES = 30
-# What its picture is worth is measured in a small copy, against the upper quartile of so many frames: unlike their
-# median, it is still that of clear ones where fluid stays for seconds.
+# Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
+# that of clear ones where fluid stays for seconds.
 _SMALL_PX, _NEIGHBOURS, _CLEAR_PERCENTILE = 320, 100, 75
 _LEAST_QUALITY = 0.01
 
 
 class SharpnessMonitor:
-    """Compares the sharpness of frames, in order, with the median of the last 30.
-
-    Unsharp frames count among those 30, too, so that a camera that approached a bare wall is soon usual again.
-    """
+    """Compares the sharpness of frames, in order, with the median of the last 30, unsharp ones included."""
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=_FRAMES)
@@ -33,7 +32,7 @@ class SharpnessMonitor:
 
 
 class PictureQuality:
-    """What the pictures of frames, in order, are worth beside those of the last 100.
+    """Image quality of frames, in order, beside that of the last 100.
 
     The product of three shares, each 1 at most, of the upper quartile of these frames: sharpness; usable pixels, which
     are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white.
@@ -69,12 +68,6 @@ def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
 def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:
     """Return the mean local contrast of an image (H, W, 3) uint8 over valid pixels (H, W), relative to brightness."""
     grey, valid = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), valid.astype(np.float32)
-    fine, coarse = (_blurred(grey, valid, share * grey.shape[1]) for share in (_FINE, _COARSE))
+    fine, coarse = (local_mean(grey, share * grey.shape[1], valid) for share in (_FINE, _COARSE))
     brightness = float((coarse * valid).sum())
     return float((np.abs(fine - coarse) * valid).sum()) / brightness if brightness > 0 else 0.0
-
-
-def _blurred(grey: np.ndarray, valid: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Gaussian mean over the usable pixels alone."""
-    weight = cv2.GaussianBlur(valid, (0, 0), sigma_px)
-    return cv2.GaussianBlur(grey * valid, (0, 0), sigma_px) / np.maximum(weight, 1e-3)

@@ -7,39 +7,14 @@ the tracker does not use the smoothed poses. The mean lags behind a moving camer
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from scopemap.config import SmoothingSettings
 from scopemap.geometry.se3 import mean_near
 
 
-class Smoother(Protocol):
-    """Poses in, smoothed poses out, one at a time."""
-
-    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
-        """Return the smoothed pose (4, 4) of the newest frame, given its estimate (4, 4)."""
-        ...
-
-    def reset(self) -> None:
-        """Let the next pose start without a past: between it and the last one frames were lost."""
-        ...
-
-
-class NoSmoothing:
-    """Leaves poses as they are."""
-
-    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
-        """Return the pose unchanged."""
-        return T_world_camera
-
-    def reset(self) -> None:
-        """Do nothing: there is no past."""
-
-
 class Wema:
-    """Weighted exponential moving average of the last three poses."""
+    """Weighted exponential moving average of the last three poses; without effect where `settings.method` is "none"."""
 
     def __init__(self, settings: SmoothingSettings) -> None:
         self.settings = settings
@@ -50,7 +25,7 @@ class Wema:
         """Return the smoothed pose; the first two, also after `reset`, have too short a past and stay as they are."""
         settings, past = self.settings, self._past
         smoothed = T_world_camera
-        if len(past) == 2:
+        if len(past) == 2 and settings.method != "none":
             s = 1.0 - np.exp(-self._count * settings.omega) if settings.dynamic else 1.0
             weights = [s * settings.alpha, s * settings.beta, s * settings.gamma]
             # What is left, 1 - s, is the newest pose's too: it is the base of the tangent space.
@@ -62,8 +37,3 @@ class Wema:
     def reset(self) -> None:
         """Let the next pose start without a past; s goes on growing."""
         self._past = []
-
-
-def create_smoother(settings: SmoothingSettings) -> Smoother:
-    """Return the smoother that `settings.method` names."""
-    return Wema(settings) if settings.method == "wema" else NoSmoothing()

@@ -13,7 +13,7 @@ from scopemap.trajectory.causes import LossCause
 
 Status = Literal["initial", "ok", "lost", "other-map", "rotation-only"]
 
-_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image that is hardly usable
+_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image with few usable pixels
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
@@ -29,23 +29,15 @@ class TrackingLoss(NamedTuple):
 class Track:
     """Tracking result of one frame: its pose, or the reason why it is lost.
 
-    Attributes
-    ----------
-    index : number of the frame.
-    status : "initial" for the frame that fixes the world of its map, "ok", or "lost". Trackers do not give
-        "other-map" and "rotation-only": in the records of a result these mark frames that were tracked in another
-        submap, and lost ones whose rotation was followed.
+    status : "initial" for the frame that fixes the world of its map, "ok", or "lost". In the records of a result, also
+        "other-map", tracked in another submap, and "rotation-only", lost and its rotation followed.
     reason : one phrase; for a lost frame, what was wrong. cause : of the loss, as the tracker judged it.
-    relocalised : whether features found the lost camera again in this frame.
-    T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose.
-    keyframe : number of the frame it was aligned to.
-    residual : robust standard deviation of the photometric residual, NaN if there was none.
-    inlier_share, correlation, overlap : see `rtdl.Alignment`; NaN if there was no alignment.
-    iterations : dog-leg steps over all levels. map : number of the map that the pose is in; each has its own world.
-    depth_ratio : where features found the camera again after a wall, the keyframe's depth over the frame's own; NaN
-        elsewhere.
-    rotation : (3, 3) of a lost frame whose rotation alone was followed, from its camera to that of the last tracked
-        frame; None: it is not known.
+    relocalised : whether features found the lost camera in this frame.
+    T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose. keyframe : number of its reference.
+    residual, inlier_share, correlation, overlap, iterations : see `rtdl.Alignment`; NaN if there was no alignment.
+    map : number of the map that the pose is in; each has its own world.
+    depth_ratio : where the camera is found after a close-up, the keyframe's depth over the frame's own; NaN elsewhere.
+    rotation : (3, 3) of a lost frame, from its camera to that of the last tracked frame; None: not known.
     usable : share of the image that shows tissue. sharpness : that of the image over the usual one. motion : median
         optical flow since the frame before, share of the width. quality : see `Frame`. NaN where they are not known.
     nonrigidity : `REGIONS` float32, by how many standard deviations the tissue in each region of the picture moves
@@ -90,7 +82,7 @@ class Track:
 
 
 def unusable(frame: Frame) -> TrackingLoss:
-    """Return why hardly a pixel of an image is usable: it is dark, overexposed, or something covers the view."""
+    """Return why few pixels of an image are usable: it is dark, overexposed, or something covers the view."""
     low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
     reason = f"only {frame.valid.mean():.0%} of the image is usable"
     if middle < _DARK_LEVEL:

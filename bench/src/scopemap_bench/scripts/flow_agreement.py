@@ -18,7 +18,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.options import parse_settings
 from scopemap.config import Config
-from scopemap.depth.correspondence import DenseCorrespondence
+from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence

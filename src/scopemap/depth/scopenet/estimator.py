@@ -101,14 +101,10 @@ def _answer(session: onnxruntime.InferenceSession, planes: np.ndarray) -> tuple[
     padded = np.pad(planes, ((0, 0), (0, -height % STRIDE), (0, -width % STRIDE)))
     answer, *others = session.run(None, {_INPUT: padded[None]})
     depth: np.ndarray = answer[0, :, :height, :width]
-    if not _finds_instruments(session):
+    if INSTRUMENTS not in [output.name for output in session.get_outputs()]:
         return depth, None
     instruments = cv2.resize(others[0][0, 0], padded.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
     return depth, np.asarray(instruments[:height, :width])
-
-
-def _finds_instruments(session: onnxruntime.InferenceSession) -> bool:
-    return INSTRUMENTS in [output.name for output in session.get_outputs()]
 
 
 def _missing(file: Path) -> str:

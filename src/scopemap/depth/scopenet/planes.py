@@ -8,14 +8,14 @@ import numpy as np
 from scopemap.errors import check_shape
 
 PLANES = 8
-INSTRUMENTS = "instruments"  # the name of the output that tells them
+INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3
 _LEVEL = np.arange(256) / 255
-# IEC 61966-2-1, one entry for each 8-bit level.
-_LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
-_HALF_LINEAR = (0.5 * _LINEAR).astype(np.float32)
+LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
+"""Linear brightness, 0..1, of each 8-bit level of sRGB (IEC 61966-2-1)."""
+_HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)
 
 
 def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from scopemap.geometry.least_squares import robust_sigma
+from scopemap.geometry.local_contrast import local_mean
 
 Layout = Literal["left-right", "top-bottom"]
 
@@ -206,9 +207,7 @@ def _tiles(first: np.ndarray, second: np.ndarray, shift: tuple[int, int]) -> lis
 def _detail(grey: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, float]:
     """Return a view (h, w) less its local mean, clipped, 0 where it is not used, and the share that is."""
     sigma_px = _DETAIL_SHARE * _WIDTH_PX
-    weight = cv2.GaussianBlur(used, (0, 0), sigma_px)
-    mean = cv2.GaussianBlur(grey * used, (0, 0), sigma_px) / np.maximum(weight, 1e-6)
-    detail = (grey - mean) * used
+    detail = (grey - local_mean(grey, sigma_px, used)) * used
     # By the median: few bright pixels must not widen what they are clipped to.
     deviation = robust_sigma(detail[used > 0])
     most = _MOST_DEVIATIONS * max(deviation, 1.0)

@@ -1,4 +1,4 @@
-"""Depth by a function of the caller's own, checked at the door."""
+"""Depth by a function of the caller, checked."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ class OwnDepth:
 
     function : takes (H, W, 3) uint8 sRGB, the rectified picture at the working size; returns (H, W) of a float dtype,
         NaN = unknown. It is called from one thread.
-    kind : what it returns. "disparity": unitless, >= 0, larger is nearer, known up to scale and shift. "metric":
-        predicted depth along the optical axis, mm, > 0, whose scale may change from frame to frame. "measured": depth,
-        mm, > 0, taken as it is.
+    kind : what it returns. "disparity": >= 0, larger is nearer, known up to scale and shift. "metric": predicted depth
+        along the optical axis, mm, > 0, whose scale may change from frame to frame. "measured": depth, mm, > 0.
     name : how results name it.
 
     Raises `SettingsError` for another kind and for what is no function. `estimate` raises `InputError` where the
