@@ -251,7 +251,7 @@ def test_a_picture_of_another_size_than_the_header_says_is_left_out(tmp_path: Pa
 
 
 def test_only_single_images_are_limited_in_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.io.datasets.dicom_files._MOST_IMAGE_BYTES", 100)
+    monkeypatch.setattr("scopemap.io.datasets.dicom._MOST_IMAGE_BYTES", 100)
     assert len(pictures(native(tmp_path / "a.dcm", film()))) == 4
     with pytest.raises(InputError, match="one image: it holds 0 MB, expected 0 MB at most"):
         open_sequence(write_frames(tmp_path / "b"))

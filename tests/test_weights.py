@@ -96,7 +96,7 @@ def test_damaged_weights_are_refused(folder: Path) -> None:
     (folder / "toy.pth").write_bytes(CONTENT + b"!")
     with pytest.raises(WeightsError, match=r"damaged.*toy\.pth"):
         weights.locate("toy")
-    assert {row.name: row.state for row in weights.overview()}["toy"] == "damaged"
+    assert {one.name: state for one, state in weights.overview()}["toy"] == "damaged"
 
 
 def test_pull_fetches_checks_and_records(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +136,7 @@ def test_a_model_copied_by_hand_is_found_without_a_record(folder: Path) -> None:
     assert not weights.is_present("depth-pro")
     (place / "model.safetensors").write_bytes(b"weights")
     assert weights.locate("depth-pro") == place
-    assert {row.name: row.state for row in weights.overview()}["depth-pro"] == "by hand"
+    assert {one.name: state for one, state in weights.overview()}["depth-pro"] == "by hand"
     assert weights.recorded_revision("depth-pro") == ""
     said = CliRunner().invoke(models.app, ["verify", "depth-pro", "--json"]).stdout
     assert json.loads(said) == {"depth-pro": "by hand, no hash to check"}
@@ -149,7 +149,7 @@ def test_pulling_records_a_model_that_was_copied_by_hand(folder: Path, hub: dict
         (place / name).write_bytes(b"an old copy")
     weights.pull("depth-pro")
     assert (place / "model.safetensors").read_bytes() == hub["model.safetensors"]
-    assert {row.name: row.state for row in weights.overview()}["depth-pro"] == "present"
+    assert {one.name: state for one, state in weights.overview()}["depth-pro"] == "present"
 
 
 def test_every_registered_repository_is_pinned_by_revision() -> None:
@@ -162,13 +162,13 @@ def test_pinned_repository_refuses_other_content(folder: Path, hub: dict[str, by
     hub["preprocessor_config.json"] = b"{}"
     with pytest.raises(WeightsError, match="damaged or of another version"):
         weights.pull("depth-anything")
-    assert {row.name: row.state for row in weights.overview()}["depth-anything"] == "damaged"
+    assert {one.name: state for one, state in weights.overview()}["depth-anything"] == "damaged"
 
 
 def test_any_hub_repository_can_be_pulled(folder: Path, hub: dict[str, bytes]) -> None:
     place = weights.pull("someone/their-depth")
     assert place == folder / "someone--their-depth"
-    assert weights.overview()[-1].name == "someone/their-depth"
+    assert weights.overview()[-1][0].name == "someone/their-depth"
     assert weights.verify("someone/their-depth") == place
 
 

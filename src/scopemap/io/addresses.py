@@ -95,12 +95,11 @@ def _system(address: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        system, name = fsspec.url_to_fs(address)
+        return fsspec.url_to_fs(address)  # type: ignore[no-any-return]
     except ImportError as error:
         raise InputError(f"reading {address} needs a package ({error}): pip install -e '.[cluster]'") from None
     except ValueError as error:  # an unknown protocol
         raise InputError(f"reading {address}: {error}") from None
-    return system, name
 
 
 def _remote_file(system: Any, facts: dict[str, Any]) -> RemoteFile:

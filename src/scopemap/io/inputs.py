@@ -33,15 +33,13 @@ class NamedInput:
 def named_inputs(texts: Sequence[str]) -> list[NamedInput]:
     """Return what texts name, in order, each input with the same columns once.
 
-    A text is the path of an input; a folder, of which each video below it is an input, and each data set or folder of
-    images; a pattern (`*`, `**`); an address that fsspec reads (s3://...) of a video, a folder or a pattern; a list,
-    *.txt, with one such text a line; or a table, *.csv, with such a text in its column `input`. Paths in a list or a
-    table are relative to its folder, and so are its cells `camera` and `config`. What does not exist is an input, too,
-    and fails when it is opened. Raises `InputError` for a list, table or address that cannot be read, and where nothing
-    is named.
+    A text is the path of an input; a folder, of which each video, data set and folder of images below it is an input; a
+    pattern (`*`, `**`); an address that fsspec reads (s3://...) of a video, a folder or a pattern; a list, *.txt, with
+    one such text a line; or a table, *.csv, with such a text in its column `input`. Paths in a list or a table are
+    relative to its folder, its cells `camera` and `config`, too. What does not exist fails when it is opened. Raises
+    `InputError` for a list, table or address that cannot be read, and where nothing is named.
     """
-    found = [named for text in texts for named in _of_text(text)]
-    once = {(str(named.path), *sorted(named.columns.items())): named for named in found}
+    once = {(str(one.path), *sorted(one.columns.items())): one for text in texts for one in _of_text(text)}
     if not once:
         raise InputError(f"no video in {', '.join(texts) or 'no input'}")
     return list(once.values())
@@ -56,16 +54,13 @@ def _of_text(text: str) -> Iterator[NamedInput]:
     with reporting(f"cannot read {file}"):
         check_bytes(str(file), file.stat().st_size, _MOST_BYTES)
         lines = file.read_text(encoding="utf-8-sig").splitlines()
-        named = _of_table(file, lines) if ending == TABLE else _of_list(lines)
+        listed = [(line.strip(), dict[str, str]()) for line in lines if line.strip() and not line.startswith("#")]
+        named = _of_table(file, lines) if ending == TABLE else listed
         for path, columns in named:
             beside = {key: str(file.parent / cell) for key, cell in columns.items() if key in _FILES}
             columns |= {key: cell for key, cell in beside.items() if Path(cell).is_file()}
             for one in _named(path, file.parent):
                 yield NamedInput(one, columns)
-
-
-def _of_list(lines: list[str]) -> list[tuple[str, dict[str, str]]]:
-    return [(line.strip(), {}) for line in lines if line.strip() and not line.startswith("#")]
 
 
 def _of_table(file: Path, lines: list[str]) -> list[tuple[str, dict[str, str]]]:
@@ -83,12 +78,11 @@ def _of_table(file: Path, lines: list[str]) -> list[tuple[str, dict[str, str]]]:
 
 
 def _named(text: str, folder: Path) -> Sequence[Path | RemoteFile]:
-    """Return the inputs that an address names, or a path or pattern relative to a folder."""
+    """Return the inputs that an address names, or a path or pattern relative to a folder; or the path itself."""
     return remote_files(text, _ENDINGS) if is_address(text) else _paths(folder / text)
 
 
 def _paths(path: Path) -> list[Path]:
-    """Return the inputs that a path or pattern names; a path without any, or that does not exist, is one itself."""
     if path.is_dir():
         return list(_in_folder(path)) or [path]
     if not path.exists() and glob.has_magic(str(path)):

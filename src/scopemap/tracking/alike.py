@@ -17,7 +17,7 @@ import onnxruntime
 
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
-from scopemap.io.inference import open_network
+from scopemap.io.device import open_network
 from scopemap.io.weights import sha256_of
 from scopemap.tracking.features import Features, points_at, usable_pixels
 
