@@ -10,7 +10,7 @@ import pytest
 from drawn_inputs import number_in, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.colmap import ModelCamera, camera_model
+from scopemap.cameras.formats.colmap_model import ModelCamera, camera_model
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.errors import CalibrationError, InputError

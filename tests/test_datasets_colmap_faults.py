@@ -23,7 +23,7 @@ from test_datasets_colmap import (
     write_scene,
 )
 
-from scopemap.cameras.formats.colmap import read_cameras, read_images
+from scopemap.cameras.formats.colmap_model import read_cameras, read_images
 from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.io.opening import open_sequence
 

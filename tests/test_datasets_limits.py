@@ -14,7 +14,7 @@ from test_datasets_endoslam import write_xlsx
 from test_datasets_stereomis import FRAMES, write_stereomis
 from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
 
-from scopemap.cameras.formats.colmap import read_largest_model
+from scopemap.cameras.formats.colmap_model import read_largest_model
 from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import reference_trajectory

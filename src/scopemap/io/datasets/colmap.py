@@ -11,10 +11,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
+from scopemap.cameras.formats.colmap_model import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
 from scopemap.io.images import ImageFolder, image_files
-from scopemap.trajectory.formats.colmap import camera_poses
+from scopemap.trajectory.formats.colmap_poses import camera_poses
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 _DEEPEST_MODEL = 3
@@ -32,12 +32,9 @@ class ColmapFolder(ImageFolder):
     quality = "sfm"
 
     def __init__(self, path: Path) -> None:
-        found = _model(path)
-        if found is None:
-            raise InputError(
-                f"reading {path}: no COLMAP model, looked for cameras.bin and images.bin, or both as .txt, in "
-                f"{', '.join(_MODELS)}"
-            )
+        if (found := _model(path)) is None:
+            looked_for = "cameras.bin and images.bin, or both as .txt"
+            raise InputError(f"reading {path}: no COLMAP model, looked for {looked_for}, in {', '.join(_MODELS)}")
         cameras_file, images_file = found
         images = read_images(images_file)
         files = _files_of(path, images)
