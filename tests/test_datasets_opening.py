@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 from drawn_bags import small_bag, write_bag1
+from drawn_colmap import NAMES, stored_pose, write_colmap, write_model
 from drawn_datasets import write_pictures
 from drawn_dicom import dataset, film, native
 from drawn_dicom import save as save_dicom
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared_c
-from test_datasets_colmap import NAMES, stored_pose, write_model
-from test_datasets_colmap import write_scene as write_colmap
 from test_datasets_endonerf import at_rest, llff
 from test_datasets_endonerf import write_scene as write_llff
 from test_datasets_oneslam import write_json, write_oneslam

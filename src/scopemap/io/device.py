@@ -21,7 +21,7 @@ def cpu_threads() -> int:
 
 
 def open_network(content: bytes, threads: int = 0) -> onnxruntime.InferenceSession:
-    """Return the session of an ONNX graph on the CPU; raises what the runtime raises. threads : 0: one for each core."""
+    """Return the session of an ONNX graph on the CPU; raises what the runtime raises. threads : 0: one a core."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
