@@ -13,7 +13,7 @@ from PIL import Image
 
 from scopemap.calibration.camera_calibration import CameraCalibration, calibrate, save_calibration, warnings_about
 from scopemap.calibration.intrinsics import FORMS, LensForm, fit_camera, with_deviations
-from scopemap.calibration.picture import draw_calibration
+from scopemap.calibration.residual_picture import draw_calibration
 from scopemap.calibration.targets import (
     CharucoBoard,
     Checkerboard,

@@ -7,10 +7,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from drawn_inputs import picture, save
 from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
 from test_datasets_endomapper_sim import buffer, write_exr
 from test_datasets_endoslam import write_xlsx
 from test_datasets_stereomis import FRAMES, write_stereomis
+from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
 
 from scopemap.cameras.formats.colmap_model import read_largest_model
 from scopemap.errors import InputError
@@ -92,3 +94,20 @@ def test_a_count_of_frames_beyond_the_file_is_not_believed(
     found = survey(sequence)
     assert (found.announced, len(found.frames), found.stopped) == (None, FRAMES, "")
     assert not any("breaks off" in warning for warning in found.sequence.warnings)
+
+
+# ---- lists of names
+
+
+@pytest.mark.parametrize("way", ["absolute", "above"])
+def test_names_that_lead_out_of_a_tum_folder_are_not_there(way: str, tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / ROOM)
+    outside = tmp_path / "outside.png"
+    save(outside, picture(1, SIZE))
+    name = {"absolute": str(outside), "above": "rgb/../../outside.png"}[way]
+    for file in ("rgb.txt", "depth.txt"):
+        replace_line(folder / file, 4, f"{STAMPS[1]:.6f} {name}")
+    sequence = open_sequence(folder)
+    assert sequence.source.numbers == [0, 2, 3]
+    assert any("rgb.txt: 1 of the 4 images that it names are not there" in text for text in sequence.warnings)
+    assert any("depth.txt: 1 of the 3 images that it names are not there" in text for text in sequence.warnings)

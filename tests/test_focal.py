@@ -13,7 +13,7 @@ from front_door import said
 from turning_clip import SIZE, focal_of, write_clip
 
 from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
-from scopemap.calibration.focal_length.estimate import (
+from scopemap.calibration.focal_length.from_motion import (
     FocalEstimate,
     combine,
     focal_from_motion,
@@ -236,7 +236,7 @@ def test_which_estimate_is_taken(
     still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, message: str
 ) -> None:
     estimate = ESTIMATES[name]
-    monkeypatch.setattr("scopemap.calibration.focal_length.estimate.focal_from_motion", lambda *_: estimate)
+    monkeypatch.setattr("scopemap.calibration.focal_length.from_motion.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
     assert message in " ".join([found.camera_source, *map(str, notes)])
     if taken:

@@ -11,7 +11,7 @@ import pytest
 from front_door import warned
 from turning_clip import write_clip
 
-from scopemap.calibration.focal_length.estimate import FocalEstimate
+from scopemap.calibration.focal_length.from_motion import FocalEstimate
 from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
 from scopemap.calibration.focal_length.windows import Window
 from scopemap.cameras.camera import PinholeCamera
@@ -113,7 +113,7 @@ def clip(tmp_path: Path) -> Path:
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
     """What the trial says, to be filled in; the motion tells nothing."""
     said: list[LensTrial | None] = []
-    place = "scopemap.calibration.focal_length.estimate"
+    place = "scopemap.calibration.focal_length.from_motion"
     window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
 
     def motion(*arguments: object) -> FocalEstimate:

@@ -37,13 +37,9 @@ _UNSURE_FOCAL = 0.01
 class CameraCalibration:
     """A camera calibrated with a target, and how well.
 
-    Attributes
-    ----------
     fit, views : the camera and the poses of the target, and the views that they were fitted to, in the input's order.
-    held_out_px : error of every form tried, in views that it was not fitted to, px.
-    left_out, blurred : views that do not fit, and views that are not sharp.
-    coverage : share of the image within targets.
-    warnings : shortcomings to know before use.
+    held_out_px : error of every form tried, in views that it was not fitted to, px. left_out, blurred : views that do
+    not fit, and views that are not sharp. coverage : share of the image within targets. warnings : shortcomings.
     """
 
     fit: Fit
@@ -139,28 +135,21 @@ def warnings_about(fit: Fit, covered: float) -> list[str]:
     """Return the shortcomings of a fit; `covered` is the share of the image within targets."""
     views, tilted = len(fit.residuals_px), int(np.sum(tilts_deg(fit) > _TILTED_DEG))
     unsure = fit.deviations["fx"] / fit.camera.central.fx
-    possible = [
-        (views < _FEW_VIEWS, f"only {views} views that differ: 15 to 40 are usual"),
-        (
-            tilted < _TILTED_VIEWS,
-            f"the board is tilted by more than {_TILTED_DEG:g} deg in {tilted} view(s): focal length and distance can "
-            "hardly be separated; tilt it by 20 to 40 deg in several directions",
-        ),
-        (
-            covered < _LITTLE_COVERED,
-            f"the boards cover {100 * covered:.0f} % of the picture: beyond them the distortion is extrapolated; hold "
-            "the board into the corners, too",
-        ),
-        (
-            fit.rms_px > _LARGE_RMS_PX,
-            f"corners are {fit.rms_px:.2f} px off on the whole: is the board flat, the video sharp, the zoom fixed?",
-        ),
-        (
-            unsure > _UNSURE_FOCAL,
-            f"the focal length is known to {100 * unsure:.1f} % only: add views with the board tilted",
-        ),
-    ]
-    return [message for applies, message in possible if applies]
+    found = []
+    if views < _FEW_VIEWS:
+        found.append(f"only {views} views that differ: 15 to 40 are usual")
+    if tilted < _TILTED_VIEWS:
+        inseparable = "focal length and distance can hardly be separated; tilt it by 20 to 40 deg in several directions"
+        found.append(f"the board is tilted by more than {_TILTED_DEG:g} deg in {tilted} view(s): {inseparable}")
+    if covered < _LITTLE_COVERED:
+        beyond = "beyond them the distortion is extrapolated; hold the board into the corners, too"
+        found.append(f"the boards cover {100 * covered:.0f} % of the picture: {beyond}")
+    if fit.rms_px > _LARGE_RMS_PX:
+        asked = "is the board flat, the video sharp, the zoom fixed?"
+        found.append(f"corners are {fit.rms_px:.2f} px off on the whole: {asked}")
+    if unsure > _UNSURE_FOCAL:
+        found.append(f"the focal length is known to {100 * unsure:.1f} % only: add views with the board tilted")
+    return found
 
 
 def _check_count(views: list[BoardView], found: str, advice: str) -> None:

@@ -98,11 +98,9 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
     `near` is a camera to start from, else several starts are tried. Raises `CalibrationError` where none converges.
     """
     w, h = size
-    starts: list[PinholeCamera | None]
-    if near is not None:
-        starts = [near.central]
-    else:
-        starts = [PinholeCamera(f * w, f * w, (w - 1) / 2, (h - 1) / 2, w, h) for f in _FOCAL_GUESSES]
+    starts: list[PinholeCamera | None] = [near.central] if near is not None else []
+    if near is None:
+        starts += [PinholeCamera(f * w, f * w, (w - 1) / 2, (h - 1) / 2, w, h) for f in _FOCAL_GUESSES]
         if form.model == "pinhole":
             starts.append(None)
         elif simple := _attempt(views, size, LensForm("pinhole", ("k1", "k2")), None):
@@ -120,8 +118,8 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
 def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
     """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to resampled views, 20 of them.
 
-    OpenCV's own standard deviations follow from the noise of single corners and are too small by a factor of 2.3 where
-    the board bends, which moves all corners of a view together; for the fisheye it has none.
+    OpenCV's own follow from the noise of single corners, and are too small by a factor of 2.3 where the board bends;
+    for the fisheye it has none.
     """
     size, rng = (fit.camera.width, fit.camera.height), np.random.default_rng(0)
     drawn = [[views[i] for i in rng.integers(0, len(views), len(views))] for _ in range(_RESAMPLES)]

@@ -66,10 +66,7 @@ class Checkerboard:
         return grid * float(self.square_mm)
 
     def find(self, grey: np.ndarray) -> Corners | None:
-        """Return all corners in an image (h, w) uint8, None where one is missing.
-
-        Found by Duda and Frese (BMVC 2018) and refined to subpixels in the full image.
-        """
+        """Return all corners in an image (h, w) uint8, None where one is missing (Duda and Frese, BMVC 2018)."""
         shrink = min(1.0, _SEARCH_SIDE_PX / max(grey.shape))
         small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         size = (self.columns, self.rows)

@@ -248,10 +248,8 @@ def _calibration_of(
     if source.camera_fault is not None:
         raise source.camera_fault
     if camera_fit.startswith("crop"):
-        raise CalibrationError(
-            f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit}): give the one "
-            "that was made before they were cut (--camera)"
-        )
+        nothing = f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit})"
+        raise CalibrationError(f"{nothing}: give the one that was made before they were cut (--camera)")
     unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True

@@ -31,8 +31,6 @@ _FIRST, _THEN = (15, 1e-3), (30, 1e-4)
 class WindowFit:
     """Focal length from one window.
 
-    Attributes
-    ----------
     log_focal : ln of fx, px. deviation : its standard deviation, all else marginalised. residual_px : robust standard
     deviation of the reprojection errors. tilt_deg : largest tilt of the optical axis against the host's. distortion :
     b of `mapping.bundle_adjustment`.

@@ -158,9 +158,8 @@ def only_camera(file: Path) -> CameraModel:
     """Return the camera of a file that holds one; `CalibrationError` for any other file."""
     cameras = read_cameras(file)
     if len(cameras) != 1:
-        raise CalibrationError(
-            f"the calibration {file} holds {len(cameras)} cameras (COLMAP): leave the one of these images in it"
-        )
+        held = f"{len(cameras)} cameras (COLMAP): leave the one of these images in it"
+        raise CalibrationError(f"the calibration {file} holds {held}")
     ((number, camera),) = cameras.items()
     return camera_model(camera, f"camera {number} of {file}")
 

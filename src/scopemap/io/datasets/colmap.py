@@ -62,10 +62,9 @@ class ColmapFolder(ImageFolder):
             raise InputError(f"reading {file}: it has no camera {unknown[0]}, by which images of the model were taken")
         models = {number: camera_model(cameras[number], f"camera {number} of {file}") for number in uses}
         if len(set(models.values())) > 1:
-            raise InputError(
-                f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ; a sequence "
-                "has one: reconstruct with a single camera for all images, or give their calibration (--camera)"
-            )
+            advice = "reconstruct with a single camera for all images, or give their calibration (--camera)"
+            differ = f"the images were taken by {len(models)} cameras whose intrinsics differ; a sequence has one"
+            raise InputError(f"reading {file}: {differ}: {advice}")
         number, camera = next(iter(models.items()))
         self._set_camera(camera, f"COLMAP {file.name}, {cameras[number].model}", f"camera {number} of {file}")
 
@@ -100,10 +99,8 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
     """Return all images of the folder that holds those of the model; `InputError` where there is none, or several."""
     inner = sorted({image.path.parent for image in images})
     if len(inner) > 1:
-        raise InputError(
-            f"reading {path}: the images of the COLMAP model are in {len(inner)} folders, a sequence in one; "
-            "reconstruct one of them, or leave the others out of the model"
-        )
+        several = f"the images of the COLMAP model are in {len(inner)} folders, a sequence in one"
+        raise InputError(f"reading {path}: {several}; reconstruct one of them, or leave the others out of the model")
     wanted = {image.path.name for image in images}
     # Names from a file of unknown origin must not lead out of the folder.
     stays_inside = not inner[0].is_absolute() and ".." not in inner[0].parts
@@ -113,7 +110,5 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
             files = image_files(place)
             if any(file.name in wanted for file in files):
                 return files
-    raise InputError(
-        f"reading {path}: none of the {len(images)} images in the COLMAP model (such as {images[0].name!r}) is there; "
-        f"put them into {path / _IMAGES}"
-    )
+    none = f"none of the {len(images)} images in the COLMAP model (such as {images[0].name!r}) is there"
+    raise InputError(f"reading {path}: {none}; put them into {path / _IMAGES}")

@@ -141,10 +141,8 @@ class Dicom(Source):
         single = [header for header in headers if not header.is_video and header.frames + header.missing == 1]
         several, series = len(headers) - len(single), {str(h.fields.get("SeriesInstanceUID", "")) for h in single}
         if several + len(series) > 1:
-            raise InputError(
-                f"reading {path}: it holds {several} videos or multi-frame images and {len(series)} series of single "
-                "frames; give one file, or a folder with one series"
-            )
+            held = f"{several} videos or multi-frame images and {len(series)} series of single frames"
+            raise InputError(f"reading {path}: it holds {held}; give one file, or a folder with one series")
         return sorted(headers, key=lambda header: header.instance or 0)
 
 
@@ -325,10 +323,10 @@ def _check_decoder(file: Path, syntax: str) -> None:
             return
     # A UID that is unknown is not quoted: it may hold anything.
     name = UID(syntax).name if syntax in UID_dictionary else "an unknown transfer syntax"
-    raise InputError(
-        f"reading {file}: no decoder is installed for {name}; install a plugin of pydicom (pyjpegls, pylibjpeg), or "
-        "convert the file, for example with dcmconv or dcmdjpeg"
+    advice = (
+        "install a plugin of pydicom (pyjpegls, pylibjpeg), or convert the file, for example with dcmconv or dcmdjpeg"
     )
+    raise InputError(f"reading {file}: no decoder is installed for {name}; {advice}")
 
 
 def _packed(header: Header) -> Iterator[bytes]:

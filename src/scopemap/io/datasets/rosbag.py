@@ -272,10 +272,9 @@ class RosBag(Source):
             raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
         if not images:
             fault = "".join(f"; {warning}" for warning in self.warnings[:1])
-            raise InputError(
-                f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage; topics of "
-                f"these kinds and camera_info are {', '.join(self._topics) or 'none'}){fault}"
-            )
+            looked = f"topics of these kinds and camera_info are {', '.join(self._topics) or 'none'}"
+            looked = f"looked for sensor_msgs/Image and CompressedImage; {looked}"
+            raise InputError(f"reading {self.path}: it holds no images ({looked}){fault}")
 
         def preference(topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
             left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))

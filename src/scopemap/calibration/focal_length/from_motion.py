@@ -44,8 +44,6 @@ _SIGNIFICANT = 2.0
 class FocalEstimate:
     """Focal length estimated from motion.
 
-    Attributes
-    ----------
     focal_px : horizontal focal length at the sequence's working size, NaN = unknown. share : its standard deviation
     over itself. fov_deg : horizontal field of view. windows : number of windows used. distortion : radial distortion, b
     of `mapping.reprojection`. reason : why there is no estimate, or "".
@@ -71,10 +69,9 @@ class FocalEstimate:
 def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[Notice]]:
     """Return a sequence of unknown camera with the focal length estimated from its motion, and notices about the lens.
 
-    Where the estimate is not taken the focal length stays, and `camera_source` says why.
-
-    `input.focal` "flow" takes any estimate, "auto" one of small deviation that contradicts the assumed focal length.
-    Raises `CalibrationError` where there is no estimate for "flow".
+    Where the estimate is not taken the focal length stays, and `camera_source` says why. `input.focal` "flow" takes any
+    estimate, "auto" one of small deviation that contradicts the assumed focal length. Raises `CalibrationError` where
+    there is no estimate for "flow".
     """
     windows: list[Window] = []
     estimate, assumed_px = focal_from_motion(sequence, config, windows), sequence.camera.fx
@@ -101,7 +98,8 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
         if is_unknown:
-            kept += "; " + _undecided(tried) if adjusts else ""
+            undecided = "fewer than two windows show a rigid scene" if tried is None else tried.reason
+            kept += f"; a trial of lenses does not tell it either: {undecided}" if adjusts else ""
             default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
             sequence.source.warnings.append(Notice("camera-unknown", {"reason": default}))
     if not kept and not wanted and not estimate.differs_from(assumed_px):
@@ -116,10 +114,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
 def _agreeing(
     tried: LensTrial | None, motion: FocalEstimate, sequence: Sequence, windows: list[Window]
 ) -> LensTrial | None:
-    """Return a trial's result; where it finds a pinhole that the motion contradicts, with the reason not to take it.
-
-    Both see the same turns, and only the trial relies on the estimated depth.
-    """
+    """Return a trial's result; a pinhole that the motion, which needs no depth, contradicts gets a `reason`."""
     if tried is None or tried.reason or motion.reason or tried.kind != "pinhole":
         return tried
     scale = sequence.camera.width / (2 * windows[0].half_width_px)
@@ -139,16 +134,10 @@ def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> 
     return sequence.with_focal(focal_px, source, sigma_px, KINDS[tried.kind])
 
 
-def _undecided(tried: LensTrial | None) -> str:
-    """Return what a trial of lenses that settles nothing says, one phrase."""
-    said = "fewer than two windows show a rigid scene" if tried is None else tried.reason
-    return f"a trial of lenses does not tell it either: {said}"
-
-
 def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
     """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior.
 
-    The principal point is the camera's. windows : to which those that are used are appended.
+    windows : to which those that are used are appended.
     """
     camera, scale = sequence.camera, 1.0
     # Flow, of the next window, and the adjustment of this one take about equally long.
