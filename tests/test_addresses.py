@@ -12,8 +12,7 @@ from tiny_phantom import write_tiny
 
 from scopemap.cli.batch import videos_of
 from scopemap.errors import InputError
-from scopemap.io.addresses import RemoteFile, is_address, remote_files
-from scopemap.io.inputs import named_inputs
+from scopemap.io.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
 
 

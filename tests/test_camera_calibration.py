@@ -11,17 +11,27 @@ import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
 from PIL import Image
 
-from scopemap.calibration.camera_calibration import CameraCalibration, calibrate, save_calibration, warnings_about
-from scopemap.calibration.intrinsics import FORMS, LensForm, fit_camera, with_deviations
+from scopemap.calibration.camera_calibration import (
+    FORMS,
+    CameraCalibration,
+    LensForm,
+    calibrate,
+    fit_camera,
+    save_calibration,
+    warnings_about,
+    with_deviations,
+)
 from scopemap.calibration.residual_picture import draw_calibration
 from scopemap.calibration.targets import (
+    BoardView,
     CharucoBoard,
     Checkerboard,
     Corners,
+    Search,
     Target,
+    edge_width_px,
     nearest_px,
 )
-from scopemap.calibration.views import BoardView, Search, edge_width_px
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError

@@ -12,9 +12,10 @@ import pytest
 from front_door import said
 from turning_clip import SIZE, focal_of, write_clip
 
-from scopemap.calibration.focal_length.adjustment import WindowFit, adjust_window
 from scopemap.calibration.focal_length.from_motion import (
     FocalEstimate,
+    WindowFit,
+    adjust_window,
     combine,
     focal_from_motion,
     with_focal_from_motion,
