@@ -114,7 +114,10 @@ def test_a_palette_is_looked_up(tmp_path: Path) -> None:
 def test_packed_pictures(tmp_path: Path) -> None:
     close = pictures(write_frames(tmp_path / "a"))
     assert np.abs(close.astype(int) - film()).mean() < 4
-    runs = [RLELosslessEncoder.encode(one.tobytes(), **rle_options()) for one in film()]
+    options = {"rows": SIZE[1], "columns": SIZE[0], "samples_per_pixel": 3, "number_of_frames": 1}
+    options |= {"bits_allocated": 8, "bits_stored": 8, "pixel_representation": 0, "planar_configuration": 0}
+    options |= {"photometric_interpretation": "RGB"}
+    runs = [RLELosslessEncoder.encode(one.tobytes(), **options) for one in film()]
     np.testing.assert_array_equal(pictures(packed(tmp_path / "b.dcm", runs, RLELossless)), film())
     wavelets = []
     for one in film():
@@ -123,20 +126,6 @@ def test_packed_pictures(tmp_path: Path) -> None:
         wavelets.append(stream.getvalue())
     file = packed(tmp_path / "c.dcm", wavelets, JPEG2000Lossless, PhotometricInterpretation="YBR_RCT")
     np.testing.assert_array_equal(pictures(file), film())
-
-
-def rle_options() -> dict[str, Any]:
-    return {
-        "rows": SIZE[1],
-        "columns": SIZE[0],
-        "samples_per_pixel": 3,
-        "bits_allocated": 8,
-        "bits_stored": 8,
-        "pixel_representation": 0,
-        "photometric_interpretation": "RGB",
-        "number_of_frames": 1,
-        "planar_configuration": 0,
-    }
 
 
 @pytest.mark.parametrize("pieces", [1, 4])
@@ -228,13 +217,6 @@ def test_a_picture_that_cannot_be_decoded_is_left_out_and_keeps_its_number(tmp_p
     source = Dicom(packed(tmp_path / "a.dcm", frames, JPEGBaseline8Bit, PhotometricInterpretation="YBR_PARTIAL_420"))
     assert [frame.index for frame in source.frames(slice(None))] == [0, 2]
     assert source.warnings == [f"image {number} cannot be decoded and was left out" for number in (1, 3)]
-
-
-def test_only_single_images_are_limited_in_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.io.datasets.dicom._MOST_IMAGE_BYTES", 100)
-    assert len(pictures(native(tmp_path / "a.dcm", film()))) == 4
-    with pytest.raises(InputError, match="one image: it holds 0 MB, expected 0 MB at most"):
-        open_sequence(write_frames(tmp_path / "b"))
 
 
 def test_claims_take_no_memory(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io import prepared
 from scopemap.io.frame_choice import is_repeat, mean_difference
 from scopemap.io.opening import open_sequence
 from scopemap.io.video_format.interlacing import combing
@@ -77,32 +76,6 @@ def test_ordinary_videos_and_data_sets_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'c3vd' defines the view; leave input\.stereo=left-right"):
         open_sequence(folder, settings=InputSettings(stereo="left-right"))
     assert open_sequence(folder, settings=InputSettings(stereo="none")).source.name == "c3vd"
-
-
-@pytest.mark.parametrize(("pictures", "held"), [(0.5, 2), (3.5, 3), (100, 8)])
-@pytest.mark.parametrize("video", [True, False])
-def test_few_large_pictures_are_held_at_once(
-    pictures: float, held: int, video: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if video:
-        # Each picture is a key frame, which the video can be entered at.
-        file = encode(tmp_path / "v.mp4", [tissue(n) for n in range(COUNT)], options={"qp": "0", "g": "1"})
-    else:
-        for number in range(COUNT):
-            save(tmp_path / f"{number:03d}.png", tissue(number))
-        file = tmp_path
-    seen = []
-    monkeypatch.setattr(prepared, "_SAMPLES_BYTES", int(pictures * 3 * WIDTH * HEIGHT))
-    monkeypatch.setattr(prepared, "packing", lambda samples, aspect: seen.append(len(samples)))
-    open_sequence(file)
-    assert seen == [held]
-
-
-def test_a_shape_that_looks_like_two_views_is_told(tmp_path: Path) -> None:
-    file = _video(tmp_path / "v.mp4", lambda number: np.hstack([tissue(number), tissue(number, seed=4)]))
-    sequence = open_sequence(file)
-    assert sequence.source.width == 2 * WIDTH
-    assert any("the shape of two views" in note and "--stereo left-right" in note for note in sequence.notes)
 
 
 def _calibration(file: Path, width: int, height: int) -> Path:

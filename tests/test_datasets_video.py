@@ -141,14 +141,6 @@ def test_how_times_are_mended(stamps: list[float | None], expected: list[float],
     assert mend.repaired == repaired
 
 
-@pytest.mark.parametrize("lag", [1, 2])
-def test_stamps_out_of_order_do_not_make_time_run_away(lag: int) -> None:
-    stated = [(index + (lag if index % 3 == 1 else -lag if index % 3 == 2 else 0)) / 25 for index in range(300)]
-    mend = TimeStamps(25.0)
-    times_s = [mend(index, stamp) for index, stamp in enumerate(stated)]
-    np.testing.assert_allclose(times_s, np.arange(300) / 25, atol=(2 * lag + 1) / 25)
-
-
 def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:
     file = encode(tmp_path / "v.h264", clip(6, size=(64, 48)), pix_fmt="yuv420p")
     source = VideoFile(file)

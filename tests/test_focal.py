@@ -130,16 +130,11 @@ def _fit(fov_deg: float, deviation: float = 0.01, tilt_deg: float = 10.0) -> Win
     return WindowFit(math.log(focal_of(fov_deg, 320)), deviation, 0.2, tilt_deg, 0.0)
 
 
-def test_windows_have_a_common_error_so_many_are_little_better_than_two() -> None:
+def test_less_tilt_and_disagreement_increase_the_deviation() -> None:
     two, many = (combine([_fit(80.0)] * count, 320.0) for count in (2, 20))
     assert two.fov_deg == pytest.approx(80.0)
-    assert two.windows == 2
-    assert many.share == pytest.approx(0.04, abs=0.005)
-    assert many.share < two.share < 0.05
-    assert two.sigma_px == pytest.approx(two.share * two.focal_px)
-
-
-def test_less_tilt_and_disagreement_increase_the_deviation() -> None:
+    # Windows have a common error, so that many are little better than two.
+    assert 0.035 < many.share < two.share < 0.05
     similar, different = combine([_fit(80.0)] * 4, 320.0), combine([_fit(60.0), _fit(100.0)] * 2, 320.0)
     assert different.share > 3 * similar.share
     assert "no endoscope" in combine([_fit(15.0)] * 3, 320.0).reason

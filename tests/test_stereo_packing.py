@@ -107,14 +107,6 @@ def test_a_lumen_is_not_stereo() -> None:
     assert packing([(light[..., None] * [220, 120, 90]).astype(np.uint8)] * 3) is None
 
 
-def test_a_chequerboard_is_not_stereo() -> None:
-    board = np.kron(np.indices((9, 12)).sum(0) % 2, np.ones((30, 30)))[..., None].repeat(3, 2) * 180 + 40
-    corners = np.float32([[0, 0], [360, 0], [360, 270], [0, 270]])
-    seen = np.float32([[70, 40], [270, 30], [300, 215], [45, 200]])
-    view = cv2.warpPerspective(board.astype(np.uint8), cv2.getPerspectiveTransform(corners, seen), (WIDTH, HEIGHT))
-    assert packing([view]) is None
-
-
 def test_what_is_too_little_is_not_stereo() -> None:
     assert packing([]) is None
     assert packing([np.full((HEIGHT, WIDTH, 3), 90, np.uint8)]) is None
