@@ -10,11 +10,11 @@ import numpy as np
 from drawn_bags import write_bag1, write_mcap, write_ros2
 from drawn_calibrations import CAMERAS, write_forms
 from drawn_climb import write_clip
+from drawn_colmap import write_colmap
 from drawn_dicom import write_dicom_video, write_frames
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
 from test_datasets_c3vd_layouts import write_endogslam, write_v2
-from test_datasets_colmap import write_scene as write_colmap
 from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
 from test_datasets_endomapper_sim import write_sim
 from test_datasets_endonerf import write_scene as write_llff

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from drawn_colmap import CAMERA as COLMAP_CAMERA
+from drawn_colmap import binary_images, text_images, write_model
 from drawn_scared import frame_json, write_tar
 from drawn_scene import Content, quaternion
 from stored_containers import dicom_frames, dicom_video, recording
@@ -24,8 +26,6 @@ from stored_frames import (
     red_depths,
     scene_points,
 )
-from test_datasets_colmap import CAMERA as COLMAP_CAMERA
-from test_datasets_colmap import binary_images, text_images, write_model
 from test_datasets_endomapper import archive_of, write_models
 from test_datasets_endomapper_sim import HEADER as SIM_HEADER
 from test_datasets_endonerf import llff

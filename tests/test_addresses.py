@@ -12,8 +12,7 @@ from tiny_phantom import write_tiny
 
 from scopemap.cli.batch import videos_of
 from scopemap.errors import InputError
-from scopemap.io.addresses import RemoteFile, is_address, remote_files
-from scopemap.io.inputs import named_inputs
+from scopemap.io.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
 
 
@@ -87,13 +86,3 @@ def test_results_are_those_of_files(tmp_path: Path) -> None:
     assert not (tmp_path / "fetched" / ".fetched").exists()
     assert call("batch", tmp_path / "videos" / "colon_01.mp4", "--out", tmp_path / "files", *options) == 0
     assert _files(tmp_path / "fetched" / "colon_01") == _files(tmp_path / "files" / "colon_01")
-
-
-def test_a_dry_run_fetches_and_leaves_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    write_videos(tmp_path / "videos", 1)
-    address = (tmp_path / "videos").as_uri()
-    assert call("batch", address, "--out", tmp_path / "out", "--dry-run", "--camera", CAMERA, "--workers", 1) == 0
-    said = capfd.readouterr()
-    assert "1 video, 0 s, 0.00 GB" in said.out
-    assert "colon_00: 8 frames" in said.err
-    assert not (tmp_path / "out").exists()

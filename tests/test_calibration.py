@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,6 @@ import pytest
 from drawn_calibrations import (
     CAMERAS,
     FISHEYE,
-    KALIBR_SECOND,
     OCAM,
     OCAM_AFFINE,
     OCAM_CENTRE,
@@ -57,15 +55,6 @@ def assert_same(found: CameraModel, expected: CameraModel) -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: type(c).__name__)
-def test_what_is_written_reads_back(camera: CameraModel, tmp_path: Path) -> None:
-    write_calibration(camera, tmp_path / "camera.yaml", depth_scale_mm=0.005)
-    found = read_calibration(tmp_path / "camera.yaml", (640, 480))
-    assert found.camera == camera
-    assert found.depth_scale_mm == 0.005
-    assert found.source == "calibration file camera.yaml"
-
-
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: type(c).__name__)
 def test_what_is_written_opencv_reads(camera: CameraModel, tmp_path: Path) -> None:
     write_calibration(camera, tmp_path / "camera.yaml")
     storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
@@ -105,8 +94,9 @@ def test_any_camera_reads_back_exactly(
 ) -> None:
     camera = lens_of(central, kind, numbers, small)
     file = tmp_path_factory.mktemp("any") / "camera.yaml"
-    write_calibration(camera, file)
-    assert read_calibration(file, (camera.width, camera.height)).camera == camera
+    write_calibration(camera, file, depth_scale_mm=0.005)
+    found = read_calibration(file, (camera.width, camera.height))
+    assert (found.camera, found.depth_scale_mm, found.source) == (camera, 0.005, "calibration file camera.yaml")
 
 
 # ---- the forms
@@ -118,17 +108,6 @@ def test_each_form(form: str, tmp_path: Path) -> None:
     found = read(tmp_path, content)
     assert_same(found.camera, expected)
     assert found.depth_scale_mm is None
-
-
-@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
-@pytest.mark.parametrize("names", [("K", "D"), ("M1", "D1"), ("camera_matrix", "distortion_coefficients")])
-def test_files_by_opencv(suffix: str, names: tuple[str, str], tmp_path: Path) -> None:
-    file = tmp_path / f"c.{suffix}"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write(names[0], PINHOLE.matrix)
-    storage.write(names[1], np.array([[-0.3, 0.1, 1e-3, -5e-4, -0.01]]))
-    storage.release()
-    assert read_calibration(file, (640, 480)).camera == RADTAN5
 
 
 def test_the_toolbox_of_scaramuzza_row_first_and_backwards(tmp_path: Path) -> None:
@@ -143,12 +122,6 @@ def test_the_toolbox_of_scaramuzza_row_first_and_backwards(tmp_path: Path) -> No
         back = np.polynomial.polynomial.polyval(rho, OCAM_POLYNOMIAL)
         ray = np.array([right, down, -back])
         np.testing.assert_allclose(camera.unproject(np.array([u, v])), ray / ray[2], rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("header", ["", "%YAML:1.0\n---\n"])
-@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
-def test_a_ros_file(header: str, line_end: str, tmp_path: Path) -> None:
-    assert read(tmp_path, (header + ROS).replace("\n", line_end)).camera == FISHEYE
 
 
 def test_ros_images_of_a_region_in_blocks(tmp_path: Path) -> None:
@@ -166,22 +139,13 @@ def test_ros_images_of_a_region_in_blocks(tmp_path: Path) -> None:
         read(tmp_path, ROS.replace("image_width: 640\nimage_height: 480\n", "") + "binning_x: 2\n")
 
 
-def test_of_several_cameras_the_first_is_used_and_said(tmp_path: Path) -> None:
-    found = read(tmp_path, kalibr("equi", FISHEYE.distortion, KALIBR_SECOND))
-    assert found.source == "calibration file any.thing, cam0 of 2 cameras"
-
-
-def test_four_coefficients_of_no_named_model_are_opencvs(tmp_path: Path) -> None:
-    text = "K: [520.5, 0, 318, 0, 525.25, 245, 0, 0, 1]\nD: [-0.3, 0.1, 0.001, -0.0005]\n"
-    found = read(tmp_path, text)
-    assert found.camera == RADTAN
-    for word in ("distortion_model: fisheye", "fisheye_model: 1", "camera_model: kannala-brandt"):
-        assert isinstance(read(tmp_path, f"{text}{word}\n").camera, FisheyeCamera)
-
-
-@pytest.mark.parametrize("sides", ["image_size: [640, 480]", "image_width: 640\nimage_height: 480"])
-def test_coefficients_that_are_zero_matter_not(sides: str, tmp_path: Path) -> None:
-    matrix = f"K: [520.5, 0, 318, 0, 525.25, 245, 0, 0, 1]\n{sides}\n"
+def test_coefficients_of_no_named_model_are_opencvs_and_zeros_matter_not(tmp_path: Path) -> None:
+    matrix = "K: [520.5, 0, 318, 0, 525.25, 245, 0, 0, 1]\nimage_size: [640, 480]\n"
+    four = f"{matrix}D: [-0.3, 0.1, 0.001, -0.0005]\n"
+    assert read(tmp_path, four).camera == RADTAN
+    for word in ("distortion_model: fisheye", "fisheye_model: 1", "fisheye: true", "camera_model: kannala-brandt"):
+        assert isinstance(read(tmp_path, f"{four}{word}\n").camera, FisheyeCamera)
+    assert read(tmp_path, f"{four}fisheye: 0\n").camera == RADTAN
     zeros = ", ".join(["0"] * 6)
     assert read(tmp_path, f"{matrix}D: [-0.3, 0.1, 1e-3, -5e-4, -0.01, 0, 0, 0, {zeros}]\n").camera == OpenCvCamera(
         PINHOLE, (*RADTAN5.distortion, 0.0, 0.0, 0.0)
@@ -192,13 +156,6 @@ def test_coefficients_that_are_zero_matter_not(sides: str, tmp_path: Path) -> No
 def test_bytes_that_are_no_text_do_not_matter_in_comments(tmp_path: Path) -> None:
     assert read(tmp_path, b"# endoscopio n\xba 1\n520.5 525.25 318 245").camera == PINHOLE
     assert read(tmp_path, b"\xef\xbb\xbf520.5 525.25 318 245").camera == PINHOLE
-
-
-def test_a_kannala_brandt_of_orb_slam_has_four_coefficients(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="k1 k2 k3 k4 alone"):
-        read(tmp_path, ORB_SLAM3 + "Camera1.p1: 0.1\n")
-    with pytest.raises(CalibrationError, match="it has k4 but no p1, and names no model"):
-        read(tmp_path, ORB_SLAM3.replace('Camera.type: "KannalaBrandt8"\n', ""))
 
 
 # ---- numbers as typed
@@ -221,19 +178,11 @@ def test_numbers_instead_of_a_file(typed: str, expected: CameraModel) -> None:
     assert (cropped.cx, cropped.cy) == (168.0, 145.0)
 
 
-@pytest.mark.parametrize(
-    ("typed", "message"),
-    [
-        ("520 525 318", r"camera '520 525 318': it holds 3 numbers: expected fx fy cx cy \[k1 k2 p1 p2 \[k3"),
-        ("520 525 318 245 0.1", "it holds 5 numbers"),
-        ("520 nan 318 245", "NaN or infinity"),
-        ("1000 1000 960 540", "the camera of the numbers given .* its principal point 960, 540 is outside"),
-        ("520 525 318 wide", "520 525 318 wide: there is no such file"),
-    ],
-)
-def test_numbers_that_are_no_camera(typed: str, message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        read_calibration(typed, SIZE)
+def test_numbers_that_are_no_camera() -> None:
+    with pytest.raises(CalibrationError, match=r"camera '520 525 318': it holds 3 numbers: expected fx fy cx cy"):
+        read_calibration("520 525 318", SIZE)
+    with pytest.raises(CalibrationError, match="520 525 318 wide: there is no such file"):
+        read_calibration("520 525 318 wide", SIZE)
 
 
 def test_a_file_whose_name_is_numbers_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,34 +197,26 @@ def test_a_file_whose_name_is_numbers_is_read(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("52.0 52.0 318 245", "focal length"),
         ("5200 5200 318 245", "focal length"),
         ("1000 1000 960 540", "principal point"),
-        ("1 2 3", "3 numbers"),
-        ("nan 525 318 245", "NaN or infinity"),
+        (ORB_SLAM3 + "Camera1.p1: 0.1\n", "k1 k2 k3 k4 alone"),
+        (ORB_SLAM3.replace('Camera.type: "KannalaBrandt8"\n', ""), "it has k4 but no p1, and names no model"),
         ("520 525 318 245\n1e999 0 0 0", "NaN or infinity"),
         ("", "0 numbers"),
         ("hello there", "none of the formats that are read"),
-        ("- 1\n- x\n", "none of the formats that are read"),
-        ("%YAML:1.0\n---\na: 1\n", "no 3x3 camera matrix"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: [0.1, 0.2]\n", "expected 4, 5 or 8"),
-        ("K: [520, 0, 318, 0, 520, 245, 0, 0]\n", "no 3x3 camera matrix"),
         ("K: {rows: 3, cols: 3, data: [1, 2]}\n", "K holds 2 numbers, but should be 3x3"),
         ("K: [520, 0, wide, 0, 520, 245, 0, 0, 1]\n", "K must be a finite number, found 'wide'"),
-        ("K: [520, 0, .nan, 0, 520, 245, 0, 0, 1]\n", "K must be a finite number"),
         ("K: [520, 0, 0, 0, 520, 9, 318, 245, 1]\n", "is no camera matrix"),
         ("K: [520, 9, 318, 0, 520, 245, 0, 0, 1]\n", "a skew of 9"),
         ("K: [0, 0, 0, 0, 0, 0, 0, 0, 0]\n", "not calibrated"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nimage_width: 640\n", "one of width and height"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nimage_size: [640.5, 480]\n", "640.5x480 px, which no image"),
-        ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nimage_size: [-640, 480]\n", "which no image"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\ndepth_scale: -1\n", "depth_scale"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nK: [1]\n", "'K' is there twice"),
         (f"K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: {[0.1] * 14}\n", "thin-prism"),
         ("K: [520, 0, 318, 0, 520, 245, 0, 0, 1]\nD: [1, 0, 0, 0]\nmodel: mei\n", "lens model 'mei'"),
         ("fx: 520\nfy: 520\ncx: 318\n", "it has no cy"),
-        ("fx: 520\nfy: broad\ncx: 318\ncy: 245\n", "fy must be a finite number"),
-        ("fx=520 fy=520", "fx must be a finite number"),
         ('{"intrinsics": {"fx": true, "fy": 1, "cx": 0, "cy": 0}}', "fx must be a finite number, found 'True'"),
         ("520 0 318\n0 520 245\n0 9 1\n", "is no camera matrix"),
         ("<opencv_storage><K>1 2 3</K></opencv_storage>", "no 3x3 camera matrix"),
@@ -285,15 +226,12 @@ def test_a_file_whose_name_is_numbers_is_read(tmp_path: Path, monkeypatch: pytes
             kalibr("radtan", RADTAN.distortion).replace("pinhole", "omni"),
             "lens model 'omni radtan' has no counterpart",
         ),
-        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "ds"), "lens model 'ds radtan'"),
-        (kalibr("radtan", RADTAN.distortion).replace("pinhole", "eucm"), "lens model 'eucm radtan'"),
         (kalibr("fov", (4.0,)), "between 0 and pi"),
         ("1 PINHOLE 640 480 520 520 318", "found 3 parameters where the model PINHOLE has 4"),
         ("1 THIN_PRISM_FISHEYE 640 480 1 2 3 4 5 6 7 8 9 1 2 3", "of the model THIN_PRISM_FISHEYE, which is not read"),
         ("1 PINHOLE 640 480 520 520 318 245\n2 PINHOLE 640 480 520 520 318 245", "holds 2 cameras"),
         (OCAM.replace("4 -400.0", "4 400.0"), "its polynomial begins with 400"),
         (OCAM.replace("480 640", "0 640"), "640x0 px, which no image has"),
-        (OCAM.replace("4 -400.0", "4 inf"), "NaN or infinity"),
     ],
 )
 def test_calibrations_that_cannot_be_are_refused(text: str, message: str, tmp_path: Path) -> None:
@@ -310,8 +248,3 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_calibration(tmp_path, (640, 480))
     with pytest.raises(CalibrationError, match="cannot write"):
         write_calibration(PINHOLE, tmp_path / "no folder" / "c.yaml")
-
-
-def test_lenses_of_a_size_are_kept_by_a_crop_of_nothing(tmp_path: Path) -> None:
-    write_calibration(replace(PINHOLE, width=641), tmp_path / "camera.yaml")
-    assert read_calibration(tmp_path / "camera.yaml", SIZE, "crop:0,0").camera == PINHOLE

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 from drawn_bags import IMAGE, Bag
 from drawn_bags import SIZE as BAG_SIZE
-from drawn_calibrations import COLMAP, FISHEYE, ORB_SLAM, PINHOLE, RADTAN, RADTAN5, ROS, SIZE, kalibr
-from drawn_datasets import write_pictures
+from drawn_calibrations import ORB_SLAM, PINHOLE, RADTAN, RADTAN5, SIZE, kalibr
 from drawn_inputs import picture
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.calibration import Calibration
-from scopemap.cameras.formats.reading import read_calibration, stated_calibration
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.cameras.formats.reading import read_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError
 from scopemap.io.opening import open_sequence
@@ -91,67 +89,30 @@ def test_what_is_no_lens_of_the_camera_is_left_alone(name: str, value: Any, tmp_
 
 
 def test_the_scale_of_depth_is_read_in_every_form(tmp_path: Path) -> None:
-    assert read(tmp_path, {**FX, "depth_scale": 0.5}).depth_scale_mm == 0.5
     assert read(tmp_path, {"intrinsics": FX, "depth_scale": 0.5}).depth_scale_mm == 0.5
     assert read(tmp_path, ORB_SLAM + "depth_scale: 0.5\n").depth_scale_mm == 0.5
-    assert read(tmp_path, kalibr("radtan", RADTAN.distortion, "depth_scale: 0.5\n")).depth_scale_mm == 0.5
     assert read(tmp_path, kalibr("radtan", RADTAN.distortion, "  depth_scale: 0.5\n")).depth_scale_mm == 0.5
-    with pytest.raises(CalibrationError, match="depth_scale"):
-        read(tmp_path, {**FX, "depth_scale": -1})
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        *("brown_conrady", "Brown Conrady", "Brown-Conrady", "plumb bob", "radial_tangential", "radial tangential"),
-        *("rational polynomial", "FULL_OPENCV", "SIMPLE_RADIAL", "pinhole-radtan", "pinhole_radtan", "radtan8"),
-        *("standard", "pinhole camera", "distortion.brown_conrady"),
+        *("brown_conrady", "Brown-Conrady", "plumb bob", "radial tangential", "rational polynomial", "FULL_OPENCV"),
+        *("SIMPLE_RADIAL", "pinhole_radtan", "radtan8", "standard", "distortion.brown_conrady", "Olympus CF-H190"),
     ],
 )
 @pytest.mark.parametrize("name", ["model", "camera_model", "type"])
 def test_words_for_opencvs_lens(name: str, words: str, tmp_path: Path) -> None:
-    for beside in ({"K": K}, FX):
-        found = read(tmp_path, {**beside, name: words, "D": FIVE})
-        assert found.camera == RADTAN5
-        assert "taken as" not in found.source
+    found = read(tmp_path, {"K": K, name: words, "D": FIVE})
+    assert found.camera == RADTAN5
+    # The endoscope's name is no lens.
+    assert ("its lens taken as OpenCV's ('olympus cf h190' names none)" in found.source) == ("Olympus" in words)
 
 
-@pytest.mark.parametrize("words", ["Olympus CF-H190", "Olympus", "monocular endoscope"])
-def test_the_endoscopes_name_is_no_lens_and_it_is_said(words: str, tmp_path: Path) -> None:
-    for beside in ({"K": K}, FX):
-        found = read(tmp_path, {**beside, "model": words, "D": FIVE})
-        assert found.camera == RADTAN5
-        assert f"its lens taken as OpenCV's ('{words.lower().replace('-', ' ')}' names none)" in found.source
-
-
-@pytest.mark.parametrize(
-    "words",
-    ["omni", "ds", "Double_Sphere", "EUCM", "MEI", "thin_prism", "DIVISION", "Inverse Brown Conrady", "thin-prism"],
-)
+@pytest.mark.parametrize("words", ["omni", "ds", "Double_Sphere", "EUCM", "MEI", "thin-prism", "DIVISION", "inverse"])
 def test_other_lenses_are_refused(words: str, tmp_path: Path) -> None:
-    for beside in ({"K": K}, FX):
-        with pytest.raises(CalibrationError, match="has no counterpart here"):
-            read(tmp_path, {**beside, "model": words, "D": FIVE})
-
-
-def test_another_lens_without_distortion_is_a_pinhole_only_where_it_projects_as_one(tmp_path: Path) -> None:
-    assert read(tmp_path, {**FX, "model": "Inverse Brown Conrady", "coeffs": [0.0] * 5}).camera == PINHOLE
     with pytest.raises(CalibrationError, match="has no counterpart here"):
-        read(tmp_path, {"K": K, "camera_model": "omni"})
-
-
-@pytest.mark.parametrize(("said", "kind"), [("true", FisheyeCamera), ("false", OpenCvCamera), ("0", OpenCvCamera)])
-def test_fisheye_is_said_by_yes_and_no(said: str, kind: type, tmp_path: Path) -> None:
-    assert isinstance(read(tmp_path, f"{MATRIX}D: {FOUR}\nfisheye: {said}\n").camera, kind)
-    assert isinstance(read(tmp_path, {**FX, "D": FOUR, "fisheye": json.loads(said)}).camera, kind)
-
-
-def test_a_fisheye_of_fewer_and_more_coefficients(tmp_path: Path) -> None:
-    text = f"{MATRIX}distortion_model: equidistant\n"
-    assert read(tmp_path, f"{text}D: []\n").camera == FisheyeCamera(PINHOLE, (0.0, 0.0, 0.0, 0.0))
-    assert read(tmp_path, f"{text}D: {[*FISHEYE.distortion, 0.0]}\n").camera == FISHEYE
-    with pytest.raises(CalibrationError, match="expected 4 numbers"):
-        read(tmp_path, f"{text}D: {[*FISHEYE.distortion, 0.1]}\n")
+        read(tmp_path, {"K": K, "model": words, "D": FIVE})
 
 
 # ---- the size
@@ -161,7 +122,6 @@ def test_a_fisheye_of_fewer_and_more_coefficients(tmp_path: Path) -> None:
     "sides",
     [
         {"imageWidth": 640, "imageHeight": 480},
-        {"Width": 640, "Height": 480},
         {"image_size": {"width": 640, "height": 480}},
         {"resolution": {"w": 640, "h": 480}},
         {"img_width": 640, "img_height": 480},
@@ -170,10 +130,9 @@ def test_a_fisheye_of_fewer_and_more_coefficients(tmp_path: Path) -> None:
     ],
 )
 def test_a_size_that_is_spelled_otherwise_holds(sides: dict[str, Any], tmp_path: Path) -> None:
-    for beside in ({"K": K}, FX):
-        assert read(tmp_path, {**beside, **sides}).camera == PINHOLE
-        with pytest.raises(CalibrationError, match=r"is for 640x480 px, but the images are 1280x960 px"):
-            read(tmp_path, {**beside, **sides}, (1280, 960))
+    assert read(tmp_path, {"K": K, **sides}).camera == PINHOLE
+    with pytest.raises(CalibrationError, match=r"is for 640x480 px, but the images are 1280x960 px"):
+        read(tmp_path, {**FX, **sides}, (1280, 960))
 
 
 @pytest.mark.parametrize("name", ["imageSize", "image_size", "resolution", "image_shape"])
@@ -181,12 +140,6 @@ def test_height_before_width_is_turned_and_it_is_said(name: str, tmp_path: Path)
     found = read(tmp_path, {"K": K, name: [480, 640]})
     assert found.camera == PINHOLE
     assert "its size 480, 640 taken as height, width" in found.source
-
-
-@pytest.mark.parametrize("board", [{"cols": 9, "rows": 6}, {"width": 9, "height": 6}, {"size": [9, 6]}])
-def test_the_size_of_the_board_is_not_the_pictures(board: dict[str, Any], tmp_path: Path) -> None:
-    found = read(tmp_path, {"K": K, **board})
-    assert found.camera == PINHOLE
 
 
 # ---- the matrix
@@ -215,12 +168,6 @@ def test_a_small_skew_is_left_out_and_it_is_said(tmp_path: Path) -> None:
 
 
 # ---- the text
-
-
-def test_colmaps_text_with_a_mark_and_comments_of_other_encodings(tmp_path: Path) -> None:
-    text = COLMAP.format(model="OPENCV", parameters="520.5 525.25 318.5 245.5 -0.3 0.1 0.001 -0.0005")
-    assert read(tmp_path, b"\xef\xbb\xbf" + text.encode()).camera == RADTAN
-    assert read(tmp_path, text.replace("Number", "Z\u00e4hler").encode("latin-1")).camera == RADTAN
 
 
 def test_a_name_that_comes_twice_matters_only_where_it_is_used(tmp_path: Path) -> None:
@@ -285,21 +232,3 @@ def test_a_bags_camera_of_another_size_obeys_camera_fit(tmp_path: Path) -> None:
     assert f"rescaled from {2 * width}x{2 * height} px" in scaled.camera_source
     cut = open_sequence(file, settings=InputSettings(camera_fit="crop:30,20"))
     assert cut.rectifier.source == PinholeCamera(120.0, 122.0, 32.5, 28.5, *BAG_SIZE)
-
-
-def test_a_bags_lens_is_read_as_a_files(tmp_path: Path) -> None:
-    sequence = open_sequence(bag(tmp_path, model="Brown Conrady", d=tuple(FIVE)))
-    assert isinstance(sequence.rectifier.source, OpenCvCamera)
-    (tmp_path / "a.bag").unlink()
-    sequence = open_sequence(bag(tmp_path, model="equidistant", d=(-0.1, 0.0, 0.0, 0.0, 0.0)))
-    assert sequence.rectifier.source.distortion == (-0.1, 0.0, 0.0, 0.0)  # type: ignore[attr-defined]
-
-
-def test_scaling_that_has_nothing_to_scale_is_said(tmp_path: Path) -> None:
-    folder = write_pictures(tmp_path / "frames")
-    scale = InputSettings(camera_fit="scale")
-    assert (
-        "no calibration file: --camera-fit scale has no effect" in open_sequence(folder, settings=scale).camera_source
-    )
-    (tmp_path / "any.yaml").write_text(ROS)
-    assert "scale" not in stated_calibration(tmp_path / "any.yaml", SIZE).source

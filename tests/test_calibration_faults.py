@@ -36,33 +36,25 @@ BOMBS = {
     "entities": ENTITIES,
     "entity outside": OUTSIDE,
     "brackets": "K: " + "[" * MANY,
-    "braces": "{a: " * MANY,
     "json brackets": '{"K": ' + "[" * MANY,
     "json objects": '{"K": ' * 100_000,
     "dashes": "K:\n " + "- " * MANY,
-    "questions": "? " * MANY,
     "elements": "<opencv_storage>" + "<K>" * MANY,
-    "closed elements": "<opencv_storage>" + "<K>" * MANY + "</K>" * 60_000,
     "many elements": "<opencv_storage>" + "<K/>" * MANY + "</opencv_storage>",
     "many rows": "K:\n" + "- 1\n" * MANY,
     "many names": "".join(f"n{i}:\n  m: 1\n" for i in range(60_000)),
     "one long word": "x" * 1_000_000,
-    "one long name": "x" * 900_000 + ": 1\ny: [2]\n",
     "long quote": 'K: "' + "x" * 1_000_000,
     "tags": "K: " + "!" * MANY,
     "separators": "," * 1_000_000,
-    "blanks": " " * 1_000_000,
-    "lines": "\n" * 1_000_000,
     "many numbers": "1 " * 400_000,
     "long number": "K: [" + "9" * 900_000 + ", 0, 1, 0, 1, 1, 0, 0, 1]\n",
     "long whole number in json": '{"K": [' + "9" * 900_000 + "]}",
-    "exponent": "1e400 1e400 1 1",
     "huge": "1e308 1e308 1e308 1e308 1e308 1e308 1e308 1e308",
     "huge polynomial": "camera_model: omnidirectional\nK: [5e2, 0, 3e2, 0, 5e2, 2e2, 0, 0, 1]\n"
     f"polynomial: {[500.0] * 10_000}\n",
     "huge size": "K: [520, 0, 318, 0, 525, 245, 0, 0, 1]\nimage_width: 1e300\nimage_height: 1e300\n",
     "nul": "K: [520, 0\0]",
-    "control": "K: [\x01\x02\x7f]",
     "colmap of many": "1 PINHOLE 640 480 520 520 318 245\n" * 20_000,
 }
 BINARY = {
@@ -86,22 +78,13 @@ def refused(file: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("bomb", BOMBS)
+@pytest.mark.parametrize("bomb", [*BOMBS, *BINARY])
 def test_bombs(bomb: str, tmp_path: Path) -> None:
-    (tmp_path / "bomb").write_text(BOMBS[bomb], encoding="utf-8")
-    assert "bomb" in refused(tmp_path / "bomb")
-
-
-@pytest.mark.parametrize("junk", BINARY)
-def test_binary_junk(junk: str, tmp_path: Path) -> None:
-    (tmp_path / "junk").write_bytes(BINARY[junk])
-    assert "junk" in refused(tmp_path / "junk")
-
-
-def test_what_harms_is_named(tmp_path: Path) -> None:
-    for bomb, word in [("entities", "entities"), ("brackets", "deeper"), ("dashes", "deeper")]:
-        (tmp_path / "bomb").write_text(BOMBS[bomb])
-        assert word in refused(tmp_path / "bomb")
+    (tmp_path / "bomb").write_bytes(BINARY.get(bomb) or BOMBS[bomb].encode())
+    message = refused(tmp_path / "bomb")
+    assert "bomb" in message
+    named = {"entities": "entities", "brackets": "deeper", "dashes": "deeper"}
+    assert named.get(bomb, "") in message
 
 
 def test_a_large_file_is_not_read(tmp_path: Path) -> None:
@@ -119,9 +102,7 @@ def test_a_pipe_and_a_loop_are_not_waited_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the limit of memory is Linux' own")
-@pytest.mark.parametrize(
-    "bomb", ["aliases", "entities", "brackets", "elements", "many elements", "many rows", "braces"]
-)
+@pytest.mark.parametrize("bomb", ["aliases", "entities", "brackets", "elements", "many elements", "many rows"])
 def test_bombs_take_little_memory(bomb: str, tmp_path: Path) -> None:
     (tmp_path / "bomb").write_text(BOMBS[bomb])
     code = (

@@ -46,45 +46,13 @@ def test_project_undoes_unproject_over_the_whole_image(camera: CameraModel) -> N
     assert np.abs(camera.project(rays[seen]) - pixels[seen]).max() < 1e-6
 
 
-def test_project_does_not_depend_on_the_distance(camera: CameraModel) -> None:
-    rays = camera.unproject(grid(camera, 97))
-    np.testing.assert_allclose(camera.project(37.5 * rays), camera.project(rays), rtol=0, atol=1e-7)
-
-
 def test_points_behind_the_camera_have_no_pixel(camera: CameraModel) -> None:
     assert np.isnan(camera.project(np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 0.0]]))).all()
-
-
-def test_the_principal_point_looks_along_the_axis(camera: CameraModel) -> None:
-    pixel = camera.project(np.array([0.0, 0.0, 2.0]))
-    np.testing.assert_allclose(pixel, [camera.central.cx, camera.central.cy])
-    np.testing.assert_allclose(camera.unproject(pixel), [0, 0, 1], atol=1e-12)
 
 
 def test_the_central_pinhole_agrees_near_the_axis(camera: CameraModel) -> None:
     points = np.array([[1e-4, 0, 1], [0, 1e-4, 1], [-1e-4, 1e-4, 1]])
     np.testing.assert_allclose(camera.project(points), camera.central.project(points), atol=3e-3 * 1e-4 * 770)
-
-
-@pytest.mark.parametrize("size", [(320, 240), (337, 270), (1000, 300)])
-def test_resized_keeps_the_view(camera: CameraModel, size: tuple[int, int]) -> None:
-    pixels = grid(camera, 53)
-    scale = np.array(size) / np.array([camera.width, camera.height])
-    small = camera.resized(*size)
-    assert (small.width, small.height) == size
-    np.testing.assert_allclose(
-        small.unproject((pixels + 0.5) * scale - 0.5), camera.unproject(pixels), rtol=1e-9, atol=1e-9
-    )
-
-
-def test_cropped_keeps_the_view(camera: CameraModel) -> None:
-    part = camera.cropped(37, 21, 500, 400)
-    assert (part.width, part.height) == (500, 400)
-    pixels = grid(part, 53)
-    np.testing.assert_allclose(
-        part.unproject(pixels), camera.unproject(pixels + np.array([37, 21])), rtol=1e-9, atol=1e-12
-    )
-    np.testing.assert_allclose(part.central.matrix[:2, :2], camera.central.matrix[:2, :2])
 
 
 @settings(max_examples=40, deadline=None)
@@ -126,30 +94,6 @@ def test_fov_lens_is_the_published_formula() -> None:
     assert np.isnan(camera.unproject(np.array([beyond, PINHOLE.cy]))).all()
 
 
-@settings(max_examples=40, deadline=None)
-@given(omega=st.floats(0.05, 3.0), tangent=st.floats(0, 45.0), angle=st.floats(0, 6.3))
-def test_fov_round_trip_anywhere_in_the_field(omega: float, tangent: float, angle: float) -> None:
-    camera = FovCamera(PINHOLE, omega)
-    pixel = camera.project(np.array([tangent * np.cos(angle), tangent * np.sin(angle), 1.0]))
-    ray = camera.unproject(pixel)
-    np.testing.assert_allclose(np.hypot(ray[0], ray[1]), tangent, rtol=1e-7, atol=1e-12)
-    assert np.abs(camera.project(ray) - pixel).max() < 1e-6
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    k1=st.floats(-0.2, 0.2), k2=st.floats(-0.02, 0.02), k3=st.floats(-5e-3, 5e-3), share=st.floats(0, 0.98),
-    angle=st.floats(0, 6.3),
-)  # fmt: skip
-def test_fisheye_round_trip_anywhere_in_the_field(k1: float, k2: float, k3: float, share: float, angle: float) -> None:
-    camera = FisheyeCamera(PINHOLE, (k1, k2, k3, 0.0))
-    tangent = np.tan(share * camera.field_rad)
-    pixel = camera.project(np.array([tangent * np.cos(angle), tangent * np.sin(angle), 1.0]))
-    ray = camera.unproject(pixel)
-    np.testing.assert_allclose(np.hypot(ray[0], ray[1]), tangent, rtol=1e-7, atol=1e-12)
-    assert np.abs(camera.project(ray) - pixel).max() < 1e-6
-
-
 def test_source_pixels_are_where_other_code_puts_them() -> None:
     """The ray of a working pixel by hand; then OpenCV's own projection, or each lens' formula."""
     working = PinholeCamera(200.0, 210.0, 150.0, 110.0, 320, 240)
@@ -177,36 +121,6 @@ def test_source_pixels_are_where_other_code_puts_them() -> None:
     assert np.isnan(source_pixel(np.array([[1e9, 0.0]]), working, OMNI)).all()
 
 
-@pytest.mark.parametrize("camera", [OPENCV, RATIONAL], ids=["opencv", "rational"])
-def test_opencv_model_agrees_with_cv2(camera: OpenCvCamera) -> None:
-    rays = camera.unproject(grid(camera, 11)).reshape(-1, 3)
-    matrix, distortion = camera.central.matrix, np.array(camera.distortion)
-    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, distortion)
-    np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-9)
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-13)
-    back = cv2.undistortPointsIter(expected, matrix, distortion, np.eye(3), np.eye(3), criteria)
-    np.testing.assert_allclose(rays[:, :2], back[:, 0], atol=1e-7)
-
-
-def test_fisheye_model_agrees_with_cv2() -> None:
-    pixels = grid(FISHEYE, 31).reshape(-1, 2)
-    rays = FISHEYE.unproject(pixels)
-    rays = rays[np.isfinite(rays).all(-1)]
-    matrix, distortion = FISHEYE.central.matrix, np.array(FISHEYE.distortion)
-    expected, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, distortion)
-    np.testing.assert_allclose(FISHEYE.project(rays), expected[:, 0], atol=1e-6)
-
-
-def test_omnidirectional_ray_is_the_published_formula() -> None:
-    u, v = 1000.0, 200.0
-    c, d, e = OMNI.stretch
-    a, b = np.linalg.solve([[c, d], [e, 1.0]], [u - OMNI.cx, v - OMNI.cy])
-    rho = np.hypot(a, b)
-    ray = np.array([a, b, np.polynomial.polynomial.polyval(rho, OMNI.polynomial)])
-    np.testing.assert_allclose(OMNI.unproject(np.array([u, v])), ray / ray[2])
-    np.testing.assert_allclose(OMNI.project(12.0 * ray), [u, v], atol=1e-8)
-
-
 def test_omnidirectional_corners_look_sideways_and_are_not_seen() -> None:
     assert np.isnan(OMNI.unproject(np.array([[0.0, 0.0], [1349.0, 1079.0]]))).all()
 
@@ -223,34 +137,25 @@ def test_a_lens_that_turns_back_has_no_pixel_beyond_its_field() -> None:
     np.testing.assert_allclose(camera.unproject(just_inside), [0.9999, 0, 1], atol=1e-9)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
-    k1=st.floats(-0.4, 0.4), k2=st.floats(-0.1, 0.1), p1=st.floats(-2e-3, 2e-3), p2=st.floats(-2e-3, 2e-3),
+    kind=st.integers(0, 3), a=st.floats(-0.3, 0.3), b=st.floats(-0.02, 0.02), c=st.floats(-2e-3, 2e-3),
     share=st.floats(0, 0.9), angle=st.floats(0, 6.3),
 )  # fmt: skip
-def test_opencv_round_trip_anywhere_in_the_field(
-    k1: float, k2: float, p1: float, p2: float, share: float, angle: float
+def test_round_trip_anywhere_in_the_field_of_any_lens(
+    kind: int, a: float, b: float, c: float, share: float, angle: float
 ) -> None:
-    camera = OpenCvCamera(PINHOLE, (k1, k2, p1, p2))
-    r = share * min(np.tan(camera.field_rad), 1.5)
-    pixel = camera.project(np.array([r * np.cos(angle), r * np.sin(angle), 1.0]))
-    assert np.abs(camera.project(camera.unproject(pixel)) - pixel).max() < 1e-6
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    a0=st.floats(200, 1000), bend=st.floats(-0.8, 0.2), c=st.floats(0.95, 1.05), d=st.floats(-0.01, 0.01),
-    share=st.floats(0, 0.99), angle=st.floats(0, 6.3),
-)  # fmt: skip
-def test_omnidirectional_round_trip_anywhere_in_the_field(
-    a0: float, bend: float, c: float, d: float, share: float, angle: float
-) -> None:
-    camera = OmnidirectionalCamera((a0, 0.0, bend / a0), 320.0, 240.0, 640, 480, (c, d, -d))
-    tangent = share * 4.0
+    camera: CameraModel = (
+        OpenCvCamera(PINHOLE, (a, b, c, -c)),
+        FisheyeCamera(PINHOLE, (a / 2, b, c, 0.0)),
+        FovCamera(PINHOLE, 1.6 + 5 * a),
+        OmnidirectionalCamera((600 + 1000 * a, 0.0, b / 20), 320.0, 240.0, 640, 480, (1 + b, c, -c)),
+    )[kind]
+    tangent = share * min(np.tan(getattr(camera, "field_rad", 1.3)), 45.0 if kind else 1.5)
     pixel = camera.project(np.array([tangent * np.cos(angle), tangent * np.sin(angle), 1.0]))
     if np.isfinite(pixel).all():
         ray = camera.unproject(pixel)
-        np.testing.assert_allclose(np.hypot(ray[0], ray[1]), tangent, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(np.hypot(ray[0], ray[1]), tangent, rtol=1e-7, atol=1e-9)
         assert np.abs(camera.project(ray) - pixel).max() < 1e-6
 
 

@@ -11,17 +11,27 @@ import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
 from PIL import Image
 
-from scopemap.calibration.camera_calibration import CameraCalibration, calibrate, save_calibration, warnings_about
-from scopemap.calibration.intrinsics import FORMS, LensForm, choose_form, fit_camera, with_deviations
-from scopemap.calibration.picture import draw_calibration
+from scopemap.calibration.camera_calibration import (
+    FORMS,
+    CameraCalibration,
+    LensForm,
+    calibrate,
+    fit_camera,
+    save_calibration,
+    warnings_about,
+    with_deviations,
+)
+from scopemap.calibration.residual_picture import draw_calibration
 from scopemap.calibration.targets import (
+    BoardView,
     CharucoBoard,
     Checkerboard,
     Corners,
+    Search,
     Target,
+    edge_width_px,
     nearest_px,
 )
-from scopemap.calibration.views import BoardView, Search, edge_width_px, select_views
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError, SettingsError
@@ -98,15 +108,6 @@ def test_a_known_camera_is_found_again(
     assert done.fit.rms_px < 0.12
 
 
-def test_a_fit_says_how_sure_it_is(pinhole: CameraCalibration, fisheye: CameraCalibration) -> None:
-    for done, truth in ((pinhole, PINHOLE), (fisheye, FISHEYE)):
-        assert set(done.fit.deviations) == set(done.fit.parameters) == {"fx", "fy", "cx", "cy", *done.fit.form.terms}
-        for name in ("fx", "fy", "cx", "cy"):
-            off = abs(done.fit.parameters[name] - getattr(truth.central, name))
-            assert 0 < done.fit.deviations[name] < 0.5
-            assert off < 3 * done.fit.deviations[name]
-
-
 def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
     studio, form, shares = Studio(PINHOLE, CHECKERBOARD), LensForm("pinhole", ("k1", "k2", "p1", "p2")), []
     true = np.array(
@@ -138,23 +139,6 @@ def test_the_wrong_and_the_blurred_view_are_left_out_with_the_reason(
     assert BLURRED in {out.view.index for out in pinhole.blurred}
 
 
-def test_corners_that_are_off_go_and_their_view_stays(pinhole_search: Search, pinhole: CameraCalibration) -> None:
-    views = {view.index: view for view in pinhole.views}
-    spoiled = []
-    for view in list(views.values())[:3]:
-        pixels = view.corners.pixels.copy()
-        pixels[:2] += [7.0, -4.0]
-        corners = Corners(view.corners.board_mm, pixels)
-        spoiled.append(replace(view, corners=corners))
-    searched_again = replace_views(pinhole_search, [*spoiled, *list(views.values())[3:]])
-    done = calibrate(searched_again, CHECKERBOARD, "pinhole")
-    assert [view.index for view in done.views] == list(views)
-    for view in spoiled:
-        kept = next(each for each in done.views if each.index == view.index).corners.pixels
-        assert not any((kept == pixel).all(axis=1).any() for pixel in view.corners.pixels[:2])
-    assert done.fit.camera.central.fx == pytest.approx(pinhole.fit.camera.central.fx, rel=1e-3)
-
-
 def test_the_model_and_no_more_coefficients_than_needed_are_chosen(
     pinhole: CameraCalibration, fisheye: CameraCalibration
 ) -> None:
@@ -163,15 +147,6 @@ def test_the_model_and_no_more_coefficients_than_needed_are_chosen(
     assert list(pinhole.held_out_px) == list(FORMS)
     best_other = min(error for form, error in fisheye.held_out_px.items() if form.model == "pinhole")
     assert best_other > 3 * fisheye.held_out_px[fisheye.fit.form]
-
-
-def test_the_simpler_form_wins_unless_another_is_clearly_better() -> None:
-    simple, rich, fish = FORMS[1], FORMS[4], FORMS[6]
-    assert choose_form({simple: 0.100, rich: 0.099, fish: 0.0985}) == simple
-    assert choose_form({simple: 0.100, rich: 0.090, fish: 0.089}) == rich
-    assert choose_form({simple: np.inf, rich: np.inf, fish: 0.2}) == fish
-    with pytest.raises(CalibrationError, match="no model predicts views"):
-        choose_form({simple: np.inf})
 
 
 def test_the_summary_says_where_the_boards_were(pinhole: CameraCalibration) -> None:
@@ -189,37 +164,39 @@ def test_the_summary_says_where_the_boards_were(pinhole: CameraCalibration) -> N
 # ---- selection
 
 
-def test_views_that_show_the_same_count_once(pinhole_search: Search) -> None:
-    sharp = [view for view in pinhole_search.views if view.index < 100]
-    again = [replace(view, index=1000 * k + view.index) for k in range(5) for view in sharp]
-    selected, _ = select_views(again, SIZE)
-    assert len(selected) == len({view.index % 1000 for view in selected}) <= len(sharp)
-    few, _ = select_views(sharp, SIZE, most=5)
-    assert len(few) == 5
-    spread = np.ptp([view.corners.pixels.mean(axis=0) for view in few], axis=0)
-    assert (spread > 0.25 * np.array(SIZE)).all()
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        ([0] * 30, r"found in 30 of 30 frames, but 1 of these views .* at least 8 needed: move"),
+        ([0, 1], r"found in 2 of 2 frames, at least 8 needed: looked for a checkerboard of 9"),
+    ],
+)
+def test_too_few_views_that_differ_are_refused(pinhole_search: Search, views: list[int], words: str) -> None:
+    few = [replace(pinhole_search.views[view], index=place) for place, view in enumerate(views)]
+    with pytest.raises(InputError, match=words):
+        calibrate(replace(pinhole_search, views=few, looked_at=len(few)), CHECKERBOARD)
 
 
-def test_a_still_board_is_refused(pinhole_search: Search) -> None:
-    one = pinhole_search.views[0]
-    still = replace_views(pinhole_search, [replace(one, index=i) for i in range(30)])
-    with pytest.raises(InputError, match=r"found in 30 of 30 frames, but 1 of these views .* at least 8 needed: move"):
-        calibrate(still, CHECKERBOARD)
-
-
-def replace_views(search: Search, views: list[BoardView]) -> Search:
-    return replace(search, views=views, looked_at=len(views))
+def test_stray_corners_go_and_shortcomings_are_said(pinhole_search: Search, pinhole: CameraCalibration) -> None:
+    spoiled = [*pinhole.views]
+    for place, view in enumerate(spoiled[:3]):
+        pixels = view.corners.pixels + np.where(np.arange(len(view.corners))[:, None] < 2, [7.0, -4.0], 0.0)
+        spoiled[place] = replace(view, corners=Corners(view.corners.board_mm, pixels))
+    done = calibrate(replace(pinhole_search, views=spoiled), CHECKERBOARD, "pinhole")
+    assert [view.index for view in done.views] == [view.index for view in pinhole.views]
+    assert all(
+        len(view.corners) <= len(whole.corners) - 2 for view, whole in zip(done.views[:3], spoiled, strict=False)
+    )
+    assert done.fit.camera.central.fx == pytest.approx(pinhole.fit.camera.central.fx, rel=1e-3)
+    flat = np.tile(np.eye(4), (len(done.views), 1, 1))
+    rough = tuple(100 * residual for residual in done.fit.residuals_px)
+    poor = replace(done.fit, T_camera_board=flat, residuals_px=rough, deviations=done.fit.deviations | {"fx": 10.0})
+    said = "\n".join(warnings_about(poor, 0.3))
+    for words in ("in 0 view(s)", "cover 30 %", "px off on the whole", "known to 3.8 % only"):
+        assert words in said
 
 
 # ---- what cannot serve
-
-
-def test_too_few_views_are_refused(pinhole_search: Search) -> None:
-    few = replace(replace_views(pinhole_search, pinhole_search.views[:2]), looked_at=200)
-    with pytest.raises(
-        InputError, match=r"found in 2 of 200 frames, at least 8 needed: looked for a checkerboard of 9"
-    ):
-        calibrate(few, CHECKERBOARD)
 
 
 def test_corners_without_sense_are_refused(pinhole_search: Search) -> None:
@@ -236,8 +213,6 @@ def test_corners_without_sense_are_refused(pinhole_search: Search) -> None:
     ("make", "words"),
     [
         (lambda: Checkerboard(2, 6, 3.0), "2x6 cannot be"),
-        (lambda: Checkerboard(9, 101, 3.0), "9x101 cannot be"),
-        (lambda: Checkerboard(9, 6, 0.0), "larger than 0 mm"),
         (lambda: Checkerboard(9, 6, float("nan")), "larger than 0 mm"),
         (lambda: CharucoBoard(7, 5, 4.0, 4.0), "does not fit a square"),
         (lambda: CharucoBoard(7, 5, 4.0, 3.0, "DICT_3X3"), "unknown markers 'DICT_3X3': choose one of DICT_4X4_100,"),
@@ -274,19 +249,6 @@ def large() -> Studio:
 
 
 # ---- what is left open
-
-
-def test_warnings(pinhole: CameraCalibration) -> None:
-    fit = pinhole.fit
-    assert warnings_about(fit, 0.8) == []
-    flat = fit.T_camera_board.copy()
-    flat[:, :3, :3] = np.eye(3)
-    rough = tuple(100 * residual for residual in fit.residuals_px)
-    unsure = fit.deviations | {"fx": 10.0}
-    poor = replace(fit, T_camera_board=flat, residuals_px=rough, deviations=unsure)
-    said = "\n".join(warnings_about(poor, 0.3))
-    for words in ("in 0 view(s)", "cover 30 %", "px off on the whole", "known to 3.8 % only"):
-        assert words in said
 
 
 def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: CameraCalibration, tmp_path: Path) -> None:

@@ -68,39 +68,44 @@ def test_a_picture_that_cannot_be_decoded_is_left_out_and_keeps_its_number(tmp_p
     assert any("9 bytes for 48 rows of 192 bytes" in warning for warning in short.warnings)
 
 
-def test_pictures_of_another_size_are_an_error(tmp_path: Path) -> None:
-    bag = small_bag(2)
-    bag.image(IMAGE, 2, picture(2, (SIZE[0], SIZE[1] + 2)), "rgb8")
-    with pytest.raises(InputError, match=r"image 2 of .* is 64x50 px, those before it are 64x48 px"):
-        numbers(RosBag(bag.write_bag1(tmp_path / "a.bag")))
+DEPTH = np.ones((48, 64), np.uint16), "16UC1"
 
 
-def test_a_bag_without_pictures_names_what_it_holds(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        ([("/depth", DEPTH, {}), ("/depth", DEPTH, {})], f"holds no images .* {INFO}, /depth"),
+        ([(IMAGE, (picture(0, SIZE), "nv97"), {})], "encoding 'nv97' of its images is not known"),
+        ([(IMAGE, (picture(0, SIZE), "rgb8"), {"height": 60_000, "width": 60_000})], "more than 64 million pixels"),
+    ],
+)
+def test_bags_without_usable_pictures_are_one_sentence(tmp_path: Path, messages: list[Any], message: str) -> None:
     bag = Bag()
     bag.info()
-    for number in range(2):
-        bag.image("/depth", number, np.ones((48, 64), np.uint16), "16UC1")
-    file = bag.write_bag1(tmp_path / "a.bag")
-    with pytest.raises(InputError, match=f"holds no images .* {INFO}, /depth"):
-        open_sequence(file)
+    for number, (topic, (values, encoding), fields) in enumerate(messages):
+        bag.image(topic, number, values, encoding, **fields)
+    with pytest.raises(InputError, match=message):
+        open_sequence(bag.write_bag1(tmp_path / "a.bag"))
 
 
-@pytest.mark.parametrize("topic", ["/nowhere", "/depth"])
-def test_a_topic_that_holds_no_pictures_is_refused(tmp_path: Path, topic: str) -> None:
+def test_topics_sizes_and_stamps_that_do_not_fit(tmp_path: Path) -> None:
     bag = small_bag(2)
-    bag.image("/depth", 0, np.ones((48, 64), np.uint16), "16UC1")
+    bag.image("/depth", 0, *DEPTH)
+    bag.image(IMAGE, 3, picture(2, SIZE), "rgb8", stamp_ns=0)
+    bag.image(IMAGE, 4, picture(3, SIZE), "rgb8", stamp_ns=START_NS)
+    bag.image(IMAGE, 5, picture(4, (SIZE[0], SIZE[1] + 2)), "rgb8")
     file = bag.write_bag1(tmp_path / "a.bag")
-    with pytest.raises(InputError, match=f"no images under the topic '{topic}'; there are {IMAGE}"):
-        open_sequence(file, dataset=f"rosbag:{topic}")
+    for topic in ("/nowhere", "/depth"):
+        with pytest.raises(InputError, match=f"no images under the topic '{topic}'; there are {IMAGE}"):
+            open_sequence(file, dataset=f"rosbag:{topic}")
     with pytest.raises(InputError, match="only rosbag:TOPIC"):
         open_sequence(file, dataset="video:1")
-
-
-def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
-    bag = Bag()
-    bag.image(IMAGE, 0, picture(0, SIZE), "nv97")
-    with pytest.raises(InputError, match="encoding 'nv97' of its images is not known"):
-        open_sequence(bag.write_bag1(tmp_path / "a.bag"))
+    source = RosBag(file)
+    assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 3 * STEP_NS + 5) / 1e9)
+    with pytest.raises(InputError, match=r"image 4 of .* is 64x50 px, those before it are 64x48 px"):
+        numbers(source)
+    assert any("hold no stamp" in warning for warning in source.warnings)
+    assert f"the stamps of {IMAGE} do not increase: images stay as they were recorded" in source.warnings
 
 
 @pytest.mark.parametrize(
@@ -113,6 +118,7 @@ def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
         ({"model": "double_sphere", "d": (1.0,)}, "double[ _]sphere"),
         ({"model": "rational_polynomial", "d": (0.1,) * 12}, "thin-prism and tilt coefficients"),
         ({"d": (np.nan, 0, 0, 0, 1)}, "distortion_coefficients must be a finite number"),
+        ({"k": np.zeros(9)}, ""),
         ({"roi": (1, 1, 48, 64)}, "its region, 64x48 px at 1,1, is no part of 64x48 px"),
     ],
 )
@@ -123,19 +129,15 @@ def test_a_camera_that_cannot_be_is_told_and_another_may_be_given(
     bag.messages.pop(0)
     bag.info(**info)
     file = bag.write_bag1(tmp_path / "a.bag")
-    with pytest.raises(CalibrationError, match=message):
-        open_sequence(file)
+    if message:
+        with pytest.raises(CalibrationError, match=message):
+            open_sequence(file)
+    else:
+        sequence = open_sequence(file)
+        assert not sequence.calibrated
+        assert any("not calibrated (K is zero)" in note for note in sequence.notes)
     (tmp_path / "camera.txt").write_text("60 60 31 24\n")
     assert open_sequence(file, camera=tmp_path / "camera.txt").calibrated
-
-
-def test_a_camera_that_was_never_calibrated_is_unknown(tmp_path: Path) -> None:
-    bag = small_bag(2)
-    bag.messages.pop(0)
-    bag.info(k=np.zeros(9))
-    sequence = open_sequence(bag.write_bag1(tmp_path / "a.bag"))
-    assert not sequence.calibrated
-    assert any("not calibrated (K is zero)" in note for note in sequence.notes)
 
 
 def test_metadata_that_does_not_fit_the_files_is_one_sentence(tmp_path: Path) -> None:
@@ -166,36 +168,11 @@ def test_a_count_beyond_the_file_is_bounded(tmp_path: Path) -> None:
         RosBag(folder)
 
 
-def test_some_messages_without_a_stamp_are_told(tmp_path: Path) -> None:
-    bag = small_bag(2)
-    bag.image(IMAGE, 2, picture(2, SIZE), "rgb8", stamp_ns=0)
-    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
-    assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 2 * STEP_NS + 5) / 1e9)
-    assert any("hold no stamp" in warning for warning in source.warnings)
-
-
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_bag1(tmp_path / "a")
     monkeypatch.setattr("scopemap.io.datasets.rosbag.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install -e '\.\[ros\]'"):
         open_sequence(file)
-
-
-def test_a_picture_that_claims_too_many_pixels_is_refused(tmp_path: Path) -> None:
-    bag = Bag()
-    for number in range(2):
-        bag.image(IMAGE, number, picture(number, SIZE), "rgb8", height=60_000, width=60_000)
-    with pytest.raises(InputError, match="more than 64 million pixels"):
-        open_sequence(bag.write_bag1(tmp_path / "a.bag"))
-
-
-def test_stamps_out_of_order_are_told(tmp_path: Path) -> None:
-    bag = Bag()
-    for number, place in enumerate((0, 1, 3, 2, 4)):
-        bag.image(IMAGE, number, picture(number, SIZE), "rgb8", stamp_ns=START_NS + place * STEP_NS)
-    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
-    assert numbers(source) == [0, 1, 2, 3, 4]
-    assert source.warnings == [f"the stamps of {IMAGE} do not increase: images stay as they were recorded"]
 
 
 def test_messages_of_another_serialization_are_named(tmp_path: Path) -> None:

@@ -37,15 +37,9 @@ def test_a_video_of_an_unknown_codec_is_one_sentence(tmp_path: Path) -> None:
         open_sequence(file)
 
 
-def test_a_video_knows_neither_poses_nor_truth(tmp_path: Path) -> None:
-    source = open_sequence(write_video(tmp_path / "v.mp4", 4)).source
-    assert (source.pose(0), source.truth(0), source.stamps(slice(None))) == (None, None, None)
-
-
 COLOURS = [(200, 40, 60), (180, 120, 90), (255, 255, 255), (0, 0, 0), (30, 200, 220)]
 FORMS = [
     ("libx264", "yuv420p", {"qp": "0"}),
-    ("libx264", "yuv420p10le", {"qp": "0"}),
     ("hevc", "yuv420p10le", {"x265-params": "lossless=1:log-level=error"}),
     ("ffv1", "yuv444p10le", {}),
 ]
@@ -62,12 +56,6 @@ def test_colours_are_those_that_the_stream_states(
         file = one_colour(tmp_path / name, rgb, codec, pix_fmt, bt709=bt709, full=full, options=options)
         frame = next(VideoFile(file).frames(slice(None)))
         assert np.abs(frame.rgb.astype(int) - rgb).max() <= 3
-
-
-def test_full_range_jpeg_colours(tmp_path: Path) -> None:
-    rgb = COLOURS[1]
-    file = one_colour(tmp_path / "v.mp4", rgb, "libx264", "yuvj420p", bt709=False, full=True, options={"qp": "0"})
-    assert np.abs(next(VideoFile(file).frames(slice(None))).rgb.astype(int) - rgb).max() <= 3
 
 
 @pytest.mark.parametrize(
@@ -140,7 +128,6 @@ def test_mended_times_increase(stamps: list[float | None]) -> None:
     ("stamps", "expected", "repaired"),
     [
         ([0.0, 0.04, 0.09, 0.2], [0.0, 0.04, 0.09, 0.2], 0),
-        ([7.5, 7.54, 7.58], [7.5, 7.54, 7.58], 0),
         ([None, None, None], [0.0, 0.04, 0.08], 3),
         ([0.0, None, 0.08], [0.0, 0.04, 0.08], 1),
         ([0.0, 0.04, 0.04, 0.08], [0.0, 0.04, 0.08, 0.12], 2),
@@ -154,26 +141,6 @@ def test_how_times_are_mended(stamps: list[float | None], expected: list[float],
     assert mend.repaired == repaired
 
 
-@pytest.mark.parametrize("lag", [1, 2])
-def test_stamps_out_of_order_do_not_make_time_run_away(lag: int) -> None:
-    stated = [(index + (lag if index % 3 == 1 else -lag if index % 3 == 2 else 0)) / 25 for index in range(300)]
-    mend = TimeStamps(25.0)
-    times_s = [mend(index, stamp) for index, stamp in enumerate(stated)]
-    np.testing.assert_allclose(times_s, np.arange(300) / 25, atol=(2 * lag + 1) / 25)
-
-
-def test_a_time_lapse_keeps_its_stamps() -> None:
-    mend = TimeStamps(1 / 90)
-    assert [mend(index, 90.0 * index) for index in range(4)] == [0, 90, 180, 270]
-    assert mend.repaired == 0
-
-
-def test_reordered_frames_in_avi_last_as_long_as_they_do(tmp_path: Path) -> None:
-    source = VideoFile(encode(tmp_path / "v.avi", clip(60, size=(64, 48)), pix_fmt="yuv420p"))
-    times_s = [frame.time_s for frame in source.frames(slice(None))]
-    assert times_s[-1] - times_s[0] == pytest.approx(59 / source.rate_hz, abs=5 / source.rate_hz)
-
-
 def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:
     file = encode(tmp_path / "v.h264", clip(6, size=(64, 48)), pix_fmt="yuv420p")
     source = VideoFile(file)
@@ -182,17 +149,11 @@ def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(times_s), 1 / source.rate_hz, rtol=0.01)
 
 
-def test_samples_come_from_all_parts(tmp_path: Path) -> None:
+def test_samples_come_from_all_parts_of_a_video_that_can_be_searched(tmp_path: Path) -> None:
     pictures = [picture(i // 4, (160, 120)) for i in range(80)]
-    source = VideoFile(write(tmp_path / "v.mp4", pictures))
-    numbers = [number_in(one) for one in source.samples(8)]
-    assert len(numbers) == 8
-    assert min(numbers) < 3
-    assert max(numbers) > 14
-
-
-def test_samples_of_a_video_that_cannot_be_searched_are_read_in_order(tmp_path: Path) -> None:
-    pictures = [picture(i // 4, (160, 120)) for i in range(80)]
+    searched = [number_in(one) for one in VideoFile(write(tmp_path / "all.mp4", pictures)).samples(8)]
+    assert len(searched) == 8
+    assert min(searched) < 3 < 14 < max(searched)
     one_key_frame = encode(tmp_path / "v.mp4", pictures, options={"qp": "0", "g": "600", "sc_threshold": "0"})
     numbers = [number_in(one) for one in VideoFile(one_key_frame).samples(8)]
     assert numbers == sorted(numbers)

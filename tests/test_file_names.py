@@ -13,10 +13,6 @@ import pytest
 from front_door import call
 from tiny_phantom import write_tiny
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError
 from scopemap.io import result_folder
 from scopemap.reconstruction import DepthReader
 
@@ -43,14 +39,6 @@ def test_a_folder_with_any_letters_is_read_and_written(tmp_path: Path, capfd: py
     assert DepthReader(run).read(0) is not None
     assert (folder / "→/images/000000.png").stat().st_size > 0
     assert json.loads((run / "provenance.json").read_text(encoding="utf-8"))["input"] == str(phantom)
-
-
-def test_a_calibration_is_written_under_any_name(tmp_path: Path) -> None:
-    camera = PinholeCamera(500.25, 501.5, 320.125, 240.75, 640, 480)
-    write_calibration(camera, tmp_path / f"{NAME}.yaml")
-    assert read_calibration(tmp_path / f"{NAME}.yaml", (640, 480)).camera.central == camera
-    with pytest.raises(CalibrationError, match="cannot write the calibration"):
-        write_calibration(camera, tmp_path / "missing" / "camera.yaml")
 
 
 def test_a_narrow_code_page_stops_no_command(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ import pytest
 from front_door import warned
 from turning_clip import write_clip
 
-from scopemap.calibration.focal_length.estimate import FocalEstimate
+from scopemap.calibration.focal_length.from_motion import FocalEstimate
 from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
-from scopemap.calibration.focal_length.windows import Window, windows_of
+from scopemap.calibration.focal_length.windows import Window
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.lenses import FisheyeCamera
@@ -113,7 +113,7 @@ def clip(tmp_path: Path) -> Path:
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
     """What the trial says, to be filled in; the motion tells nothing."""
     said: list[LensTrial | None] = []
-    place = "scopemap.calibration.focal_length.estimate"
+    place = "scopemap.calibration.focal_length.from_motion"
     window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
 
     def motion(*arguments: object) -> FocalEstimate:
@@ -159,17 +159,3 @@ def test_the_default_is_named_where_nothing_is_known(
     reasons = [reason.text for reason in verdict(run_of(result)).reasons]
     assert sum("lens is a guess" in text for text in reasons) == 1
     assert not any("amera is unknown" in text for text in reasons)  # said once
-
-
-def test_a_stated_view_is_not_tried(clip: Path, tried: list) -> None:
-    result = reconstruct(open_sequence(clip, fov_deg=90.0), Config.load(settings=LIGHT))
-    assert not any("camera is unknown" in warning for warning in warned(result.provenance))
-    assert not tried
-
-
-def test_corners_have_distances_that_do_not_depend_on_the_lens(tmp_path: Path) -> None:
-    folder = write_clip(tmp_path / "turning", 100.0, 12)
-    narrow, wide = (open_sequence(folder, fov_deg=fov_deg) for fov_deg in (50.0, 100.0))
-    one, other = (next(windows_of(sequence, Config())) for sequence in (narrow, wide))
-    assert one.log_distance is not None
-    np.testing.assert_allclose(one.log_distance, other.log_distance, atol=1e-4)

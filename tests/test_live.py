@@ -21,7 +21,7 @@ from tiny_phantom import write_tiny
 
 from scopemap import Config
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.io.live import LiveSource
+from scopemap.io.live_source import LiveSource
 from scopemap.io.opening import sequence_of
 from scopemap.report.serving import LocalServer
 from scopemap.runner.live import LiveSession

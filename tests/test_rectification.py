@@ -46,59 +46,22 @@ def test_working_size(size: tuple[int, int], expected: tuple[int, int]) -> None:
     assert working_size(*size) == expected
 
 
-def test_the_working_camera_has_the_focal_length_of_the_centre(source: CameraModel) -> None:
-    camera = working_camera(source, (320, 240))
-    assert camera.fx == pytest.approx(source.central.fx / 2)
-    assert camera.cx == pytest.approx((source.central.cx + 0.5) / 2 - 0.5)
-    assert working_camera(source, (320, 240), zoom=0.5).fx == pytest.approx(source.central.fx / 4)
-
-
-def test_maps_lead_where_the_cameras_say(source: CameraModel) -> None:
-    """A ramp image holds its own coordinates: rectified, it must hold the source pixel of each target pixel."""
-    rectifier = Rectifier(source, working_camera(source, (160, 120)))
-    u, v = coordinates(640, 480)
-    expected = source_pixel(np.stack(coordinates(160, 120), -1), rectifier.target, rectifier.source)
-    inside = rectifier.valid
-    for axis, ramp in enumerate((u, v)):
-        np.testing.assert_allclose(rectifier.smooth(ramp)[inside], expected[inside][:, axis], atol=0.02)
-        assert np.abs(rectifier.nearest(ramp)[inside] - expected[inside][:, axis]).max() <= 0.501
-
-
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
-def test_an_array_of_another_resolution_is_taken_from_the_same_place(source: CameraModel, factor: float) -> None:
+def test_an_array_of_any_resolution_is_taken_from_where_the_cameras_say(source: CameraModel, factor: float) -> None:
+    """A ramp holds its own coordinates: rectified, it must hold the source pixel of each target pixel."""
     rectifier = Rectifier(source, working_camera(source, (160, 120)))
     u, _ = coordinates(int(640 * factor), int(480 * factor))
     ramp = (u + 0.5) / factor - 0.5  # u of the full-size image
     expected = source_pixel(np.stack(coordinates(160, 120), -1), rectifier.target, rectifier.source)[..., 0]
     deep = rectifier.valid & (expected > 2) & (expected < 637)
     np.testing.assert_allclose(rectifier.smooth(ramp)[deep], expected[deep], atol=0.05)
+    ramp[: len(ramp) // 4] = np.nan  # unknown disparity takes no part
+    smooth = rectifier.smooth(ramp)
+    known = np.isfinite(smooth) & deep
+    assert known.sum() == pytest.approx(0.75 * deep.sum(), rel=0.1)
+    np.testing.assert_allclose(smooth[known], expected[known], atol=0.05)
+    ramp = (u + 0.5) / factor - 0.5
     assert np.abs(rectifier.nearest(ramp)[deep] - expected[deep]).max() <= 0.501 / factor
-
-
-def test_a_straight_edge_in_the_world_is_straight_in_the_rectified_image() -> None:
-    source = LENSES["opencv"]
-    rays = source.unproject(np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1))
-    image = np.where(rays[..., 0] > 0.3 + 0.2 * rays[..., 1], 255, 0).astype(np.uint8)
-    target = working_camera(source, (320, 240))
-    rectified = Rectifier(source, target).image(np.repeat(image[..., None], 3, -1))[..., 0].astype(float)
-    rows = np.arange(20, 220)
-    edge_px = 320 - rectified[rows].sum(1) / 255 - 0.5
-    y = (rows - target.cy) / target.fy
-    np.testing.assert_allclose(edge_px, target.fx * (0.3 + 0.2 * y) + target.cx, atol=0.35)
-
-
-def test_known_points_lie_where_the_pinhole_sees_them(source: CameraModel) -> None:
-    """Dots drawn where the lens sees points of the world are, rectified, where the pinhole camera sees these."""
-    target = working_camera(source, (320, 240))
-    x, y = np.meshgrid([-0.3, -0.1, 0.0, 0.2, 0.35], [-0.2, 0.0, 0.25])
-    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) * 42.0
-    u, v = coordinates(640, 480)
-    for point, seen in zip(points, source.project(points), strict=True):
-        dot = 255 * np.exp(-((u - seen[0]) ** 2 + (v - seen[1]) ** 2) / (2 * 4.0**2))
-        rectified = Rectifier(source, target).image(np.rint(dot).astype(np.uint8)).astype(float)
-        columns, rows = coordinates(320, 240)
-        centre = [(rectified * axis).sum() / rectified.sum() for axis in (columns, rows)]
-        np.testing.assert_allclose(centre, target.project(point), atol=0.1)
 
 
 def test_a_wider_view_has_an_invalid_border_and_says_so(source: CameraModel) -> None:
@@ -113,12 +76,6 @@ def test_a_wider_view_has_an_invalid_border_and_says_so(source: CameraModel) -> 
     depth = rectifier.nearest(np.ones((480, 640), np.float32))
     np.testing.assert_array_equal(np.isfinite(depth), valid)
     assert (rectifier.nearest(np.ones((480, 640), np.uint8)) == valid).all()
-
-
-def test_valid_is_a_copy() -> None:
-    rectifier = Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240)))
-    rectifier.valid[:] = False
-    assert rectifier.valid.all()
 
 
 def test_the_same_view_is_not_touched_or_only_resized() -> None:
@@ -140,15 +97,6 @@ def test_fine_texture_does_not_alias() -> None:
     image[:, ::2] = 255
     rectified = Rectifier(source, working_camera(source, (160, 120))).image(image)
     assert rectified[10:-10, 10:-10].std() < 4
-
-
-def test_unknown_disparity_takes_no_part() -> None:
-    disparity = np.full((480, 640), 3.0, np.float32)
-    disparity[100:200, 100:200] = np.nan
-    rectifier = Rectifier(PINHOLE, working_camera(PINHOLE, (213, 160)))
-    smooth = rectifier.smooth(disparity)
-    assert np.isnan(smooth).mean() == pytest.approx(1e4 / (640 * 480), rel=0.1)
-    np.testing.assert_allclose(smooth[np.isfinite(smooth)], 3.0, rtol=1e-5)
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_inputs import write_c3vd, write_sevenscenes, write_video
+from drawn_inputs import write_c3vd, write_sevenscenes
 from drawn_scared import write_scared, write_scared_c
 
 from scopemap.io import images
@@ -61,16 +61,3 @@ def test_frames_without_a_pose_are_left_out(tmp_path: Path) -> None:
     (folder / "frame-000001.pose.txt").write_text("nan " * 16)
     (folder / "frame-000002.pose.txt").unlink()
     assert list(reference_trajectory(open_sequence(folder)).indices) == [0, 3]
-
-
-def test_there_is_none_without_poses(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    assert reference_trajectory(open_sequence(folder, dataset="images")) is None
-    assert reference_trajectory(open_sequence(write_video(tmp_path / "v.mp4", 4))) is None
-
-
-@pytest.mark.real
-def test_real_c3vd_reference(real_data: Path) -> None:
-    reference = reference_trajectory(open_sequence(real_data / "endoscopy" / "c3vd" / "cecum_t1_a"))
-    assert len(reference) == 276
-    assert reference.path_length_mm == pytest.approx(54.7, abs=0.1)

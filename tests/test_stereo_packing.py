@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
 from drawn_clips import circle, inside, tissue
-from drawn_inputs import picture
 from drawn_videos import HEIGHT, WIDTH, above, above_squeezed, beside, beside_squeezed, stereo
 
-from scopemap.io.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
+from scopemap.io.video_format.stereo_packing import packing, squeezed_views, suspected
 
 NUMBERS = range(0, 40, 5)
 Draw = Callable[[int], np.ndarray]
@@ -35,13 +32,7 @@ def test_two_views_are_found(draw: Draw, layout: str, squeezed: bool, size: tupl
     assert (found.layout, found.squeezed, found.pixel_aspect) == (layout, squeezed, aspect)
     assert found.correlation > 0.6
     assert found.view_size(pictures[0].shape[1], pictures[0].shape[0]) == size
-    assert found.first(pictures[0]).shape == (size[1], size[0], 3)
-
-
-def test_the_left_eyes_view_is_the_left_or_upper_one() -> None:
-    left, right = stereo(3)
-    for layout, stack in (("left-right", np.hstack), ("top-bottom", np.vstack)):
-        np.testing.assert_array_equal(Packing(layout, False, 1.0).first(stack([left, right])), left)
+    np.testing.assert_array_equal(found.first(pictures[0]), pictures[0][: size[1], : size[0]])
 
 
 def test_views_in_circles_are_found() -> None:
@@ -68,7 +59,7 @@ def test_other_disparities_are_found(disparity: float, stack: Callable[..., np.n
     assert packing([stack(stereo(number, disparity)) for number in NUMBERS]) is not None
 
 
-@pytest.mark.parametrize(("scale_px", "deviation"), [(20, 6), (8, 8), (5, 12)])
+@pytest.mark.parametrize(("scale_px", "deviation"), [(20, 6), (5, 12)])
 @pytest.mark.parametrize("gap", [0.5, 0.45])
 @pytest.mark.parametrize("peak", [150, 400])
 def test_reflections_of_two_lamps_are_not_stereo(scale_px: float, deviation: float, gap: float, peak: float) -> None:
@@ -103,10 +94,6 @@ def test_stereo_with_text_over_both_views_is_found() -> None:
     assert packing(pictures) is not None
 
 
-def test_views_of_different_scenes_are_not_stereo() -> None:
-    assert packing([np.hstack([tissue(n), tissue(n, seed=4)]) for n in NUMBERS]) is None
-
-
 @pytest.mark.parametrize("flip", [np.fliplr, np.flipud])
 def test_a_symmetric_picture_is_not_stereo(flip: Draw) -> None:
     stack = np.hstack if flip is np.fliplr else np.vstack
@@ -120,25 +107,10 @@ def test_a_lumen_is_not_stereo() -> None:
     assert packing([(light[..., None] * [220, 120, 90]).astype(np.uint8)] * 3) is None
 
 
-def test_a_chequerboard_is_not_stereo() -> None:
-    board = np.kron(np.indices((9, 12)).sum(0) % 2, np.ones((30, 30)))[..., None].repeat(3, 2) * 180 + 40
-    corners = np.float32([[0, 0], [360, 0], [360, 270], [0, 270]])
-    seen = np.float32([[70, 40], [270, 30], [300, 215], [45, 200]])
-    view = cv2.warpPerspective(board.astype(np.uint8), cv2.getPerspectiveTransform(corners, seen), (WIDTH, HEIGHT))
-    assert packing([view]) is None
-
-
-def test_bars_and_even_slopes_are_not_stereo() -> None:
-    barred = [tissue(n) for n in NUMBERS]
-    for view in barred:
-        view[:40], view[-40:] = 0, 0
-    assert packing(barred) is None
-    assert packing([picture(n) for n in range(4)]) is None
-    assert packing([np.full((HEIGHT, WIDTH, 3), 90, np.uint8)]) is None
-
-
 def test_what_is_too_little_is_not_stereo() -> None:
     assert packing([]) is None
+    assert packing([np.full((HEIGHT, WIDTH, 3), 90, np.uint8)]) is None
+    assert packing([np.hstack([tissue(n), tissue(n, seed=4)]) for n in NUMBERS]) is None
     assert packing([tissue(0)[:20, :20]]) is None
     assert packing([tissue(0)[:1]]) is None
     # One picture of many that happens to look like two views proves nothing.
@@ -149,41 +121,13 @@ def test_what_is_too_little_is_not_stereo() -> None:
     ("size", "layout", "squeezed"),
     [
         ((1280, 2048), "top-bottom", False),
-        ((1920, 2160), "top-bottom", False),
         ((1920, 1080), "top-bottom", True),
         ((2560, 1024), "left-right", False),
-        ((3840, 1080), "left-right", False),
         ((1920, 1080), "left-right", True),
         ((1280, 1024), "left-right", True),
     ],
 )
 def test_sizes_tell_squeezed_views(size: tuple[int, int], layout: str, squeezed: bool) -> None:
     assert squeezed_views(*size, layout) == squeezed  # type: ignore[arg-type]
-
-
-def test_shapes_that_are_suspect() -> None:
-    assert [suspected(*size) for size in ((1280, 2048), (2560, 1024), (1920, 1080), (1000, 1000))] == [
-        "top-bottom",
-        "left-right",
-        None,
-        None,
-    ]
-
-
-@pytest.mark.real
-@pytest.mark.parametrize("name", ["colonoscopy_nflba_03", "laparoscopy_rvim"])
-def test_clinical_clips_are_not_stereo(name: str, real_data: Path) -> None:
-    with av.open(str(real_data / "endoscopy" / "video" / f"{name}.mp4")) as container:
-        pictures = [f.to_ndarray(format="rgb24") for i, f in enumerate(container.decode(video=0)) if i % 25 == 0]
-    assert packing(pictures) is None
-    assert not any(packing([one]) for one in pictures)
-
-
-@pytest.mark.real
-def test_phantom_frames_are_not_stereo(real_data: Path) -> None:
-    files = sorted((real_data / "endoscopy" / "c3vd" / "cecum_t1_a").glob("*color*"))[::40]
-    pictures = [cv2.imread(str(file)) for file in files]
-    assert len(pictures) == 7
-    assert packing(pictures) is None
-    # The same frames put side by side as two views are.
-    assert packing([np.hstack([one, np.roll(one, 20, 1)]) for one in pictures]) is not None
+    usual = size in ((1920, 1080), (1280, 1024))
+    assert suspected(*size) == (None if usual else layout)

@@ -1,8 +1,7 @@
 """Lenses with distortion: OpenCV radial-tangential, Kannala-Brandt fisheye, FOV, Scaramuzza omnidirectional.
 
 Each is one increasing radial function, plus OpenCV's tangential terms. The field of a lens ends where its radial
-function stops increasing (there two rays would share a pixel) or where rays no longer point forward. Beyond the field
-`project` and `unproject` return NaN.
+function stops increasing or rays no longer point forward; beyond it `project` and `unproject` return NaN.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class _RadialLens(CameraModel, ABC):
 
     @property
     def field_rad(self) -> float:
-        """Largest angle from the axis, rad, that the lens maps one to one and that still points forward."""
+        """Largest angle from the axis, rad, within the field."""
         return float(self._grid[-1])
 
     @cached_property

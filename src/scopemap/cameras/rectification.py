@@ -36,9 +36,8 @@ def working_camera(source: CameraModel, size: tuple[int, int], zoom: float = 1.0
 class Rectifier:
     """Moves images, depth and labels from a source camera to a pinhole camera with the same centre.
 
-    sensor : the camera of the depth where it is another one than the images', or None.
-
-    Raises `CalibrationError` where source and target share no view.
+    sensor : the camera of the depth where it is another one than the images', or None. Raises `CalibrationError` where
+    source and target share no view.
     """
 
     def __init__(self, source: CameraModel, target: PinholeCamera, sensor: DepthSensor | None = None) -> None:
@@ -50,10 +49,8 @@ class Rectifier:
             np.abs(y - (source.height - 1) / 2) <= source.height / 2
         )
         if not self._valid.any():
-            raise CalibrationError(
-                f"rectifying {source.width}x{source.height} px to {target.width}x{target.height} px: no pixel of the "
-                "source is seen; check the calibration"
-            )
+            sizes = f"{source.width}x{source.height} px to {target.width}x{target.height} px"
+            raise CalibrationError(f"rectifying {sizes}: no pixel of the source is seen; check the calibration")
         self._x = np.where(self._valid, x, 0).astype(np.float32)
         self._y = np.where(self._valid, y, 0).astype(np.float32)
         self._shrink = source.central.fx / target.fx
@@ -119,9 +116,9 @@ class Rectifier:
         height, width = array.shape[:2]
         sx, sy = width / self.source.width, height / self.source.height
         if abs(sx / sy - 1) > 0.02:
+            images = f"{self.source.width}x{self.source.height} px images"
             raise CalibrationError(
-                f"rectifying an array of {width}x{height} px: its aspect is not that of the "
-                f"{self.source.width}x{self.source.height} px images"
+                f"rectifying an array of {width}x{height} px: its aspect is not that of the {images}"
             )
         return (self._x + 0.5) * np.float32(sx) - 0.5, (self._y + 0.5) * np.float32(sy) - 0.5
 

@@ -68,8 +68,8 @@ def calibrate(
     reading = _reading(settings or [])
     # Imported here, so that --help does not wait for it.
     from scopemap.calibration import camera_calibration
-    from scopemap.calibration.picture import draw_calibration
-    from scopemap.calibration.views import find_views
+    from scopemap.calibration.residual_picture import draw_calibration
+    from scopemap.calibration.targets import find_views
     from scopemap.io.opening import open_source
 
     silent = quiet or as_json

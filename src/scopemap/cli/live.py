@@ -77,7 +77,7 @@ def live(
     config = Config.load("realtime", settings=chosen | {"input.focal": "assume"} | parse_settings(settings or []))
 
     from scopemap.io.checksums import write_checksums
-    from scopemap.io.live import LiveSource
+    from scopemap.io.live_source import LiveSource
     from scopemap.io.opening import sequence_of
     from scopemap.io.result_folder import NOT_OF_THE_RESULT, result_folder
     from scopemap.report.frame_pictures import FramePictures

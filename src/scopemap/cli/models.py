@@ -20,10 +20,11 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
 
     rows = weights.overview()
     if as_json:
-        fields = ("name", "purpose", "licence", "size_mb", "state")
-        print_json([{key: getattr(row, key) for key in fields} | {"path": str(row.path)} for row in rows])
+        fields, folder = ("name", "purpose", "licence", "size_mb"), weights.weights_folder()
+        facts = [{"state": state, "path": str(folder / one.place)} for one, state in rows]
+        print_json([{key: getattr(one, key) for key in fields} | of for (one, _), of in zip(rows, facts, strict=True)])
     elif not quiet:
-        shown = ((row.name, row.state, f"{row.size_mb:.1f}", row.licence, row.purpose) for row in rows)
+        shown = ((one.name, state, f"{one.size_mb:.1f}", one.licence, one.purpose) for one, state in rows)
         heads = ("name", "state", "MB", "licence", "what it is")
         print_table(heads, shown, title=f"weights in {weights.weights_folder()}")
 
@@ -53,7 +54,7 @@ def verify(
     """Hash weights again and compare them with the pinned or recorded hashes."""
     from scopemap.io import weights
 
-    states = {row.name: row.state for row in weights.overview() if row.state != "missing"}
+    states = {one.name: state for one, state in weights.overview() if state != "missing"}
     names, faults = [name] if name else list(states), dict[str, str]()
     for each in names:
         try:

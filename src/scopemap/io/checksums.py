@@ -9,6 +9,7 @@ import platform
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,10 @@ _MOST_INPUT_BYTES, _MOST_INPUT_FILES = 256 << 20, 20_000
 
 @dataclass(frozen=True)
 class Verified:
-    """What has become of a result.
+    """A result compared with its checksums.
 
-    whole : number of files that are as they were. damaged, missing : names of those that are not. added : names of
-    files that are not the result's. bytes : of all files that were read. notes : how it came about, and what is other
-    than on this machine.
+    whole : number of unchanged files. damaged, missing, added : names of the others. bytes : of all files that were
+    read. notes : how the result came about, and which versions differ on this machine.
     """
 
     whole: int
@@ -84,27 +84,27 @@ def verify_result(folder: Path) -> Verified:
 def input_checksum(path: Path) -> dict[str, Any]:
     """Return the size of an input and a SHA-256 of its content, {} for what is neither file nor folder.
 
-    At most 256 MB are read, and 20,000 files counted. A file up to that size has its own SHA-256; of a larger one it is
-    that of its first and its last 128 MB. A folder's is that of lines "SIZE NAME" in the order of their names, each
-    followed by the file's own while the files before it hold less than 256 MB. Where not all is read there is
-    `hashed_bytes`, and `changed_ns`, the latest time of change.
+    At most 256 MB are read, of a larger file its first and last 128 MB, and 20,000 files counted. A folder's SHA-256 is
+    that of lines "SIZE NAME" in the order of their names, each followed by the file's while the files before it hold
+    less than 256 MB. Where not all is read there is `hashed_bytes`, and `changed_ns`, the latest time of change.
     """
     try:
         if path.is_file():
             return {"bytes": path.stat().st_size, "sha256": _digest(path, _MOST_INPUT_BYTES)} | _part([path])
         if not path.is_dir():
             return {}
-        total, found, count = 0, hashlib.sha256(), 0
-        for count, name in enumerate(_files_in(path), 1):
-            if count > _MOST_INPUT_FILES:
-                return {"files": f"more than {_MOST_INPUT_FILES}"}
+        names = list(islice(_files_in(path), _MOST_INPUT_FILES + 1))
+        if len(names) > _MOST_INPUT_FILES:
+            return {"files": f"more than {_MOST_INPUT_FILES}"}
+        total, found = 0, hashlib.sha256()
+        for name in names:
             size = (path / name).stat().st_size
             found.update(f"{size} {name}\n".encode("utf-8", "surrogateescape"))
             if total < _MOST_INPUT_BYTES:
                 found.update(_digest(path / name, _MOST_INPUT_BYTES - total).encode())
             total += size
-        files = [path / name for name in _files_in(path)]
-        return {"files": count, "bytes": total, "sha256": found.hexdigest()} | _part(files)
+        part = _part([path / name for name in names])
+        return {"files": len(names), "bytes": total, "sha256": found.hexdigest()} | part
     except OSError:  # it was read, and is gone
         return {}
 

@@ -44,8 +44,7 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | N
 def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
     """Return the image in a file as `decoded` does; None also where no file can be read. Errors name the file."""
     try:
-        # Opening a pipe would wait forever.
-        return decoded(file.read_bytes(), flags) if file.is_file() else None
+        return decoded(file.read_bytes(), flags) if file.is_file() else None  # a pipe would be waited for
     except OSError:
         return None
     except InputError as error:

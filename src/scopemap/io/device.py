@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from scopemap.errors import SettingsError
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 
 def cpu_threads() -> int:
@@ -14,6 +18,18 @@ def cpu_threads() -> int:
     if wanted.isdecimal() and int(wanted):
         return int(wanted)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def open_network(content: bytes, threads: int = 0) -> onnxruntime.InferenceSession:
+    """Return the session of an ONNX graph on the CPU; raises what the runtime raises. threads : 0: one a core."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or cpu_threads()
+    # Threads that wait must sleep: the tracker needs the cores.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # what is wrong is raised, not printed
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
 
 def missing_packages(what: str, *packages: str) -> str:

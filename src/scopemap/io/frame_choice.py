@@ -31,10 +31,7 @@ _SLACK_S, _SLACK_SHARE = 1e-3, 0.25
 
 @dataclass(frozen=True)
 class SkippedFrame:
-    """A frame that was read and not used.
-
-    index, time_s, name : the frame's. kind : why, in one word. reason : why, one phrase.
-    """
+    """A frame that was read and not used: its index, time and name, and why, in one word and as a phrase."""
 
     index: int
     time_s: float
@@ -48,7 +45,7 @@ class FrameChoice:
     """Which of the selected frames are used.
 
     fps : at most so many frames per second, by the time stamps; None: all. skip_repeated : leave out pictures that
-    repeat the last one used. skipped : by number, what was left out so far; grows while frames are read.
+    repeat the last one used. skipped : by number, those left out so far; grows while frames are read.
     """
 
     fps: float | None = None

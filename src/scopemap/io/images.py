@@ -29,10 +29,7 @@ def numeric_order(path: Path) -> list[tuple[int, int, str]]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the colour images in `folder` in numeric order; not depth, not masks; none where it is no folder.
-
-    The pictures of a result in a run's folder are no frames.
-    """
+    """Return the colour images in `folder` in numeric order; not depth, not masks, none of a run's folder."""
     if all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json")):
         return []
     files = sorted(_images_in(folder), key=numeric_order)
@@ -40,10 +37,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return all images in `folder`, depth and masks too, by the last number in their names, ascending; others not.
-
-    None where there is no folder. Raises `InputError` where two images have the same number.
-    """
+    """Return the images in `folder` with a number in their names, depth and masks too, as `by_number`."""
     return by_number(file for file in _images_in(folder) if frame_number(file) is not None)
 
 
@@ -58,12 +52,11 @@ def decoded_image(content: bytes) -> np.ndarray | None:
 
 
 class ImageFolder(Source):
-    """A folder of images. A reader of a data set fills in what it knows: `poses`, `times_s`, and
+    """A folder of images. A reader of a data set fills in what it knows: `poses`, `times_s` and `depth_files`.
 
-    depth_files : depth images by frame number, stored as `depth_code` has it.
-
-    The calibration is `camera.yaml` in the folder, else beside the images; one that cannot be read is its
-    `camera_fault`. Raises `InputError` where no image can be read.
+    depth_files : depth images by frame number, stored as `depth_code` has it. The calibration is `camera.yaml` in the
+    folder, else beside the images; one that cannot be read is its `camera_fault`. Raises `InputError` where no image
+    can be read.
     """
 
     name = "images"

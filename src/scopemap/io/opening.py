@@ -63,8 +63,7 @@ def open_sequence(
     `dataset` names the reader (`readers`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
     camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
     of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: by
-    `settings.longest_side_px`. `frames` selects positions in the input. `settings` are those of reading. Raises
-    `InputError` and `CalibrationError`.
+    `settings.longest_side_px`. `frames` selects positions in the input. Raises `InputError` and `CalibrationError`.
     """
     if frames is not None and frames.step is not None and frames.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
@@ -92,13 +91,12 @@ def sequence_of(
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
     size_source = "chosen" if size is None else "given (--size)"
     size = size or working_size(source.width, source.height, settings.longest_side_px)
+    working = f"the working size {size[0]}x{size[1]} px"
     if min(size) < _SMALLEST_SIDE_PX:
-        raise InputError(
-            f"the working size {size[0]}x{size[1]} px is too small: {_SMALLEST_SIDE_PX} px a side at least"
-        )
+        raise InputError(f"{working} is too small: {_SMALLEST_SIDE_PX} px a side at least")
     if max(size) > _LARGEST_SIDE_PX or size[0] * size[1] > most_pixels():
         most = f"{_LARGEST_SIDE_PX} px a side and {most_pixels() / 1e6:g} million pixels at most"
-        raise InputError(f"the working size {size[0]}x{size[1]} px is too large: {most}; give another by --size")
+        raise InputError(f"{working} is too large: {most}; give another by --size")
     size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
     rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
     if (seen := float(rectifier.valid.mean())) < _LEAST_SEEN_SHARE:
@@ -141,14 +139,13 @@ def _reader(path: Path, dataset: str | None) -> Source:
     dataset, _, part = (dataset or "").partition(":")
     if dataset and dataset not in readers():
         raise InputError(f"unknown data set '{dataset}': choose one of {', '.join(readers())}")
-    if not path.exists():
-        raise InputError(f"reading {path}: no such file or folder")
     if not path.is_dir() and not path.is_file():
-        raise InputError(f"reading {path}: it is no file and no folder")
+        what = "it is no file and no folder" if path.exists() else "no such file or folder"
+        raise InputError(f"reading {path}: {what}")
     closed = _closed_folders(path) if path.is_dir() else []
-    path = _innermost(path, dataset or None) if path.is_dir() else path
+    path = _innermost(path, dataset) if path.is_dir() else path
     kind = dataset or next((name for name, kind in readers().items() if kind.recognises(path)), "")
-    if not kind and path.is_dir():
+    if not kind:
         _refuse_videos(path)
     kind = kind or ImageFolder.name
     if (kind not in _OF_FILES) if path.is_file() else kind == VideoFile.name:
@@ -165,11 +162,13 @@ def _reader(path: Path, dataset: str | None) -> Source:
 
 def _refuse_videos(folder: Path) -> None:
     """Raise `InputError` where a folder without images holds videos: one of them is meant."""
-    videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_ENDINGS and path.is_file())
-    if videos:
-        named = ", ".join(path.name for path in videos[:_MOST_NAMED]) + (", ..." * (len(videos) > _MOST_NAMED))
-        one = f"give one of them, such as {videos[0]}"
-        raise InputError(f"reading {folder}: it holds {len(videos)} video(s) ({named}) and no images; {one}")
+    if videos := sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_ENDINGS and file.is_file()):
+        held = f"{len(videos)} video(s) ({_named([file.name for file in videos])})"
+        raise InputError(f"reading {folder}: it holds {held} and no images; give one of them, such as {videos[0]}")
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:_MOST_NAMED]) + ", ..." * (len(names) > _MOST_NAMED)
 
 
 def _closed_folders(folder: Path) -> list[Path]:
@@ -187,22 +186,22 @@ def _may_enter(folder: Path) -> bool:
     return os.access(folder, os.R_OK | os.X_OK)
 
 
-def _innermost(path: Path, dataset: str | None) -> Path:
-    """Return the folder in `path` that the reader `dataset` recognises, `path` where none; None: that any reader does.
+def _innermost(path: Path, dataset: str) -> Path:
+    """Return the folder in `path` that the reader `dataset` recognises, `path` where none; "": that any reader does.
 
     A bag or a DICOM file that is beside a data set or `images` does not hide them.
     """
-    if dataset is not None:
-        return _recognised_below(path, (readers()[dataset],)) or path
-    others = tuple(kind for kind in readers().values() if kind not in (RosBag, Dicom))
+    if dataset:
+        return _recognised_below(path, [readers()[dataset]]) or path
+    others = [kind for kind in readers().values() if kind not in (RosBag, Dicom)]
     found = _recognised_below(path, others)
     is_alone = found is not None and found != path and found.name != _IMAGES
     if found is None or (is_alone and not any(k.recognises(found) for k in others if k not in _WITHOUT_LAYOUT)):
-        found = _recognised_below(path, tuple(readers().values()))
+        found = _recognised_below(path, list(readers().values()))
     return found or path
 
 
-def _recognised_below(path: Path, kinds: tuple[type[Source], ...]) -> Path | None:
+def _recognised_below(path: Path, kinds: list[type[Source]]) -> Path | None:
     """Return the folder that one of `kinds` recognises, `path` or the only one some levels below it; or None.
 
     Images alone are found in a folder around them that holds nothing else, or in `images`. Raises `InputError` where
@@ -215,7 +214,7 @@ def _recognised_below(path: Path, kinds: tuple[type[Source], ...]) -> Path | Non
         level = [folder for folder in level[:_MOST_FOLDERS] if _may_enter(folder)]
         found = [folder for folder in level if any(kind.recognises(folder) for kind in sought)]
         if len(found) > 1:
-            names = ", ".join(str(folder.relative_to(path)) for folder in found[:5]) + (", ..." * (len(found) > 5))
+            names = _named([str(folder.relative_to(path)) for folder in found])
             raise InputError(f"reading {path}: it holds {len(found)} sequences ({names}); give one of them")
         if found:
             return found[0]
@@ -226,17 +225,12 @@ def _recognised_below(path: Path, kinds: tuple[type[Source], ...]) -> Path | Non
 
 
 def _folders_in(path: Path) -> list[Path]:
-    """Return the folders in one, but those of the file system, hidden ones and what a zip made on a Mac leaves."""
+    """Return the folders in one, without hidden ones, the system's, and links to a folder around them."""
     with os.scandir(path) as entries:  # it knows folders without asking for each file
         found = [entry for entry in entries if entry.is_dir(follow_symlinks=False) or entry.is_symlink()]
         names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
-    names = [name for name in names if not _leads_up(path / name)]
-    return sorted(path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
-
-
-def _leads_up(folder: Path) -> bool:
-    """Return whether a folder is a link to one that it is in: out of the input, or round in a circle."""
-    return folder.is_symlink() and folder.parent.resolve().is_relative_to(folder.resolve())
+    inner = (path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
+    return sorted(i for i in inner if not (i.is_symlink() and path.resolve().is_relative_to(i.resolve())))
 
 
 def _calibration_of(
@@ -254,10 +248,8 @@ def _calibration_of(
     if source.camera_fault is not None:
         raise source.camera_fault
     if camera_fit.startswith("crop"):
-        raise CalibrationError(
-            f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit}): give the one "
-            "that was made before they were cut (--camera)"
-        )
+        nothing = f"there is no calibration file out of which to cut the images (--camera-fit {camera_fit})"
+        raise CalibrationError(f"{nothing}: give the one that was made before they were cut (--camera)")
     unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True

@@ -48,16 +48,13 @@ def prepared(source: Source, settings: InputSettings) -> Source:
     for a box outside of the pictures.
     """
     if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
-        raise InputError(
-            f"reading {source.path}: the reader of the data set '{source.name}' defines the view; leave "
-            f"input.stereo={settings.stereo} (--stereo) out"
-        )
-    for x, y, width, height in settings.redact:
-        if x >= source.width or y >= source.height:
-            raise InputError(
-                f"reading {source.path}: the box {x},{y},{width},{height} to blacken (--redact, X,Y,WIDTH,HEIGHT) is "
-                f"outside of the pictures of {source.width}x{source.height} px"
-            )
+        defines = f"the reader of the data set '{source.name}' defines the view"
+        raise InputError(f"reading {source.path}: {defines}; leave input.stereo={settings.stereo} (--stereo) out")
+    for box in settings.redact:
+        if box[0] >= source.width or box[1] >= source.height:
+            outside = f"is outside of the pictures of {source.width}x{source.height} px"
+            named = f"the box {','.join(map(str, box))} to blacken (--redact, X,Y,WIDTH,HEIGHT)"
+            raise InputError(f"reading {source.path}: {named} {outside}")
     samples = sample_pictures(source) if source.name in UNKNOWN_MAKE else []
     samples = [redacted(rgb, settings.redact) for rgb in samples]
     packed, note = _packing(source, settings, samples)
@@ -77,8 +74,7 @@ class PreparedSource(Source):
     """
 
     def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
-        self._source, self.packed, self._deinterlace = source, packed, settings.deinterlace
-        self._redact = settings.redact
+        self._source, self.packed, self._settings = source, packed, settings
         super().__init__(source.path)
         for attribute in _KEPT:
             setattr(self, attribute, getattr(source, attribute))
@@ -104,8 +100,8 @@ class PreparedSource(Source):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, each with what is used of its picture."""
         for frame in self._source.frames(selection):
-            rgb = redacted(frame.rgb, self._redact)
-            rgb = deinterlaced(rgb) if self._deinterlace else rgb
+            rgb = redacted(frame.rgb, self._settings.redact)
+            rgb = deinterlaced(rgb) if self._settings.deinterlace else rgb
             yield replace(frame, rgb=rgb if self.packed is None else self.packed.first(rgb))
 
 
@@ -123,10 +119,8 @@ def of_one_view(source: Source) -> str:
     """Return what an error about a camera of another size adds where pictures hold two views, else ""."""
     if not isinstance(source, PreparedSource) or source.packed is None:
         return ""
-    return (
-        f"; the pictures hold two views, and the camera must be that of one, {source.width}x{source.height} px "
-        "(--stereo none uses the whole picture)"
-    )
+    one = f"the camera must be that of one, {source.width}x{source.height} px"
+    return f"; the pictures hold two views, and {one} (--stereo none uses the whole picture)"
 
 
 def sample_pictures(source: Source) -> list[np.ndarray]:

@@ -43,8 +43,8 @@ def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -
 def reference_trajectory(sequence: Sequence) -> Trajectory | None:
     """Return the true poses of the sequence's selected frames; None where none, or not which frames, are known.
 
-    `indices` and `times_s` are those of the frames; a frame without a true pose is left out. What the data set holds is
-    what is returned: frames that later turn out unreadable are among it. Raises `InputError` for unreadable poses.
+    `indices` and `times_s` are those of the frames, unreadable ones included; a frame without a true pose is left out.
+    Raises `InputError` for unreadable poses.
     """
     return _true_poses(sequence.source, sequence.selection)
 

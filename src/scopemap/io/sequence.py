@@ -6,6 +6,8 @@ from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Literal
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
@@ -15,7 +17,6 @@ from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth
 from scopemap.io.frame_choice import FrameChoice, SkippedFrame
 from scopemap.io.source import Source, SourceFrame, assumed_camera
-from scopemap.io.waiting import HangingError, in_time
 from scopemap.notices import Notice
 
 CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
@@ -30,11 +31,9 @@ class Sequence:
 
     Attributes
     ----------
-    source : where the frames come from.
-    path : the file or folder, as found.
+    source, path : where the frames come from; its file or folder.
     rectifier : from the source's camera to the working camera.
-    camera_source : how the camera is known, one phrase.
-    size_source : where the working size comes from, one phrase.
+    camera_source, size_source : how the camera is known, and where the working size comes from, one phrase each.
     calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
     focal_is_stated : whether the field of view was given, not assumed. is_estimated : whether `with_focal` found it.
     selection : slice over the input's frames.
@@ -105,19 +104,17 @@ class Sequence:
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
         for frame in self._rectified(self.source.frames(self.selection), -1):
-            truth = self.source.truth(frame.index)
-            if truth is None:
+            if (truth := self.source.truth(frame.index)) is None:
                 yield frame, None
-            else:
-                depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
-                yield frame, Truth(frame.index, truth.T_world_camera, depth_mm, truth.quality)
+                continue
+            depth_mm = None if truth.depth_mm is None else self.depth_rectifier.nearest(truth.depth_mm)
+            yield frame, Truth(frame.index, truth.T_world_camera, depth_mm, truth.quality)
 
     def frames(self, after: int = -1) -> Iterator[Frame]:
         """Yield each frame, rectified; its truth is not read. Raises `InputError` at the end of fewer than two.
 
-        Where a picture does not come in time the frames end with a warning.
-
-        after : number of a frame; it and those before are read, so that later ones are chosen as ever, but not yielded.
+        The frames end with a warning where a picture does not come in time. after : number of a frame; it and those
+        before are read, so that the choice of later ones stays the same, but not yielded.
         """
         return self._rectified(self._in_time(), after)
 
@@ -143,10 +140,10 @@ class Sequence:
         # Pictures that are passed over are decoded, too.
         step_s, start_s, read, last = self.selection.step or 1, abs(self.selection.start or 0), 0, -1
         try:
-            for picture in in_time(pictures, limit_s + start_s, limit_s + step_s):
+            for picture in _in_time(pictures, limit_s + start_s, limit_s + step_s):
                 yield picture
                 read, last = read + 1, picture.index
-        except HangingError as error:
+        except _HangingError as error:
             which = f"picture after frame {last}" if read else "first picture"
             late = f"{self.path}: its {which} did not come within {error}: a decoder or a disk hangs"
             if read < 2:
@@ -170,3 +167,46 @@ class Sequence:
         target = working_camera(camera, (self.camera.width, self.camera.height))
         changed = replace(self, rectifier=Rectifier(camera, target), camera_source=source, is_estimated=True)
         return replace(changed, focal_sigma_px=sigma_px)
+
+
+class _HangingError(Exception):
+    """A picture has not come in time."""
+
+
+def _in_time(
+    pictures: Generator[SourceFrame, None, None], first_s: float, next_s: float
+) -> Generator[SourceFrame, None, None]:
+    """Yield pictures one at a time; raise `_HangingError` where the first or another takes longer than so many seconds.
+
+    They come from a thread of their own, which does not keep the process from ending where it hangs.
+    """
+    asked, found = SimpleQueue[bool](), SimpleQueue[SourceFrame | BaseException | None]()
+
+    def answer() -> None:
+        while asked.get():
+            try:
+                found.put(next(pictures, None))
+            except BaseException as error:
+                found.put(error)
+        pictures.close()
+
+    reader, limit_s, hangs = Thread(target=answer, name="read", daemon=True), first_s, False
+    reader.start()
+    try:
+        while True:
+            asked.put(True)
+            try:
+                picture = found.get(timeout=limit_s)
+            except Empty:
+                hangs = True
+                raise _HangingError(f"{limit_s:g} s") from None
+            if picture is None:
+                return
+            if isinstance(picture, BaseException):
+                raise picture
+            yield picture
+            limit_s = next_s
+    finally:
+        asked.put(False)
+        if not hangs:
+            reader.join()

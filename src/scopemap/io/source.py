@@ -27,12 +27,8 @@ OWN_CALIBRATION = "camera.yaml"
 class SourceFrame:
     """One image as it is in the file, not rectified.
 
-    Attributes
-    ----------
-    index : number of the frame in the input.
-    time_s : time stamp, s.
-    rgb : (h, w, 3) uint8, sRGB.
-    name : the file's own name, or "".
+    index : number of the frame in the input. time_s : time stamp, s. rgb : (h, w, 3) uint8, sRGB. name : the file's
+    own name, or "".
     """
 
     index: int
@@ -45,12 +41,8 @@ class SourceFrame:
 class SourceTruth:
     """What is known to be true of an image, in the geometry of the file.
 
-    Attributes
-    ----------
-    T_world_camera : (4, 4) float64, mm, or None.
-    depth_mm : (h, w) float32 along the optical axis, NaN = unknown, of the image's view or what the source's
-        `depth_sensor` sees, at any size; or None.
-    quality : how the truth came about.
+    T_world_camera : (4, 4) float64, mm, or None. depth_mm : (h, w) float32 along the optical axis, NaN = unknown, of
+    the image's view or what the source's `depth_sensor` sees, at any size; or None. quality : how the truth came about.
     """
 
     T_world_camera: np.ndarray | None
@@ -142,10 +134,8 @@ class Source:
         """Raise `InputError` where an image is not of the source's size."""
         height, width = rgb.shape[:2]
         if (width, height) != (self.width, self.height):
-            raise InputError(
-                f"reading {what} is {width}x{height} px, those before it are {self.width}x{self.height} px; a sequence "
-                "needs frames of one size"
-            )
+            differ = f"{width}x{height} px, those before it are {self.width}x{self.height} px"
+            raise InputError(f"reading {what} is {differ}; a sequence needs frames of one size")
 
     def _warn(self, message: str | Notice) -> None:
         if message not in self.warnings:

@@ -37,8 +37,8 @@ class VideoFile(Source):
     """A video; frame number = order of decoding, time stamps from the stream, pictures turned as they are to be shown.
 
     Colours are converted to 8-bit sRGB by the matrix and range of the stream; where it states none, BT.601, limited. A
-    video that breaks off, holds damaged pictures or wrong time stamps is used as far as it goes; `warnings` names
-    it once it was read. Raises `InputError` where it cannot be opened or holds fewer than two readable frames.
+    video that breaks off, holds damaged pictures or wrong time stamps is used with `warnings`, which grow while it is
+    read. Raises `InputError` where it cannot be opened or holds fewer than two readable frames.
     """
 
     name = "video"
@@ -93,9 +93,9 @@ class VideoFile(Source):
                 container.seek(start + length * part // count)
                 frame = next(container.decode(container.streams.video[0]))
                 found[frame.pts] = _shown(frame)
-        found = {pts: rgb for pts, rgb in found.items() if rgb.shape[:2] == (self.height, self.width)}
-        if len(found) >= count // 2:
-            return list(found.values())
+        pictures = [rgb for rgb in found.values() if rgb.shape[:2] == (self.height, self.width)]
+        if len(pictures) >= count // 2:
+            return pictures
         return [frame.rgb for frame in self.frames(slice(0, count * _SAMPLED_EVERY, _SAMPLED_EVERY))]
 
     def media(self) -> str:
@@ -193,25 +193,20 @@ def _display_matrix(frame: VideoFrame) -> tuple[int, ...] | None:
 class TimeStamps:
     """Repairs stamps while frames are read in order.
 
-    rate_hz : frames per second. A stamp that is missing is put at the rate after the last one that was there. One that
-    does not increase is too; where it goes back by more than a second, or runs ahead by more than a minute (ten frames
-    of a slow clip), all that follow are moved with it: files that were joined each begin at 0.
+    rate_hz : frames per second. A stamp that is missing, or does not increase, is put at the rate after the last one
+    that was there. Where one goes back by more than a second, or runs ahead by more than a minute (ten frames of a slow
+    clip), all that follow are moved with it: files that were joined each begin at 0.
+
+    repaired, first_repaired : how many stamps were missing or moved, and the number of the first such frame. span_s :
+    time from the first to the last stamp as the stream has them, s.
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self._rate_hz, self._shift_s = rate_hz, 0.0
-        self._known = (0, 0.0)
+        self._rate_hz, self._shift_s, self._known = rate_hz, 0.0, (0, 0.0)
         self._last_s: float | None = None
-        self.repaired = 0
-        """How many stamps were missing or moved."""
+        self._first_stamp_s: float | None = None
+        self.repaired, self.span_s = 0, 0.0
         self.first_repaired: int | None = None
-        """Number of the first such frame."""
-        self._stated_s: tuple[float, float] | None = None
-
-    @property
-    def span_s(self) -> float:
-        """Time from the first to the last stamp as the stream has them, s."""
-        return 0.0 if self._stated_s is None else self._stated_s[1] - self._stated_s[0]
 
     def __call__(self, index: int, stamp_s: float | None) -> float:
         """Return when the frame with number `index` was taken, s, by its stamp, s or None."""
@@ -228,6 +223,7 @@ class TimeStamps:
             self.repaired += 1
         if stamp_s is not None:
             self._known = (index, time_s)
-            self._stated_s = (stamp_s if self._stated_s is None else self._stated_s[0], stamp_s)
+            self._first_stamp_s = stamp_s if self._first_stamp_s is None else self._first_stamp_s
+            self.span_s = stamp_s - self._first_stamp_s
         self._last_s = time_s
         return time_s

@@ -1,6 +1,5 @@
 """Weights that scopemap knows (`checkpoints.toml`): their folder, their verification by hash, their download.
 
-All weights are in one folder: `SCOPEMAP_WEIGHTS_DIR` if set, else `scopemap` in the user's cache. `pull` downloads.
 Files must have the hashes of `checkpoints.toml`, and those recorded in the folder's `weights.lock.json` when they were
 pulled, with their revision. A model of the hub that has neither is taken as it is: it was copied by hand.
 """
@@ -32,15 +31,13 @@ class Checkpoint:
 
     Attributes
     ----------
-    name : what the user calls it.
-    purpose : what it is, in a few words.
-    licence : licence of the weights.
+    name, purpose, licence : what the user calls it, what it is in a few words, the weights' licence.
     size_mb : size on disk, MB; 0 = unknown.
     place : file or folder, below the weights folder.
-    source : where it comes from: the Hugging Face hub, torchvision's weights enums, or by hand.
-    location : hub repository, torchvision's name of the weights, or where to fetch them by hand.
-    files : file below the weights folder to its SHA-256 or that hash's leading digits; empty = recorded when pulled.
-        torchvision puts the first eight digits of the hash into the file's name.
+    source, location : the Hugging Face hub and a repository, torchvision and its name of the weights, or where to fetch
+        them by hand.
+    files : file below the weights folder to its SHA-256 or that hash's leading digits (torchvision states eight);
+        empty = recorded when pulled.
     revision : commit of the hub repository; "" = the newest at the first pull, recorded then (the user's own choices).
     """
 
@@ -57,18 +54,6 @@ class Checkpoint:
 
 _TABLE = tomllib.loads(Path(__file__).with_name("checkpoints.toml").read_text(encoding="utf-8"))
 REGISTRY: dict[str, Checkpoint] = {name: Checkpoint(name, **entry) for name, entry in _TABLE.items()}
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of `overview`: a checkpoint and the state of its files ("by hand": there, with no hash to check)."""
-
-    name: str
-    purpose: str
-    licence: str
-    size_mb: float
-    state: State
-    path: Path
 
 
 def find(name: str) -> Checkpoint:
@@ -89,14 +74,14 @@ def find(name: str) -> Checkpoint:
 
 
 def weights_folder() -> Path:
-    """Return the folder of all weights; it need not exist."""
+    """Return the folder of all weights: `SCOPEMAP_WEIGHTS_DIR`, else `scopemap` in the user's cache."""
     if chosen := os.environ.get("SCOPEMAP_WEIGHTS_DIR"):
         return Path(chosen).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "scopemap"
 
 
 def is_present(*names: str) -> bool:
-    """Return whether the files of any of `names` are there; their content is not looked at."""
+    """Return whether the files of any of `names` are there, by their names alone."""
     return any(_is_there(find(name)) for name in names)
 
 
@@ -105,11 +90,10 @@ def locate(*names: str) -> Path:
 
     Raises `WeightsError` that names what to fetch and where to put it, or the damaged file.
     """
-    checkpoints = [find(name) for name in names]
-    for checkpoint in checkpoints:
+    for checkpoint in map(find, names):
         if _is_there(checkpoint):
             return _checked(checkpoint)
-    raise WeightsError(_advice(checkpoints))
+    raise WeightsError(_advice(*names))
 
 
 def verify(name: str) -> Path:
@@ -118,13 +102,12 @@ def verify(name: str) -> Path:
     return locate(name)
 
 
-def overview() -> list[Row]:
-    """Return the state of every registered checkpoint and of every other one that was pulled."""
-    names = [*REGISTRY, *(name for name in _read_lock() if name not in REGISTRY)]
-    return [
-        Row(one.name, one.purpose, one.licence, one.size_mb, _state(one), weights_folder() / one.place)
-        for one in map(find, names)
-    ]
+def overview() -> list[tuple[Checkpoint, State]]:
+    """Return every registered checkpoint and every other one that was pulled, with the state of its files.
+
+    "by hand": they are there, with no hash to check.
+    """
+    return [(one, _state(one)) for one in map(find, dict.fromkeys([*REGISTRY, *_read_lock()]))]
 
 
 def pull(name: str, *, progress: bool = False) -> Path:
@@ -137,7 +120,7 @@ def pull(name: str, *, progress: bool = False) -> Path:
     if _is_there(checkpoint) and not _is_by_hand(checkpoint):
         return verify(name)
     if checkpoint.source == "hand":
-        raise WeightsError(_advice([checkpoint]))
+        raise WeightsError(_advice(name))
     if os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}:
         raise WeightsError(f"cannot pull '{name}' while HF_HUB_OFFLINE is set: unset it")
     download = _download_from_hub if checkpoint.source == "hub" else _download_from_torchvision
@@ -203,16 +186,17 @@ def _checked(checkpoint: Checkpoint) -> Path:
 
 
 def _state(checkpoint: Checkpoint) -> State:
+    if not _is_there(checkpoint):
+        return "missing"
     with suppress(WeightsError):
-        if not (_is_there(checkpoint) and _checked(checkpoint)):
-            return "missing"
+        _checked(checkpoint)
         return "by hand" if _is_by_hand(checkpoint) else "present"
     return "damaged"
 
 
-def _advice(checkpoints: list[Checkpoint]) -> str:
-    ways = "; or ".join(_how_to_fetch(checkpoint) for checkpoint in checkpoints)
-    return f"the weights of '{checkpoints[0].name}' are not in {weights_folder()}: {ways}"
+def _advice(*names: str) -> str:
+    ways = "; or ".join(_how_to_fetch(find(name)) for name in names)
+    return f"the weights of '{find(names[0]).name}' are not in {weights_folder()}: {ways}"
 
 
 def _how_to_fetch(checkpoint: Checkpoint) -> str:
@@ -248,12 +232,9 @@ def _download_from_hub(checkpoint: Checkpoint, progress: bool) -> str:
 
     (enable_progress_bars if progress else disable_progress_bars)()
     commit = checkpoint.revision or HfApi().model_info(checkpoint.location).sha
-    snapshot_download(
-        checkpoint.location,
-        revision=commit,
-        local_dir=weights_folder() / checkpoint.place,
-        allow_patterns=[*_CONFIGURATION, "*.safetensors", "*.safetensors.index.json"],
-    )
+    wanted = [*_CONFIGURATION, "*.safetensors", "*.safetensors.index.json"]
+    place = weights_folder() / checkpoint.place
+    snapshot_download(checkpoint.location, revision=commit, local_dir=place, allow_patterns=wanted)
     return commit or ""
 
 

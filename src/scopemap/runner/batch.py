@@ -22,8 +22,7 @@ from typing import Any
 
 from scopemap.config import Config
 from scopemap.errors import reporting
-from scopemap.io.addresses import RemoteFile
-from scopemap.io.inputs import NamedInput
+from scopemap.io.inputs import NamedInput, RemoteFile
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.report.batch_page import BatchRow, write_batch_page, write_batch_table

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scopemap.errors import reporting
-from scopemap.io.addresses import RemoteFile
+from scopemap.io.inputs import RemoteFile
 from scopemap.runner.batch import LOGS, Video, log_to
 from scopemap.runner.engines import Engine
 from scopemap.runner.processes import ProcessLimits, run_in_processes

@@ -16,7 +16,7 @@ from scopemap.config import Config
 from scopemap.errors import reporting
 from scopemap.frame import Frame
 from scopemap.fusion.mesh_files import save_mesh
-from scopemap.io.live import LiveSource
+from scopemap.io.live_source import LiveSource
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.odometry import Step

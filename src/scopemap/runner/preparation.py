@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from scopemap.calibration.focal_length.estimate import with_focal_from_motion
+from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
 from scopemap.config import Config
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.estimators import OwnEstimators, create_estimators

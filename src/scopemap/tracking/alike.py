@@ -20,7 +20,7 @@ from scopemap.flow.corners import usable_pixels
 from scopemap.frame import Frame
 from scopemap.geometry.local_contrast import local_mean
 from scopemap.geometry.warp import bilinear
-from scopemap.io.inference import open_network
+from scopemap.io.device import open_network
 from scopemap.io.weights import sha256_of
 from scopemap.tracking.features import Features, points_at
 

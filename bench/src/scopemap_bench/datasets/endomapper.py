@@ -12,10 +12,10 @@ import json
 import re
 from pathlib import Path
 
-from scopemap.cameras.formats.colmap import read_largest_model
+from scopemap.cameras.formats.colmap_model import read_largest_model
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError, reporting
-from scopemap.trajectory.formats.colmap import camera_poses
+from scopemap.trajectory.formats.colmap_poses import camera_poses
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
 _PROCEDURE = re.compile(r"Seq_\d+")

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scopemap.errors import InputError, reporting
-from scopemap.trajectory.formats.colmap import read_colmap
+from scopemap.trajectory.formats.colmap_poses import read_colmap
 from scopemap.trajectory.formats.poses import from_quaternions, stamped
 from scopemap.trajectory.formats.text import text_lines
 from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit

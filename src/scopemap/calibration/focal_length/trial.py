@@ -5,11 +5,10 @@ turn; a straight one tells it where the camera turns and the tissue's depth is a
 being taken for a translation. The depth is scopenet's, without rays: it hardly depends on the lens. The kinds have no
 parameter but the focal length: the radius of a ray at the angle t from the axis is f tan t, f t or f sin t.
 
-The cost of a lens is that of its reprojection errors, in pixels of the picture, so that lenses can be compared, by
-Cauchy's kernel. Errors of neighbouring corners, and those of a corner in successive frames, are alike: `_CORRELATED`
-of them count as one, a number chosen on phantoms (scopemap_bench/scripts/focal_length.py). What is left is a
-probability over
-kinds and focal lengths.
+The cost of a lens is that of its reprojection errors, in pixels of the picture, by Cauchy's kernel. Errors of
+neighbouring corners, and those of a corner in successive frames, are alike: `_CORRELATED` of them count as one, a
+number chosen on phantoms (scopemap_bench/scripts/focal_length.py). The costs give a probability over kinds and focal
+lengths.
 """
 
 from __future__ import annotations
@@ -61,10 +60,8 @@ _FINE = 200
 
 @dataclass(frozen=True)
 class LensTrial:
-    """What a trial of lenses says.
+    """Result of a trial of lenses.
 
-    Attributes
-    ----------
     kind : of the lens that fits best, one of `KINDS`. focal_px : its fx, at the windows' size. share : standard
     deviation of ln fx over all kinds. fov_deg : horizontal field of view. certainty : probability of the kind.
     windows : number of windows used. reason : why this does not tell the lens, or "".
@@ -128,7 +125,10 @@ class _Tried:
 def _camera(focal_px: float, window: Window, kind: str) -> CameraModel:
     """Return a lens whose pixels count from the axis, as those of windows do."""
     width = round(2 * window.half_width_px)
-    plane = PinholeCamera(focal_px, focal_px * window.aspect, 0.0, 0.0, width, width)
+    return _lens(kind, PinholeCamera(focal_px, focal_px * window.aspect, 0.0, 0.0, width, width))
+
+
+def _lens(kind: str, plane: PinholeCamera) -> CameraModel:
     return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
 
 
@@ -232,16 +232,15 @@ def _weights(costs: dict[str, dict[float, float]], fine: np.ndarray) -> dict[str
         shares = [share for share in sorted(of_kind) if math.isfinite(of_kind[share])]
         cost = [of_kind[share] for share in shares]
         # Costs that rise steeply where a lens does not see the picture's corners must not bend the rest.
-        curve = (
-            PchipInterpolator(np.log(shares), cost, extrapolate=False)(fine) if len(shares) > 1 else 0 * fine + np.inf
-        )
+        curve = np.full(len(fine), np.inf)
+        if len(shares) > 1:
+            curve = PchipInterpolator(np.log(shares), cost, extrapolate=False)(fine)
         weight[kind] = np.exp(-np.nan_to_num(curve - lowest, nan=np.inf).clip(0) / _CORRELATED)
     return weight
 
 
 def _fov_deg(kind: str, focal_px: float, width_px: float) -> float:
     """Return the horizontal field of view of a lens, degrees."""
-    plane = PinholeCamera(focal_px, focal_px, 0.0, 0.0, 1, 1)
-    lens = FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
+    lens = _lens(kind, PinholeCamera(focal_px, focal_px, 0.0, 0.0, 1, 1))
     edge = lens.unproject(np.array([[width_px / 2, 0.0]]))[0, 0]
     return 2 * math.degrees(math.atan(np.nan_to_num(edge, nan=np.inf)))

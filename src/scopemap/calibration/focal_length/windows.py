@@ -42,8 +42,6 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 class Window:
     """N corners of a host frame and their observations in K partner frames.
 
-    Attributes
-    ----------
     start : (N, 2) float64 px in the host, from the principal point. seen : (N, K, 2) the same in the partners, NaN
     where not observed. half_width_px : half the width of the image. aspect : fy over fx. log_distance : (N,) ln of the
     estimated distance of the corners along their rays, mm; None: not estimated.
@@ -145,16 +143,9 @@ def _searched(
     image_from: np.ndarray, image_to: np.ndarray, places: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     # OpenCV writes the result over the start.
+    begin, patch, flags = start[:, None].copy(), (_PATCH_PX, _PATCH_PX), cv2.OPTFLOW_USE_INITIAL_FLOW
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        image_from,
-        image_to,
-        places[:, None],
-        start[:, None].copy(),
-        winSize=(_PATCH_PX, _PATCH_PX),
-        maxLevel=_LEVELS,
-        criteria=_STOP,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=_LEAST_EIGENVALUE,
+        image_from, image_to, places[:, None], begin, None, None, patch, _LEVELS, _STOP, flags, _LEAST_EIGENVALUE
     )
     return moved[:, 0], status.ravel() > 0
 

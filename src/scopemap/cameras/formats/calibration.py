@@ -26,10 +26,10 @@ _FOCAL_RATIO = (0.2, 5.0)
 class Calibration:
     """A camera and where it is from.
 
-    depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it.
-    source : how the camera is known, one phrase. file : the file, or its name in errors; None where there is none.
-    size_origin : where the size of `camera` is from. stated: the file. images: the file has none. relative: as images,
-        and the file's numbers are shares of the size.
+    depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it. source : how
+    the camera is known, one phrase. file : the file, or its name in errors, or None. size_origin : where the size of
+    `camera` is from. stated: the file. images: the file has none. relative: as images, and the file's numbers are
+    shares of the size.
     """
 
     camera: CameraModel
@@ -52,10 +52,11 @@ def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Siz
     """
     fx, fy, cx, cy = intrinsics
     width, height = check_size(*(stated or image_size))
-    if max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL:
-        camera = PinholeCamera(fx * width, fy * height, cx * width, cy * height, width, height)
-        return camera, "stated" if stated else "relative"
-    return PinholeCamera(fx, fy, cx, cy, width, height), "stated" if stated else "images"
+    are_shares = max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL
+    if are_shares:
+        fx, fy, cx, cy = fx * width, fy * height, cx * width, cy * height
+    origin: SizeOrigin = "stated" if stated else "relative" if are_shares else "images"
+    return PinholeCamera(fx, fy, cx, cy, width, height), origin
 
 
 def check_size(width: float, height: float) -> Size:
@@ -80,10 +81,11 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
         raise SettingsError(f"fitting a calibration: expected exact, scale or crop:X,Y, found {fit[:40]!r}")
     camera = calibration.camera
     if (camera.width, camera.height) != image_size:
-        raise CalibrationError(
-            f"{_sizes(calibration, image_size)}; give --camera-fit scale if the images were resized from "
-            "that size, --camera-fit crop:X,Y if they were cut out of it, else another calibration (--camera)"
+        advice = (
+            "give --camera-fit scale if the images were resized from that size, --camera-fit crop:X,Y if they were "
         )
+        advice += "cut out of it, else another calibration (--camera)"
+        raise CalibrationError(f"{_sizes(calibration, image_size)}; {advice}")
     check_plausible(camera, calibration.name)
     return calibration
 
@@ -106,17 +108,17 @@ def check_plausible(camera: CameraModel, name: str) -> None:
 def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
     camera = calibration.camera
     if calibration.size_origin == "images":
-        raise CalibrationError(
-            f"{calibration.name} does not state its image size, so that it cannot be scaled (--camera-fit scale): add "
-            "image_width and image_height"
-        )
+        cannot = "so that it cannot be scaled (--camera-fit scale): add image_width and image_height"
+        raise CalibrationError(f"{calibration.name} does not state its image size, {cannot}")
     width, height = image_size
     if (camera.width, camera.height) == image_size:
         return calibration
     if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
+        advice = (
+            "give --camera-fit crop:X,Y if the images were cut out of that size, else a calibration for these images"
+        )
         raise CalibrationError(
-            f"{_sizes(calibration, image_size)}: another aspect, perhaps cropped; give --camera-fit crop:X,Y if the "
-            "images were cut out of that size, else a calibration for these images (--camera)"
+            f"{_sizes(calibration, image_size)}: another aspect, perhaps cropped; {advice} (--camera)"
         )
     source = f"{calibration.source}, rescaled from {camera.width}x{camera.height} px"
     return replace(calibration, camera=camera.resized(width, height), source=source)
@@ -125,16 +127,12 @@ def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
 def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]) -> Calibration:
     camera, (x, y) = calibration.camera, corner
     if calibration.size_origin == "relative":
-        raise CalibrationError(
-            f"{calibration.name} holds shares of a size that it does not state, so that nothing can be cut out of it "
-            "(--camera-fit crop): add width and height"
-        )
+        cannot = "so that nothing can be cut out of it (--camera-fit crop): add width and height"
+        raise CalibrationError(f"{calibration.name} holds shares of a size that it does not state, {cannot}")
     is_stated = calibration.size_origin == "stated"
     if is_stated and (x + image_size[0] > camera.width or y + image_size[1] > camera.height):
-        raise CalibrationError(
-            f"{_sizes(calibration, image_size)}: too large to have been cut out of it at {x},{y} px "
-            f"(--camera-fit crop:{x},{y})"
-        )
+        cut = f"cut out of it at {x},{y} px (--camera-fit crop:{x},{y})"
+        raise CalibrationError(f"{_sizes(calibration, image_size)}: too large to have been {cut}")
     of_size = f" of {camera.width}x{camera.height} px" if is_stated else ""
     source = f"{calibration.source}, cut out{of_size} at {x},{y} px"
     return replace(calibration, camera=camera.cropped(x, y, *image_size), source=source)

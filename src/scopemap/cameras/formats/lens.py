@@ -60,11 +60,10 @@ def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tup
     Of several sets of coefficients the first that is not zero counts. Raises `ValueError` as `with_lens`, and where
     something looks like coefficients but is not read.
     """
-    found = list(_candidates(levels, model))
-    coefficients = next(filter(any, found), None)
-    if coefficients is None:
+    found = [*_candidates(levels, model), []]
+    coefficients = next(filter(any, found), found[0])
+    if not any(coefficients):
         _check_nothing_unread(levels)
-        coefficients = found[0] if found else []
     return with_lens(pinhole, model, coefficients)
 
 
@@ -78,10 +77,8 @@ def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float])
         raise ValueError(f"it has {len(coefficients)} distortion coefficients, more than any lens")
     lens = tuple(float(k) for k in coefficients)
     if _OTHER_PROJECTION.search(model) or (any(lens) and _OTHER_DISTORTION.search(model)):
-        raise ValueError(
-            f"the lens model {model[:_LONGEST_QUOTE]!r} has no counterpart here: calibrate as pinhole with "
-            "radial-tangential or equidistant (fisheye) coefficients"
-        )
+        advice = "calibrate as pinhole with radial-tangential or equidistant (fisheye) coefficients"
+        raise ValueError(f"the lens model {model[:_LONGEST_QUOTE]!r} has no counterpart here: {advice}")
     if _FISHEYE.search(model):
         return FisheyeCamera(pinhole, _with_count(lens, 4)), ""
     if _FOV.search(model):
@@ -144,10 +141,8 @@ def _check_nothing_unread(levels: Sequence[Fields]) -> None:
     for name, node in (pair for level in levels for pair in level.pairs):
         is_lens = _UNREAD.search(name) or (isinstance(node, Fields) and node.number(("k1",)) is not None)
         if is_lens and not _BESIDE.search(name) and _has_numbers(node):
-            raise ValueError(
-                f"{name[:_LONGEST_QUOTE]!r} in it looks like distortion but is not read: call it "
-                "distortion_coefficients, a list in OpenCV's order, k1 k2 p1 p2 k3"
-            )
+            advice = "call it distortion_coefficients, a list in OpenCV's order, k1 k2 p1 p2 k3"
+            raise ValueError(f"{name[:_LONGEST_QUOTE]!r} in it looks like distortion but is not read: {advice}")
 
 
 def _has_numbers(node: Any, depth: int = 0) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats import colmap, text_formats
+from scopemap.cameras.formats import colmap_model, text_formats
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, Calibration, Size, check_size, fitted, pinhole_of
 from scopemap.cameras.formats.lens import lens_of, model_in
 from scopemap.cameras.formats.parsing import (
@@ -82,15 +82,15 @@ def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
 
 def _read(file: Path, image_size: Size) -> Calibration:
     content = calibration_bytes(file)
-    if colmap.is_cameras_binary(content):
-        return Calibration(colmap.only_camera(file), None, "")
+    if colmap_model.is_cameras_binary(content):
+        return Calibration(colmap_model.only_camera(file), None, "")
     if b"\0" in content:
         raise ValueError("it is binary, not text")
     text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
     if (rows := number_rows(text)) is not None:
         return text_formats.of_numbers(rows, image_size)
-    if colmap.is_cameras_text(text):
-        return Calibration(colmap.only_camera(file), None, "")
+    if colmap_model.is_cameras_text(text):
+        return Calibration(colmap_model.only_camera(file), None, "")
     if (
         fields := text_formats.calibu_fields(text) if "<camera_model" in text else text_formats.stereo_ini_fields(text)
     ) is not None:

@@ -37,10 +37,8 @@ def of_numbers(rows: list[list[float]], image_size: Size) -> Calibration:
     elif len(values) in _LINE_COUNTS:
         note, intrinsics, coefficients = "", values[:4], values[4:]
     else:
-        raise ValueError(
-            f"it holds {len(values)} numbers: expected fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or a camera matrix "
-            "of 3x3, 3x4 or 4x4"
-        )
+        expected = "expected fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or a camera matrix of 3x3, 3x4 or 4x4"
+        raise ValueError(f"it holds {len(values)} numbers: {expected}")
     pinhole, origin = pinhole_of(intrinsics, None, image_size)
     return Calibration(with_lens(pinhole, "", coefficients)[0], None, note, origin)
 
@@ -92,10 +90,8 @@ def _of_ocamcalib(rows: list[list[float]]) -> OmnidirectionalCamera:
     size = check_size(width, height)
     first = polynomial[0] if 0 < len(polynomial) <= MOST_TERMS else 0.0
     if first >= 0 or not 0.5 < c < 2:
-        raise ValueError(
-            f"its polynomial begins with {first:g} and its affine part with {c:g}: the toolbox writes a negative "
-            "number and one near 1"
-        )
+        begins = f"its polynomial begins with {first:g} and its affine part with {c:g}"
+        raise ValueError(f"{begins}: the toolbox writes a negative number and one near 1")
     forward = tuple(-a * c ** (1 - power) for power, a in enumerate(polynomial))
     return OmnidirectionalCamera(forward, column, row, *size, (1 / c, e / c, d / c))
 

@@ -21,9 +21,8 @@ def write_calibration(
 ) -> None:
     """Write `camera` as OpenCV YAML that `read_calibration` reads back exactly.
 
-    `depth_scale_mm` is written as `depth_scale`: mm per unit of the depth files beside it; `focal_sigma_px` under its
-    own name: the standard deviation of fx, for people; `rate_hz` as `fps`, frames per second. Raises `CalibrationError`
-    where the file cannot be written.
+    `depth_scale_mm` is written as `depth_scale`: mm per unit of the depth files beside it; `focal_sigma_px`: the
+    standard deviation of fx; `rate_hz` as `fps`. Raises `CalibrationError` where the file cannot be written.
     """
     # In memory: OpenCV takes no names outside of the system's code page on Windows.
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -40,12 +39,9 @@ def write_calibration(
     storage.write("camera_model", model)
     for name, values in terms.items():
         storage.write(name, np.array([values]))
-    if depth_scale_mm is not None:
-        storage.write("depth_scale", float(depth_scale_mm))
-    if focal_sigma_px is not None:
-        storage.write("focal_sigma_px", float(focal_sigma_px))
-    if rate_hz is not None:
-        storage.write("fps", float(rate_hz))
+    for name, value in (("depth_scale", depth_scale_mm), ("focal_sigma_px", focal_sigma_px), ("fps", rate_hz)):
+        if value is not None:
+            storage.write(name, float(value))
     try:
         Path(file).write_text(storage.releaseAndGetString(), encoding="utf-8")
     except OSError as error:

@@ -24,8 +24,7 @@ from scopemap.depth.scopenet.planes import INSTRUMENTS, PLANES, STRIDE, input_pl
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
-from scopemap.io.device import cpu_threads
-from scopemap.io.inference import open_network
+from scopemap.io.device import cpu_threads, open_network
 
 WEIGHTS_NAME = "scopenet.onnx"
 _INPUT = "planes"

@@ -11,10 +11,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from scopemap.cameras.formats.colmap import ModelImage, camera_model, model_files, read_cameras, read_images
+from scopemap.cameras.formats.colmap_model import ModelImage, camera_model, model_files, read_cameras, read_images
 from scopemap.errors import InputError
 from scopemap.io.images import ImageFolder, image_files
-from scopemap.trajectory.formats.colmap import camera_poses
+from scopemap.trajectory.formats.colmap_poses import camera_poses
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 _DEEPEST_MODEL = 3
@@ -32,12 +32,9 @@ class ColmapFolder(ImageFolder):
     quality = "sfm"
 
     def __init__(self, path: Path) -> None:
-        found = _model(path)
-        if found is None:
-            raise InputError(
-                f"reading {path}: no COLMAP model, looked for cameras.bin and images.bin, or both as .txt, in "
-                f"{', '.join(_MODELS)}"
-            )
+        if (found := _model(path)) is None:
+            looked_for = "cameras.bin and images.bin, or both as .txt"
+            raise InputError(f"reading {path}: no COLMAP model, looked for {looked_for}, in {', '.join(_MODELS)}")
         cameras_file, images_file = found
         images = read_images(images_file)
         files = _files_of(path, images)
@@ -65,10 +62,9 @@ class ColmapFolder(ImageFolder):
             raise InputError(f"reading {file}: it has no camera {unknown[0]}, by which images of the model were taken")
         models = {number: camera_model(cameras[number], f"camera {number} of {file}") for number in uses}
         if len(set(models.values())) > 1:
-            raise InputError(
-                f"reading {file}: the images were taken by {len(models)} cameras whose intrinsics differ; a sequence "
-                "has one: reconstruct with a single camera for all images, or give their calibration (--camera)"
-            )
+            advice = "reconstruct with a single camera for all images, or give their calibration (--camera)"
+            differ = f"the images were taken by {len(models)} cameras whose intrinsics differ; a sequence has one"
+            raise InputError(f"reading {file}: {differ}: {advice}")
         number, camera = next(iter(models.items()))
         self._set_camera(camera, f"COLMAP {file.name}, {cameras[number].model}", f"camera {number} of {file}")
 
@@ -103,10 +99,8 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
     """Return all images of the folder that holds those of the model; `InputError` where there is none, or several."""
     inner = sorted({image.path.parent for image in images})
     if len(inner) > 1:
-        raise InputError(
-            f"reading {path}: the images of the COLMAP model are in {len(inner)} folders, a sequence in one; "
-            "reconstruct one of them, or leave the others out of the model"
-        )
+        several = f"the images of the COLMAP model are in {len(inner)} folders, a sequence in one"
+        raise InputError(f"reading {path}: {several}; reconstruct one of them, or leave the others out of the model")
     wanted = {image.path.name for image in images}
     # Names from a file of unknown origin must not lead out of the folder.
     stays_inside = not inner[0].is_absolute() and ".." not in inner[0].parts
@@ -116,7 +110,5 @@ def _files_of(path: Path, images: list[ModelImage]) -> list[Path]:
             files = image_files(place)
             if any(file.name in wanted for file in files):
                 return files
-    raise InputError(
-        f"reading {path}: none of the {len(images)} images in the COLMAP model (such as {images[0].name!r}) is there; "
-        f"put them into {path / _IMAGES}"
-    )
+    none = f"none of the {len(images)} images in the COLMAP model (such as {images[0].name!r}) is there"
+    raise InputError(f"reading {path}: {none}; put them into {path / _IMAGES}")

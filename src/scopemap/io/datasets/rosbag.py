@@ -2,8 +2,7 @@
 
 Images are those of one topic, `sensor_msgs/Image` or `CompressedImage`; the camera is that of its `camera_info`. Depth
 is used where its topic's name says that it is aligned to the colour images. Poses are not used: no message says which
-of a recording's frames is the camera's. Bags are read by the package `rosbags` (the extra `ros`); messages are those
-of the ROS distributions, definitions inside a bag are not used.
+frame is the camera's. Bags are read by `rosbags` (the extra `ros`), by the message definitions of the distributions.
 """
 
 from __future__ import annotations
@@ -91,11 +90,9 @@ class RosBag(Source):
         if find_spec("rosbags") is None:
             raise InputError(f"reading {path}: it is a ROS bag; install its reader: pip install -e '.[ros]'")
         super().__init__(path)
-        self._storage = _storage_of(path)
-        self._lock = threading.Lock()
+        self._storage, self._bits = _storage_of(path), 0
+        self._lock, self._open_readers = threading.Lock(), ExitStack()
         self._depth_reader: Any = None
-        self._open_readers = ExitStack()
-        self._bits = 0
         with self._opened() as reader:
             self._topics = self._topics_in(reader)
             self._topic = self._chosen(topic)
@@ -199,15 +196,14 @@ class RosBag(Source):
 
         connections = [connection for connection in _readable(reader) if connection.topic in topics]
         found = reader.messages(connections, start_ns, stop_ns) if connections else iter(())
-        ros1 = self._storage.suffix == ".bag"
-        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
-        deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+        is_ros1 = self._storage.suffix == ".bag"
+        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+        deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         while True:
             with self._reporting():
-                item = next(found, None)
-            if item is None:
+                connection, bag_ns, raw = next(found, (None, 0, b""))
+            if connection is None:
                 return
-            connection, bag_ns, raw = item
             fields: Any = None
             header_ns = 0
             with suppress(Exception):  # damaged bytes end in exceptions of any kind
@@ -246,8 +242,7 @@ class RosBag(Source):
         fault = f"{self._topic.name} holds no message"
         for message in self._as_far_as_read(reader, [self._topic.name]):
             try:
-                height, width, _ = self._picture(message).shape
-                return height, width
+                return self._picture(message).shape[:2]
             except InputError as error:
                 fault = str(error)
         raise InputError(f"reading {self.path}: no image of {self._topic.name} can be read ({fault})")
@@ -272,16 +267,14 @@ class RosBag(Source):
         images = [topic for topic in self._topics.values() if topic.encoding and not is_depth(topic.encoding)]
         names = ", ".join(topic.name for topic in images) or "none"
         if name is not None:
-            for topic in images:
-                if topic.name.strip("/") == name.strip("/"):
-                    return topic
+            if found := [topic for topic in images if topic.name.strip("/") == name.strip("/")]:
+                return found[0]
             raise InputError(f"reading {self.path}: no images under the topic '{name}'; there are {names}")
         if not images:
             fault = "".join(f"; {warning}" for warning in self.warnings[:1])
-            raise InputError(
-                f"reading {self.path}: it holds no images (looked for sensor_msgs/Image and CompressedImage; topics of "
-                f"these kinds and camera_info are {', '.join(self._topics) or 'none'}){fault}"
-            )
+            looked = f"topics of these kinds and camera_info are {', '.join(self._topics) or 'none'}"
+            looked = f"looked for sensor_msgs/Image and CompressedImage; {looked}"
+            raise InputError(f"reading {self.path}: it holds no images ({looked}){fault}")
 
         def preference(topic: _Topic) -> tuple[bool, bool, bool, bool, int, bool]:
             left, right = (bool(side.search(topic.name)) for side in (_LEFT, _RIGHT))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from scopemap.cameras.formats.colmap import is_image_line
+from scopemap.cameras.formats.colmap_model import is_image_line
 from scopemap.errors import InputError, SettingsError
 from scopemap.plugins import plugins
-from scopemap.trajectory.formats import colmap, folders, text
+from scopemap.trajectory.formats import colmap_poses, folders, text
 from scopemap.trajectory.trajectory import Trajectory, Unit
 
 Reader = Callable[[Path, Unit], Trajectory]
@@ -37,7 +37,7 @@ _OWN = (
     TrajectoryFormat("tum", text.read_tum),
     TrajectoryFormat("kitti", text.read_kitti),
     TrajectoryFormat("c3vd", text.read_c3vd, ("pose.txt",)),
-    TrajectoryFormat("colmap", colmap.read_colmap, colmap.COLMAP_FILES, lambda path: _is_colmap(path)),
+    TrajectoryFormat("colmap", colmap_poses.read_colmap, colmap_poses.COLMAP_FILES, lambda path: _is_colmap(path)),
 )
 _COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, 16: text.read_c3vd}
 

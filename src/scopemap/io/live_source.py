@@ -22,13 +22,14 @@ _STREAM_OPTIONS = {"rtsp_transport": "tcp", "flags": "low_delay"}
 
 
 class LiveSource(Source):
-    """Frames of a camera, a stream or a file, read in a thread of their own; whoever is slow gets the newest.
+    """Frames of a camera, a stream or a file, read in a thread of their own; a slow consumer gets the newest.
 
     address : the number of a camera, a device (/dev/video0), an address that FFmpeg opens (rtsp://...), or a file or
         folder, which is played by its own time stamps.
 
-    Frame numbers count all frames read, `time_s` is the time since the first. `read` and `dropped` count frames.
-    Raises `InputError` where it cannot be opened or gives no frame within ten seconds.
+    Frame numbers count all frames read, `time_s` is the time since the first. `read` and `dropped` count frames; while
+    `paused` is set, frames are read and left out. `first` : the first picture, (h, w, 3) uint8, which `frames` yields,
+    too, where it comes from a file. Raises `InputError` where it cannot be opened or gives no frame within ten seconds.
     """
 
     name = "live"
@@ -37,17 +38,12 @@ class LiveSource(Source):
 
     def __init__(self, address: str) -> None:
         super().__init__(Path(address))
-        self.read = self.dropped = 0
-        self.paused = False
-        """While it is, frames are read and left out."""
+        self.read, self.dropped, self.paused = 0, 0, False
         self._pictures = self._opened(address)
-        first = next(self._pictures, None)
-        if first is None:
+        if (first := next(self._pictures, None)) is None:
             raise InputError(f"reading {address}: it gives no picture")
-        self.first = first[1]
-        """The first picture, (h, w, 3) uint8; `frames` yields it, too, where it comes from a file."""
+        self._stamp_s, self.first = first
         self.height, self.width = self.first.shape[:2]
-        self._stamp_s = first[0]
         self._started_s = time.monotonic()
         self._newest: SourceFrame | None = None
         self._ended, self._fault = False, ""
@@ -55,7 +51,7 @@ class LiveSource(Source):
         self._thread = threading.Thread(target=self._read, name="live", daemon=True)
 
     def now_s(self) -> float:
-        """Return the present time in the unit of `time_s`: with a frame's, how old it is."""
+        """Return the present time, s, on the clock of `time_s`."""
         return time.monotonic() - self._started_s
 
     def stop(self) -> None:
@@ -65,9 +61,9 @@ class LiveSource(Source):
             self._changed.notify_all()
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the newest frame, again and again, until the source ends or `stop` is called; `selection` is not used.
+        """Yield the newest frame until the source ends or `stop` is called; `selection` is not used.
 
-        Called again it goes on. Where the source broke off, `warnings` says so.
+        A second call continues. `warnings` says where the source broke off.
         """
         if self._thread.ident is None:
             self._started_s = time.monotonic()
@@ -83,7 +79,6 @@ class LiveSource(Source):
             self._warn(self._fault)
 
     def _read(self) -> None:
-        """Keep the newest frame."""
         try:
             with closing(self._pictures):
                 if self._stamp_s is not None:  # of a file; a camera's is old by now
@@ -98,7 +93,7 @@ class LiveSource(Source):
             self.stop()
 
     def _put(self, stamp_s: float | None, rgb: np.ndarray) -> None:
-        """Hand a picture on when its time has come; the one before is dropped where nobody has taken it."""
+        """Publish a picture when its time has come; the one before is dropped where nobody has taken it."""
         with self._changed:
             if stamp_s is not None:
                 self._changed.wait_for(lambda: self._ended, timeout=max(stamp_s - self.now_s(), 0.0))

@@ -12,6 +12,7 @@ import math
 import re
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -62,7 +63,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """An image of a model: path below the folder of the images, camera, qw qx qy qz tx ty tz world to camera, place.
+    """An image of a model: path below the folder of the images, camera, qw qx qy qz tx ty tz world to camera.
 
     `where` is the file and the place in it, for errors.
     """
@@ -91,18 +92,16 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 
 def read_cameras(file: Path) -> dict[int, ModelCamera]:
     """Return the cameras of a model by number; `CalibrationError` for a file that is damaged."""
-    cameras: dict[int, ModelCamera] = {}
     try:
         with file.open("rb") as stream:
             is_binary = file.suffix == ".bin" or b"\0" in stream.read(_COUNT.size)
             stream.seek(0)
-            for number, camera in _binary_cameras(stream) if is_binary else _text_cameras(stream):
-                if number in cameras:
-                    raise ValueError(f"camera {number} comes again; leave one out")
-                cameras[number] = camera
+            found = list(_binary_cameras(stream) if is_binary else _text_cameras(stream))
+        if again := [number for number, count in Counter(number for number, _ in found).items() if count > 1]:
+            raise ValueError(f"camera {again[0]} comes again; leave one out")
     except (OSError, ValueError) as error:
         raise CalibrationError(f"cannot read the cameras of a COLMAP model from {file}: {error}") from None
-    return cameras
+    return dict(found)
 
 
 def read_images(file: Path) -> list[ModelImage]:
@@ -159,9 +158,8 @@ def only_camera(file: Path) -> CameraModel:
     """Return the camera of a file that holds one; `CalibrationError` for any other file."""
     cameras = read_cameras(file)
     if len(cameras) != 1:
-        raise CalibrationError(
-            f"the calibration {file} holds {len(cameras)} cameras (COLMAP): leave the one of these images in it"
-        )
+        held = f"{len(cameras)} cameras (COLMAP): leave the one of these images in it"
+        raise CalibrationError(f"the calibration {file} holds {held}")
     ((number, camera),) = cameras.items()
     return camera_model(camera, f"camera {number} of {file}")
 
@@ -173,11 +171,9 @@ def camera_model(camera: ModelCamera, name: str) -> CameraModel:
     """
     if camera.model not in _READ:
         raise CalibrationError(f"{name} is of the model {camera.model}, which is not read: {_ADVICE}")
-    if len(camera.parameters) != _PARAMETERS[camera.model]:
-        raise CalibrationError(
-            f"{name}: found {len(camera.parameters)} parameters where the model {camera.model} has "
-            f"{_PARAMETERS[camera.model]}"
-        )
+    found, wanted = len(camera.parameters), _PARAMETERS[camera.model]
+    if found != wanted:
+        raise CalibrationError(f"{name}: found {found} parameters where the model {camera.model} has {wanted}")
     if not (0 < camera.width <= LARGEST_SIDE_PX and 0 < camera.height <= LARGEST_SIDE_PX):
         raise CalibrationError(f"{name} is for images of {camera.width}x{camera.height} px, which are none")
     if not all(map(math.isfinite, camera.parameters)):
@@ -207,9 +203,8 @@ def _text_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
             key, width, height = (int(fields[i]) for i in (0, 2, 3))
             yield key, ModelCamera(fields[1], width, height, tuple(float(field) for field in fields[4:]))
         except (IndexError, ValueError):
-            raise ValueError(
-                f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line.strip()[:60]!r}"
-            ) from None
+            expected = "expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+            raise ValueError(f"line {number}: {expected}, found {line.strip()[:60]!r}") from None
 
 
 def _binary_cameras(stream: IO[bytes]) -> Iterator[tuple[int, ModelCamera]]:
@@ -228,11 +223,9 @@ def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
     images = list((_binary_images if binary else _text_images)(stream, where))
     if not images:
         raise ValueError("it holds no image with its pose")
-    seen: set[PurePosixPath] = set()
-    for image in images:
-        if image.path in seen:
-            raise ValueError(f"the image {image.name!r} comes again ({image.where}); leave one out")
-        seen.add(image.path)
+    last = {image.path: image for image in images}
+    if again := [last[image.path] for image in images if last[image.path] is not image]:
+        raise ValueError(f"the image {again[0].name!r} comes again ({again[0].where}); leave one out")
     return images
 
 
@@ -247,10 +240,8 @@ def _text_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
                 raise ValueError(f"line {number}: expected the number of a camera before the name, found {camera!r}")
             yield ModelImage(name.strip(), int(camera), tuple(map(float, values)), f"{where}, line {number}")
         elif line.strip() and not _is_number(line.split()[-1]):
-            raise ValueError(
-                f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, or numbers, found "
-                f"{line.strip()[:60]!r}"
-            )
+            expected = "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, or numbers"
+            raise ValueError(f"line {number}: {expected}, found {line.strip()[:60]!r}")
 
 
 def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
@@ -265,7 +256,9 @@ def _binary_images(stream: IO[bytes], where: str) -> Iterator[ModelImage]:
         if letter != b"\0" or not name:
             raise ValueError(f"image {position + 1} has no name; it is damaged or cut off")
         (points,) = _taken(stream, _COUNT)
-        _skip(stream, _POINT_BYTES * points)
+        left = _POINT_BYTES * points
+        while left > 0:  # a piece at a time: it is no more than a claim
+            left -= len(_bytes(stream, min(left, _PIECE_BYTES)))
         yield ModelImage(name.decode(), camera, tuple(values), f"{where}, image {position + 1}")
     _check_end(stream)
 
@@ -277,19 +270,14 @@ def _check_end(stream: IO[bytes]) -> None:
 
 def _taken(stream: IO[bytes], form: Struct) -> tuple:
     """Return the next values, of the types in `form`."""
-    content = stream.read(form.size)
-    if len(content) < form.size:
+    return form.unpack(_bytes(stream, form.size))
+
+
+def _bytes(stream: IO[bytes], size: int) -> bytes:
+    content = stream.read(size)
+    if len(content) < size:
         raise ValueError("it is cut off; write the model again")
-    return form.unpack(content)
-
-
-def _skip(stream: IO[bytes], size: int) -> None:
-    """Read on by `size` bytes, a piece at a time: `size` is no more than a claim."""
-    while size > 0:
-        piece = len(stream.read(min(size, _PIECE_BYTES)))
-        if not piece:
-            raise ValueError("it is cut off; write the model again")
-        size -= piece
+    return content
 
 
 def _is_number(text: str) -> bool:

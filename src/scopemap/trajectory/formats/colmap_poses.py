@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.colmap import ModelImage, read_images
+from scopemap.cameras.formats.colmap_model import ModelImage, read_images
 from scopemap.errors import InputError
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.formats.poses import file_of, from_quaternions, rigid, stamped

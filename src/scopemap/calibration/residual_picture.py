@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from scopemap.calibration.camera_calibration import CameraCalibration
-from scopemap.calibration.views import views_per_pixel
+from scopemap.calibration.targets import views_per_pixel
 from scopemap.errors import InputError
 from scopemap.report.sheet import INK, Plot, Sheet
 
