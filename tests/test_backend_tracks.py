@@ -17,8 +17,8 @@ from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.bundle_adjustment import adjust
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Priors
 from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.reprojection import BundleProblem, Observations, Priors
 
 
 class _Biased(DisFlow):
@@ -118,11 +118,6 @@ def test_observations_that_share_their_errors_count_as_one() -> None:
     assert np.abs(trusted.T_camera_world - wanted.T_camera_world).max() > 0.02
 
 
-def test_less_than_one_observation_is_refused() -> None:
-    with pytest.raises(ValueError, match="correlated_observations"):
-        MappingAdvanced(correlated_observations=0.5)
-
-
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
     for number in range(4):
@@ -135,4 +130,3 @@ def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     assert 0.6 * most < len(fewer.point) <= 1.1 * most
     counts = np.bincount(observations.point, minlength=len(points.host))
     assert np.array_equal(np.bincount(fewer.point, minlength=len(fewer_points.host)), counts[::every])
-    assert np.array_equal(tracks.collected(None, len(observations.point))[1].pixel, observations.pixel)

@@ -23,7 +23,7 @@ from scopemap.depth.mapis import Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.se3 import se3
 from scopemap.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
 from scopemap.odometry import Step

@@ -27,7 +27,7 @@ from scopemap.depth.shading import ShadingDepth
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowPair
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker

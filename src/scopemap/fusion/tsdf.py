@@ -327,8 +327,6 @@ def integrate_blocks(
 class VoxelBlocks:
     """Blocks of 8^3 voxels found by the key of their block coordinate.
 
-    Attributes
-    ----------
     voxels : storage of at least `len(self) + 1` blocks; slot 0 is always an empty block.
     """
 

@@ -21,7 +21,7 @@ from scipy import sparse
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.mapping.reprojection import Points
+from scopemap.mapping.bundle_problem import Points
 
 ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
 MAX_LOG_FACTOR = 0.7
@@ -45,8 +45,6 @@ _GRID_PX = 8  # between the pixels whose depth is compared between keyframes
 class DepthCorrectionField:
     """ln of the factor of a keyframe's depth, trilinear between the nodes of a grid.
 
-    Attributes
-    ----------
     values : (6, 7, 4) over rows, columns and ln depth; the first and last nodes are at the image's borders. nearest,
     farthest : ln mm of the first and the last level; the field is constant beyond them.
     """

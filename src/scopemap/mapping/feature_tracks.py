@@ -19,8 +19,8 @@ from scopemap.flow.corners import detect_corners, match_corners, normalised_brig
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.uncertainty import relative_sigma
+from scopemap.mapping.bundle_problem import Observations, Points
 from scopemap.mapping.loop_closure import Loop
-from scopemap.mapping.reprojection import Observations, Points
 
 _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.

@@ -34,8 +34,6 @@ _NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 class Loop:
     """A loop closure: two keyframes that observe the same place, long after each other or in two maps.
 
-    Attributes
-    ----------
     past, new : numbers of the keyframes. T_new_past : (4, 4), mm of the past keyframe's depth. log_ratio : ln of the
     new keyframe's depth over the past one's, transformed into the new camera. pixels_past, pixels_new : (M, 2) of the
     matched features. log_depth_past, log_depth_new : (M,) ln of their depth, NaN = unknown.

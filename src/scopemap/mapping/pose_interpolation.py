@@ -40,8 +40,6 @@ class Refusal(NamedTuple):
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
 
-    Attributes
-    ----------
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
     robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,

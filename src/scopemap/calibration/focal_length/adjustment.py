@@ -16,7 +16,7 @@ import numpy as np
 
 from scopemap.calibration.focal_length.windows import Window
 from scopemap.mapping.bundle_adjustment import adjust, linearised
-from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors, State, UnknownLens
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State, UnknownLens
 
 _LOG_DEPTH_SIGMA, _DISTORTION_SIGMA, _LOG_FOCAL_SIGMA = 1.0, 0.3, 1.0
 _NO_DISTORTION_SIGMA = 1e-4
