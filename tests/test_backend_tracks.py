@@ -97,14 +97,6 @@ def test_patches_that_differ_are_no_observations() -> None:
     assert len(refined_corners(image, image, corners[:0], corners[:0])[0]) == 0
 
 
-def test_normalised_brightness_forgets_the_lamp() -> None:
-    rgb = plane_scene.see(plane_scene.pose()).rgb // 2 + 40
-    lit = np.linspace(0.5, 1.3, rgb.shape[1])[None, :, None] * rgb
-    assert np.abs(lit - rgb).mean() > 0.7 * rgb.std()
-    difference = normalised_brightness(lit.astype(np.uint8)).astype(int) - normalised_brightness(rgb)
-    assert np.abs(difference).mean() < 0.2 * normalised_brightness(rgb).std()
-
-
 def test_observations_that_share_their_errors_count_as_one() -> None:
     rng = np.random.default_rng(3)
     T, points, observations = world(rng)

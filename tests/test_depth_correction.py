@@ -91,7 +91,6 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
     camera, rgb, valid = plane_scene.CAMERA.resized(2, 1), np.zeros((1, 2, 3), np.uint8), np.ones((1, 2), bool)
     frame = Frame(15, 0.0, rgb, camera, valid, depth_mm, np.eye(4), depth_sigma_mm=0.1 * depth_mm)
     done = corrected_frame(frame, correction)
-    assert done.depth_sigma_mm is not None
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
     assert "corrected by 22%" in correction.notice.text
 
@@ -106,8 +105,6 @@ def _bent(number: int) -> Frame:
 
 def _shape_error(frame: Frame, factors: np.ndarray) -> float:
     """Mean error of ln depth after alignment of its scale."""
-    assert frame.T_world_camera is not None
-    assert frame.depth_mm is not None
     off = np.log(frame.depth_mm * factors / plane_scene.see(frame.T_world_camera).depth_mm)
     return float(np.abs(off - np.median(off)).mean())
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, plane_frame, sphere_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -195,24 +196,22 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
     valid[:, :30] = False
     x_mm, y_mm = (40 * VIEW.rays[[row - 3, row + 3], [col - 3, col + 3], axis] for axis in (0, 1))
 
-    def fused(*, highlights: bool = True, **advanced: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices, their confidence, colours, and whether they are under the highlight."""
+    def fused(*, highlights: bool = True, **advanced: float) -> tuple[trimesh.Trimesh, np.ndarray]:
+        """The mesh, and which vertices are under the highlight."""
         volume = TsdfVolume(_lenient(**advanced))
         for _ in range(5):
             volume.integrate(replace(frame, valid=valid, rgb=shown, highlights=~valid if highlights else None))
         mesh = volume.extract_mesh()
         x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
-        under = (x > x_mm[0]) & (x < x_mm[1]) & (y > y_mm[0]) & (y < y_mm[1])
-        colours = np.asarray(mesh.visual.vertex_colors)[:, :3]
-        return np.asarray(mesh.vertices), np.asarray(mesh.vertex_attributes["confidence"]), colours, under
+        return mesh, (x > x_mm[0]) & (x < x_mm[1]) & (y > y_mm[0]) & (y < y_mm[1])
 
-    vertices, confidence, colours, under = fused()
+    mesh, under = fused()
     assert under.sum() >= 1
-    assert np.abs(vertices[under, 2] - 40).max() < 0.1
+    assert np.abs(mesh.vertices[under, 2] - 40).max() < 0.1
+    confidence, colours = mesh.vertex_attributes["confidence"], np.asarray(mesh.visual.vertex_colors, float)
     assert confidence[under].max() < 0.4 * np.median(confidence[~under])
-    np.testing.assert_allclose(colours[under], np.broadcast_to(np.median(colours, axis=0), (under.sum(), 3)), atol=12)
-    # What is masked at the picture's border is no highlight.
-    assert vertices[:, 0].min() > 40 * VIEW.rays[row, 27, 0]
-    assert not fused(weighted=False)[3].any()
-    # Nor is what is masked for another reason, such as an instrument.
-    assert not fused(highlights=False)[3].any()
+    assert np.abs(colours[under] - np.median(colours, axis=0)).max() < 12
+    # What is masked at the picture's border is no highlight, nor what is masked for another reason.
+    assert mesh.vertices[:, 0].min() > 40 * VIEW.rays[row, 27, 0]
+    assert not fused(weighted=False)[1].any()
+    assert not fused(highlights=False)[1].any()

@@ -145,7 +145,6 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
         )
         for size in (1.0, factor)
     )
-    assert same.config.fusion.voxel_mm is not None
     assert other.config.fusion.voxel_mm == pytest.approx(factor * same.config.fusion.voxel_mm, rel=0.05)
     # What a result states is what makes it again.
     (tmp_path / "config.toml").write_text(other.config.toml(), encoding="utf-8")

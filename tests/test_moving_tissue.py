@@ -142,7 +142,7 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
     for index in (0, 9):
         vertices = np.asarray(trimesh.load(run / "surfaces" / f"{index:06d}.ply", process=False).vertices)
         column, row = np.rint(camera.project(vertices)).astype(int).T
-        truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)  # type: ignore[index]
+        truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)
         assert len(vertices) > 5000
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
 

@@ -75,7 +75,6 @@ def test_a_wrong_depth_is_corrected_to_a_fraction() -> None:
     wrong = _view(MIDDLE, _bias())
     neighbours = [_view(number, _bias(), gain=0.8 if number % 2 else 1.0) for number in (2, 3, 5, 6)]
     found = triangulate_depth(wrong, neighbours, CAMERA, DisFlow())
-    assert found is not None
     assert _error(wrong.depth_mm) > 0.05
     assert _error(found.depth_mm) < 0.2 * _error(wrong.depth_mm)
     assert np.median(found.sigma) < 0.06
@@ -98,7 +97,6 @@ def test_what_one_neighbour_sees_alone_keeps_its_depth() -> None:
     for neighbour in neighbours[1:]:
         neighbour.depth_mm[:, :60] = np.nan
     found = triangulate_depth(view, neighbours, CAMERA, DisFlow())
-    assert found is not None
     assert np.abs(found.log_factor[20:-20, 90:140]).mean() > 0.08
     assert np.abs(found.log_factor[20:-20, 12:30]).mean() < 0.06
     assert found.sigma[20:-20, 12:30].mean() > 2 * found.sigma[20:-20, 90:140].mean()

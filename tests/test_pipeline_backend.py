@@ -86,7 +86,6 @@ def test_depth_maps_in_the_folder_have_the_adjusted_scale_and_shape(run: _Run) -
         factors.append(after.depth_scale / before.depth_scale)
         known = np.isfinite(step.refined.depth_mm)
         kept = reader.read(step.frame.index)
-        assert kept is not None
         scaled = factors[-1] * step.refined.depth_mm[known]
         before_all.append(_shape_error(scaled, step.raw_mm[known]))
         after_all.append(_shape_error(kept[known], step.raw_mm[known]))
@@ -103,7 +102,6 @@ def _shape_error(depth_mm: np.ndarray, bent_mm: np.ndarray) -> float:
 def test_the_mesh_agrees_with_adjusted_poses_and_depth(run: _Run) -> None:
     number = FRAMES - 1
     depth_mm = DepthReader(run.out).read(number)
-    assert depth_mm is not None
     camera, T = run.adjusted.camera, run.adjusted.trajectory.T_world_camera[number]
     points = (camera.rays * depth_mm[..., None])[20:-20:7, 20:-20:7].reshape(-1, 3)
     points = points[np.isfinite(points[:, 2])] @ T[:3, :3].T + T[:3, 3]

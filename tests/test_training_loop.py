@@ -127,7 +127,7 @@ def test_one_command_renders_trains_evaluates_and_exports(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root / "src")])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "3 of 3 scenes rendered" in done.stdout
+    assert "small scenes: 3 of 3 rendered" in done.stdout
     assert "calibrated on training scenes" in done.stdout
     made = {path.name for path in (tmp_path / "run").iterdir()}
     assert made >= {"recipe.toml", "log.csv", "curves.png", "checkpoint.pt", "held_out.json", "scopenet.onnx"}

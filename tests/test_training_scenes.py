@@ -11,7 +11,7 @@ from scipy.ndimage import minimum_filter
 from scopemap.errors import InputError
 from training.buffers import Buffers, camera_rays, create_store, decode, encode, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
-from training.render import render_buffers, render_store, unlit_share
+from training.render import render_buffers, render_store
 from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene
 from training.shapes import ELLIPSOID, shape_row
 
@@ -41,22 +41,6 @@ def test_distances_in_a_ball_agree_with_the_closed_form() -> None:
     np.testing.assert_allclose(found, -along + np.sqrt(along**2 - eye @ eye + 400.0), rtol=3e-4)
 
 
-def test_distances_to_a_plane_agree_with_the_closed_form() -> None:
-    base = np.zeros(24)
-    base[0], base[16], base[19], base[21], base[22], base[23] = 1.0, 1.0, 1.0, 1.0, 1e4, 1.0
-    rays = camera_rays(CAMERA) * [1.0, 1.0, -1.0]
-    found = march_rays(Scene(kind=LAPAROSCOPY, base=base, seed=1).arrays(), np.array([0, 0, 30.0]), rays, 0.9, 500.0)
-    np.testing.assert_allclose(found, -30.0 / rays[..., 2], rtol=3e-4)
-
-
-def test_normals_in_a_ball_point_to_its_middle() -> None:
-    eye, rays, arrays = np.array([3.0, -4.0, 5.0]), camera_rays(CAMERA), _ball(20.0).arrays()
-    found = march_rays(arrays, eye, rays, 0.9, 500.0)
-    normal, part = np.zeros_like(rays), np.zeros(SIZE, np.uint8)
-    surface(arrays, eye, rays, found, 1 / 200.0, normal, part)
-    np.testing.assert_allclose(normal, -(eye + found[..., None] * rays) / 20.0, atol=2e-3)
-
-
 def test_a_ball_hides_a_lamp_from_what_lies_behind_it() -> None:
     small = shape_row(ELLIPSOID, np.array([0, 0, 8.0]), np.eye(3), (2.0, 2.0, 2.0), blend=1e-3)
     arrays = Scene(kind=SINUS, base=np.array([2.0]), shapes=np.vstack([_ball(20.0).shapes, small]), seed=1).arrays()
@@ -73,13 +57,6 @@ def test_a_ball_hides_a_lamp_from_what_lies_behind_it() -> None:
     assert np.all(lit[wall & (miss < 1.9)] == 0.0)
     assert np.all(lit[wall & (miss > 2.6)] == 1.0)
     assert (wall & (miss < 1.9)).sum() > 20
-
-
-def test_a_view_whose_lamp_is_buried_in_tissue_is_drawn_anew() -> None:
-    # The first draws of this frame have a wall between the lens and its lamp: 80 % of the picture would be black.
-    buffers = render_buffers(1002, 24, 160, 128)
-    points_mm = np.exp(buffers.log_distance)[..., None] * buffers.rays
-    assert unlit_share(points_mm, buffers.normal, buffers.lit, buffers.lamps_mm.astype(float)) <= 0.2
 
 
 @pytest.mark.parametrize("kind", [COLON, LAPAROSCOPY])
@@ -107,13 +84,6 @@ def test_ranges_hold_for_every_kind(frames: list[Buffers]) -> None:
         assert np.linalg.norm(np.nan_to_num(frame.lamps_mm), axis=1).max() < 10.0
 
 
-def test_normals_are_unit_and_face_the_camera(frames: list[Buffers]) -> None:
-    for frame in frames:
-        known = np.isfinite(frame.log_distance)
-        np.testing.assert_allclose(np.linalg.norm(frame.normal[known], axis=-1), 1.0, atol=1e-5)
-        assert ((frame.normal * frame.rays).sum(-1)[known] < 0.0).all()
-
-
 def test_normals_agree_with_differences_of_the_distances(frames: list[Buffers]) -> None:
     errors = []
     for frame in frames:
@@ -123,6 +93,7 @@ def test_normals_agree_with_differences_of_the_distances(frames: list[Buffers]) 
         normal = -np.cross(across, down)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         given = frame.normal[1:-1, 1:-1]
+        assert ((frame.normal * frame.rays).sum(-1)[np.isfinite(frame.log_distance)] < 0.0).all()
         inner = (given * frame.normal[1:-1, 2:]).sum(-1), (given * frame.normal[2:, 1:-1]).sum(-1)
         smooth = minimum_filter(np.minimum(*inner), 3) > 0.995
         errors.append(np.rad2deg(np.arccos(np.clip((normal * given).sum(-1)[smooth], -1, 1))))

@@ -140,7 +140,7 @@ class TsdfVolume:
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
 
     def coarsen(self) -> None:
-        """Go on with voxels of twice the size, and twice the truncation."""
+        """Double the size of voxels, and the truncation."""
         self._blocks.halve()
         voxel_mm, truncation_mm = 2 * self.parameters.voxel_mm, 2 * self.parameters.truncation_mm
         self.parameters = self.parameters._replace(voxel_mm=voxel_mm, truncation_mm=truncation_mm)

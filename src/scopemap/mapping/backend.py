@@ -31,7 +31,8 @@ from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
-from scopemap.mapping.pose_interpolation import FrameCorrection, Refusal, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
 # Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
@@ -306,10 +307,10 @@ class Backend:
 
     def _judged(
         self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
-    ) -> tuple[Refusal | None, tuple[DepthCorrectionField, ...]]:
+    ) -> tuple[Notice | None, tuple[DepthCorrectionField, ...]]:
         """Return why a solution is refused, None where it is not, and its depth correction fields."""
         if reason := contradiction(problem.points, found, self.settings):
-            return Refusal("mapping-not-rigid", {"reason": reason}), ()
+            return Notice("mapping-not-rigid", {"reason": reason, "merged": ""}), ()
         fields: tuple[DepthCorrectionField, ...] = ()
         if (step_sigma := self.settings.depth_step_sigma) > 0:
             assert self._camera is not None
@@ -325,7 +326,7 @@ class Backend:
         found: BundleSolution,
         fields: tuple[DepthCorrectionField, ...],
         worlds: Mapping[int, Similarity],
-    ) -> Refusal | None:
+    ) -> Notice | None:
         """Return that the depths of keyframes agree less than as tracked, None where they agree."""
         assert self._camera is not None
         grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
@@ -340,7 +341,8 @@ class Backend:
         tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-                return Refusal("mapping-depth-disagrees", {"adjusted": float(now), "tracked": float(was)})
+                values = {"adjusted": float(now), "tracked": float(was), "merged": ""}
+                return Notice("mapping-depth-disagrees", values)
         return None
 
 

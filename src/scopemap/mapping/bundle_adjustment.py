@@ -88,7 +88,7 @@ def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end:
     """Return the solution with the keyframes from `first` to before `end` adjusted, those before `first` being so."""
     points, seen, state = problem.points, problem.observations, found.state
     moved = state.T_camera_world.copy()
-    if first:  # The window goes on from where the one before has ended.
+    if first:  # From where the window before has ended.
         at_start = problem.begin.T_camera_world
         moved[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ moved[first - 1]
     host, observer = points.host[seen.point], seen.keyframe
