@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose,
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
-from scopemap.io.opening import open_sequence
 from scopemap_bench.evaluation.consistency import (
     ConsistencyMeter,
     alignment_errors,
@@ -23,7 +21,7 @@ from scopemap_bench.evaluation.consistency import (
     mean_change,
     projected_depth,
 )
-from scopemap_bench.evaluation.correspondences import FrameCorrespondences, FrameMatcher, have_same_colour
+from scopemap_bench.evaluation.correspondences import FrameCorrespondences, FrameMatcher
 
 STILL = [pose()] * 4
 ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]
@@ -61,25 +59,6 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
 # ---- exact depth
 
 
-def test_identical_frames_differ_by_nothing() -> None:
-    report = measure(STILL)
-    for change in (report["same_pixel"], report["along_flow"], report["opw"], report["opw_reference"]):
-        assert (change["pairs"], change["mean_mm"], change["relative"], change["rtc"]) == (3, 0, 0, 1)
-    assert (report["tae_reference"]["pairs"], report["tae_reference"]["percent"]) == (3, pytest.approx(0, abs=1e-4))
-    assert (report["jitter"]["log_std"], report["jitter"]["log_step"]) == (0, 0)
-    assert report["orb_reference"]["pairs"] == 3
-    assert report["orb_reference"]["matches"] > 300
-    assert (report["orb_reference"]["mean_mm"], report["orb_camera"]["mean_mm"]) == (0, 0)
-
-
-def test_exact_depth_of_a_plane_passed_sideways_is_consistent() -> None:
-    report = measure(ASIDE)
-    assert report["tae_reference"]["percent"] < 1e-3
-    assert report["opw"]["mean_mm"] < 1e-4
-    assert report["orb_reference"]["median_mm"] < 1e-3
-    assert report["orb_camera"]["median_mm"] == pytest.approx(SIX_PIXELS_MM, rel=1e-3)
-
-
 def test_approach_is_change_of_depth_until_the_poses_explain_it() -> None:
     report = measure(FORWARD)
     for change in (report["same_pixel"], report["along_flow"], report["opw"]):
@@ -113,20 +92,6 @@ def test_transposed_poses_are_found_out() -> None:
         assert report["orb_reference"]["relative_median"] > 2e-2
 
 
-def test_flow_of_the_wrong_sign_is_found_out() -> None:
-    # Along its own x axis: no point changes its depth, and every pixel's depth changes.
-    turned = TILTED_ASIDE[0][:3, :3]
-    poses = [se3(turned, turned @ T[:3, 3]) for T in ASIDE]
-    right, wrong = measure(poses), measure(poses, flow_sign=-1.0)
-    assert right["along_flow"]["mean_mm"] < 1e-2
-    assert wrong["along_flow"]["mean_mm"] > 1
-    # OPW looks at the pictures too: hardly a pixel finds its colour at the wrong place.
-    views = [see(T) for T in poses]
-    shares = [np.mean(links(views, sign)[1].same_colour) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
-    assert shares[0] > 0.95
-    assert shares[1] < 0.3
-
-
 # ---- flicker
 
 
@@ -142,21 +107,6 @@ def test_flicker_of_a_still_camera_has_its_closed_forms(e: float) -> None:
         assert change["relative"] == pytest.approx((2 * 2 * e / (1 - e) + 2 * e / (1 + e)) / 3, rel=1e-3)
         assert change["rtc"] == (1 if e < 0.005 else 0)
     assert report["tae_reference"]["percent"] == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
-    matcher = FrameMatcher(CAMERA)
-    matcher.match(see(STILL[0]).rgb, EVERYWHERE)
-    link = matcher.match(see(STILL[0]).rgb, EVERYWHERE)
-    assert link is not None
-    from_camera = np.linalg.norm(CAMERA.unproject(link.matches.current_px), axis=1)
-    assert report["orb_reference"]["mean_mm"] == pytest.approx(2 * e * PLANE_MM * from_camera.mean(), rel=1e-3)
-    assert report["orb_camera"]["relative_median"] == pytest.approx(2 * e * np.median(from_camera), rel=1e-3)
-
-
-def test_flicker_raises_every_figure_of_a_moving_camera() -> None:
-    exact, flickering = measure(WANDERING), measure(WANDERING, [0.95, 1.05, 0.95])
-    assert flickering["tae_reference"]["percent"] > 8
-    assert flickering["opw_reference"]["mean_mm"] > exact["opw_reference"]["mean_mm"] + 4
-    assert flickering["orb_reference"]["median_mm"] > exact["orb_reference"]["median_mm"] + 4
-    assert flickering["opw_reference"]["rtc"] < 0.01
 
 
 # ---- scale, poses of the method's own
@@ -181,7 +131,6 @@ def test_scale_serves_depth_and_estimated_poses_and_leaves_relative_figures() ->
     # Its own poses agree with its own depth at any scale; the reference's poses do not.
     assert tiny["tae_estimated"]["percent"] == pytest.approx(exact["tae_estimated"]["percent"], abs=1e-3)
     assert tiny["tae_reference"]["percent"] > 5
-    assert restored["orb_estimated"]["median_mm"] == pytest.approx(exact["orb_reference"]["median_mm"], abs=1e-3)
 
 
 def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> None:
@@ -193,39 +142,10 @@ def test_reference_poses_win_where_there_are_any_and_lost_frames_have_none() -> 
     assert (report["frames"], report["pairs"]) == (4, 3)
     assert (report["tae_estimated"]["pairs"], report["tae_reference"]["pairs"]) == (1, 0)
     assert (report["orb_estimated"]["pairs"], report["orb_reference"]["pairs"]) == (1, 0)
-    assert report["orb_estimated"]["pair_matches"][:2] == (0, 0)
-    assert report["orb_estimated"]["pair_matches"][2] > 50
     assert report["orb_camera"]["pairs"] == 3
-    assert measure(ASIDE)["orb_reference"]["pairs"] == 2
     # Without flow nothing along it is measured; without truth there is no jitter.
     assert (report["opw"]["pairs"], report["along_flow"]["pairs"], report["same_pixel"]["pairs"]) == (0, 0, 3)
     assert np.isnan([report["opw"]["mean_mm"], report["jitter"]["log_std"], report["tae_reference"]["percent"]]).all()
-
-
-def test_without_links_flow_and_features_are_silent_and_the_rest_speaks() -> None:
-    meter = ConsistencyMeter(CAMERA)
-    for T in FORWARD:
-        meter.add(see(T).depth_mm, EVERYWHERE, T_reference_camera=T)
-    report = meter.report()
-    assert (report["orb_reference"]["matches"], report["opw"]["pairs"]) == (0, 0)
-    assert report["orb_reference"]["pair_matches"] == (0, 0)
-    assert report["same_pixel"]["mean_mm"] == pytest.approx(2)
-    assert report["tae_reference"]["percent"] < 1e-3
-
-
-@pytest.mark.parametrize("frames", [0, 1])
-def test_fewer_than_two_frames_give_no_figures(frames: int) -> None:
-    meter = ConsistencyMeter(CAMERA)
-    for T in STILL[:frames]:
-        meter.add(see(T).depth_mm, EVERYWHERE, T_world_camera=T, T_reference_camera=T)
-    report = meter.report()
-    assert (report["frames"], report["pairs"], report["same_pixel"]["pairs"], report["orb_camera"]["pairs"]) == (
-        frames,
-        0,
-        0,
-        0,
-    )
-    assert np.isnan(report["same_pixel"]["mean_mm"])
 
 
 # ---- masks and missing values
@@ -246,47 +166,6 @@ def test_what_is_masked_unknown_or_impossible_does_not_count() -> None:
     whole = measure(WANDERING)
     assert reports[0]["orb_reference"]["matches"] < whole["orb_reference"]["matches"]
     assert reports[0]["opw_reference"]["relative"] < 1e-3
-
-
-def test_flow_counts_only_where_it_is_trusted() -> None:
-    views = [see(T) for T in STILL[:2]]
-    nonsense = np.zeros((*EVERYWHERE.shape, 2), np.float32)
-    nonsense[:, 120:] = 40
-    depth_mm = np.tile(np.linspace(20, 60, CAMERA.width, dtype=np.float32), (CAMERA.height, 1))
-    changes = []
-    for trusted in (EVERYWHERE, np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)):
-        matcher, meter = FrameMatcher(CAMERA), ConsistencyMeter(CAMERA)
-        for view in views:
-            link = matcher.match(view.rgb, EVERYWHERE, nonsense, trusted)
-            meter.add(depth_mm, EVERYWHERE, link)
-        changes.append(meter.report()["along_flow"]["mean_mm"])
-    assert changes[0] > 1
-    assert changes[1] < 1e-5
-
-
-def test_images_must_have_the_same_colour_at_both_ends_of_the_flow() -> None:
-    grey = np.full((4, 5, 3), 100, np.uint8)
-    flow = np.zeros((4, 5, 2), np.float32)
-    # |difference| of k in three channels of 0..1 is sqrt(3) k / 255; exp(-50 x) > 0.01 up to k = 13.56.
-    assert have_same_colour(grey, grey + np.uint8(13), flow).all()
-    assert not have_same_colour(grey, grey + np.uint8(14), flow).any()
-    flow[0, 0] = (0, -251)
-    flow[1, 1] = (249, -249)
-    alike = have_same_colour(grey, grey, flow)
-    assert not alike[0, 0]
-    assert np.count_nonzero(alike) == 19
-
-
-def test_a_link_counts_neither_masked_features_nor_distrusted_flow() -> None:
-    view = see(pose())
-    left = np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 120)
-    matcher = FrameMatcher(CAMERA)
-    assert matcher.match(view.rgb, left) is None
-    link = matcher.match(view.rgb, left, np.zeros((*left.shape, 2), np.float32), left)
-    assert link is not None
-    assert len(link.matches.current_px) > 50
-    assert link.matches.current_px[:, 0].max() < 120
-    assert np.array_equal(link.same_colour, left)
 
 
 # ---- the measures of one pair
@@ -341,28 +220,3 @@ def test_unusable_arguments_are_refused() -> None:
 
 
 # ---- real truth
-
-
-@pytest.mark.real
-def test_true_depth_of_a_real_colon_is_consistent_and_flicker_shows(real_data: Path) -> None:
-    sequence = open_sequence(real_data / "endoscopy" / "c3vd" / "trans_t1_a")
-    matcher = FrameMatcher(sequence.camera)
-    meters = {flicker: ConsistencyMeter(sequence.camera) for flicker in (0.0, 0.02)}
-    for number, (frame, truth) in enumerate(sequence):
-        assert truth is not None
-        assert truth.depth_mm is not None
-        link = matcher.match(frame.rgb, frame.valid)
-        for flicker, meter in meters.items():
-            depth_mm = truth.depth_mm * np.float32(1 + flicker * (-1) ** number)
-            known = {"T_reference_camera": truth.T_world_camera, "true_depth_mm": truth.depth_mm}
-            meter.add(depth_mm, frame.valid, link, **known)
-    exact, flickering = (meter.report() for meter in meters.values())
-    assert (exact["pairs"], exact["orb_reference"]["pairs"]) == (9, 9)
-    # 0.29 % and 0.29 mm (a pixel is about that wide); the mean holds matches at the edges of folds.
-    assert exact["tae_reference"]["percent"] < 0.4
-    assert exact["orb_reference"]["median_mm"] < 0.4
-    assert exact["orb_reference"]["relative_median"] < 0.01
-    assert flickering["tae_reference"]["percent"] == pytest.approx(4.0, abs=0.3)
-    assert flickering["orb_reference"]["relative_median"] == pytest.approx(0.04, abs=0.01)
-    assert flickering["jitter"]["log_step"] == pytest.approx(np.log(1.02 / 0.98), rel=1e-3)
-    assert set(exact) == set(flickering)

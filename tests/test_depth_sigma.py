@@ -17,7 +17,7 @@ from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
 
 SHAPE = (48, 64)

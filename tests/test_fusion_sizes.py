@@ -17,7 +17,7 @@ from scopemap.config.mapping import FusionAdvanced
 from scopemap.errors import InputError
 from scopemap.frame import Frame, Rows
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.volume import SurfaceFusion, TsdfVolume, choose_parameters
+from scopemap.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters
 
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 
@@ -28,11 +28,9 @@ def wall(depth_mm: float, index: int = 0) -> Frame:
     return Frame(index, 0.0, rgb, VIEW, np.ones((120, 160), bool), depth, np.eye(4))
 
 
-def test_a_hand_s_breadth_has_the_voxels_of_endo_depth_and_motion() -> None:
-    assert choose_parameters(FusionSettings(), 60.0) == (1.0, 5.0, 200.0)
-
-
 def test_what_is_set_stays_and_the_rest_follows_it() -> None:
+    # Endo-Depth-and-Motion's, at a hand's breadth.
+    assert choose_parameters(FusionSettings(), 60.0) == (1.0, 5.0, 200.0)
     assert choose_parameters(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0)
     assert choose_parameters(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0)
     assert choose_parameters(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
@@ -61,8 +59,12 @@ def test_the_store_returns_what_it_was_given_in_order_and_by_number(tmp_path: Pa
     (lost,) = store.frames([1])
     assert lost.T_world_camera is None
     assert lost.depth_sigma_mm == pytest.approx(0.3, rel=2e-4)
-    store.put(wall(50.0, 3))
-    assert [frame.index for frame in store.frames()] == [0, 1, 2, 3]
+    assert store.median_depth_mm() == pytest.approx(40.0, rel=2e-4)
+    assert store.median_depth_mm({1}) == pytest.approx(30.0, rel=2e-4)
+    store.put(replace(wall(50_000.0, 3), valid=np.zeros((120, 160), bool)))
+    assert store.median_depth_mm({3}) is None
+    # Depth beyond the range is unknown.
+    assert np.isnan(store.frame(3).depth_mm).all()
 
 
 def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
@@ -110,25 +112,6 @@ def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
         (tmp_path / "stored" / file).write_bytes(whole)
 
 
-def test_depth_beyond_the_range_is_unknown() -> None:
-    store = FrameStore()
-    store.put(wall(50_000.0))
-    (far,) = store.frames()
-    assert far.depth_mm is not None
-    assert np.isnan(far.depth_mm).all()
-
-
-def test_the_median_depth_is_that_of_the_frames_medians_in_usable_pixels() -> None:
-    store = FrameStore()
-    assert store.median_depth_mm() is None
-    store.put(replace(wall(70.0, 9), valid=np.zeros((120, 160), bool)))
-    assert store.median_depth_mm() is None
-    for n, depth_mm in enumerate((10.0, 12.0, 90.0)):
-        store.put(wall(depth_mm, n))
-    assert store.median_depth_mm() == pytest.approx(12.0, rel=2e-4)
-    assert store.median_depth_mm({2}) == pytest.approx(90.0, rel=2e-4)
-
-
 @pytest.mark.parametrize(
     ("corrected", "voxel_mm", "at_end"), [(False, 1.0, False), (True, 1.0, True), (False, None, True)]
 )
@@ -152,17 +135,8 @@ def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     assert fusion.fuse([], ()).settings.voxel_mm in (voxel_mm, 1.0)
 
 
-def test_no_known_depth_gives_no_surface() -> None:
-    fusion = SurfaceFusion(FusionSettings(), FrameStore(), corrected=False)
-    nothing = replace(wall(60.0), depth_mm=np.full((120, 160), np.nan, np.float32))
-    fusion.put(nothing)
-    surface = fusion.fuse(fusion.store.frames(), {0})
-    assert (len(surface.mesh.vertices), surface.settings, surface.notices) == (0, FusionSettings(), [])
-
-
-@pytest.mark.parametrize("factor", [0.03, 30.0])
-def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: Path, factor: float) -> None:
-    phantom = write_tiny(tmp_path / "phantom", frames=6)
+def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: Path) -> None:
+    phantom, factor = write_tiny(tmp_path / "phantom", frames=6), 30.0
     quick = {"networks__flow": "dis", "networks__perceptual": "structure"}
     same, other = (
         reconstruct(
@@ -171,7 +145,6 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
         )
         for size in (1.0, factor)
     )
-    assert same.config.fusion.voxel_mm is not None
     assert other.config.fusion.voxel_mm == pytest.approx(factor * same.config.fusion.voxel_mm, rel=0.05)
     # What a result states is what makes it again.
     (tmp_path / "config.toml").write_text(other.config.toml(), encoding="utf-8")

@@ -6,28 +6,24 @@ import json
 import math
 import shutil
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 import trimesh
 from tiny_phantom import with_true_depth, write_tiny
-from torchvision.models import alexnet
 from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
-from scopemap.actions.against_video import RunFrames, held_out_agreement
+from scopemap.actions.against_video import RunFrames
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.app import app
 from scopemap.cli.run import summary_lines
 from scopemap.depth.perceptual import StructureDistance
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, compare_with_frame
 from scopemap.geometry.rendering import render_mesh
-from scopemap.io.weights import REGISTRY
 from scopemap_bench.evaluation.surface import distances_mm
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
@@ -94,15 +90,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_a_surface_fused_frame_by_frame_is_compared_with_some_of_its_frames(tmp_path: Path) -> None:
-    source = write_tiny(tmp_path / "phantom", frames=18)
-    at_once = with_true_depth(source, fusion__voxel_mm=1.0, mapping__method="none")
-    figures = reconstruct(open_sequence(source), at_once).provenance["surface"]
-    # At most 16 frames: every second one.
-    assert figures["frames"] == 9
-    assert figures["coverage_mean"] > 0.75
-
-
 def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,13 +105,9 @@ def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     # Neighbouring frames see the same: their coloured points look alike, and no surface adds to that.
     assert figures["nearest_frame"]["ssim"] > max(0.7, figures["held_out"]["ssim"])
     assert figures["nearest_frame"]["coverage_mean"] > 0.8
-    assert figures["worst_frames"] == "5"
-    assert "lpips" not in figures["held_out"]
     assert figures["lpips"] == f"left out: needs the weights alexnet or alexnet-features in {tmp_path}"
     rows = pd.read_csv(run_folder / "against_video" / "frames.csv")
-    assert rows["index"].tolist() == list(range(12))
     assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]
-    assert "lpips" not in rows
     assert cv2.imread(str(run_folder / "against_video" / "worst.png")) is not None
 
 
@@ -136,24 +119,6 @@ def test_the_frames_of_a_run_give_its_surface_again(run_folder: Path) -> None:
     assert len(again.faces) == pytest.approx(len(own.faces), rel=0.01)
     assert distances_mm(np.asarray(own.vertices), again).mean() < 0.02
     assert fewer.area < again.area
-
-
-def test_lpips_is_measured_where_its_weights_are(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    torch.manual_seed(3)
-    checkpoint = REGISTRY["alexnet"]
-    features = {name: tensor for name, tensor in alexnet().state_dict().items() if name.startswith("features.")}
-    torch.save(features, tmp_path / checkpoint.place)
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
-    monkeypatch.setitem(REGISTRY, "alexnet", replace(checkpoint, files={checkpoint.place: ""}))
-    agreement = held_out_agreement(run_folder)
-    agreement.save(tmp_path / "against_video")
-    figures = agreement.figures()
-    assert "lpips" not in figures
-    assert 0 < figures["nearest_frame"]["lpips"] < figures["held_out"]["lpips"]
-    rows = pd.read_csv(tmp_path / "against_video" / "frames.csv")
-    assert rows.loc[rows["fused"] == 1, "lpips"].mean() == pytest.approx(figures["fused"]["lpips"])
 
 
 def test_lpips_counts_pixels_with_known_depth_alone() -> None:

@@ -22,17 +22,15 @@ from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
+from scopemap.mapping.bundle_problem import BundleProblem
 from scopemap.mapping.map_merging import split_maps
-from scopemap.mapping.reprojection import BundleProblem
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.reconstruction import DepthReader
-from scopemap.report.kept_run import run_of
-from scopemap.report.submap_summaries import submaps_in_time
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -46,24 +44,27 @@ FIRST, SECOND, LOST_BEFORE_NEW = 10, 13, 2
 LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": LOST_BEFORE_NEW}
 
 
+def _spliced(target: Path, frames: list[tuple[Path, int]]) -> Path:
+    """A sequence of frames of phantoms, by their folders and numbers."""
+    target.mkdir()
+    poses = []
+    for number, (folder, index) in enumerate(frames):
+        for source in folder.glob(f"{index:04d}_*"):
+            shutil.copy(source, target / f"{number:04d}{source.name[4:]}")
+        poses.append((folder / "pose.txt").read_text().splitlines()[index])
+    shutil.copy(frames[0][0] / "camera.yaml", target)
+    (target / "pose.txt").write_text("\n".join(poses) + "\n")
+    return target
+
+
 @pytest.fixture(scope="module")
 def spliced(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten frames of one scene, then thirteen of another."""
-    folder = tmp_path_factory.mktemp("maps")
-    width, height = SIZE
-    parts = (PhantomSpec(frames=FIRST, seed=3), PhantomSpec(scene="laparoscopy", frames=SECOND, seed=5))
-    poses: list[str] = []
-    for number, spec in enumerate(parts):
-        write_phantom(spec.with_settings({"width": width, "height": height}), folder / str(number))
-        for source in sorted((folder / str(number)).glob("0*_*")):
-            index = int(source.name[:4]) + number * FIRST
-            target = folder / "both" / f"{index:04d}{source.name[4:]}"
-            target.parent.mkdir(exist_ok=True)
-            shutil.copy(source, target)
-        poses += (folder / str(number) / "pose.txt").read_text().splitlines()
-    shutil.copy(folder / "0" / "camera.yaml", folder / "both")
-    (folder / "both" / "pose.txt").write_text("\n".join(poses) + "\n")
-    return folder / "both"
+    folder, (width, height) = tmp_path_factory.mktemp("maps"), SIZE
+    write_phantom(PhantomSpec(frames=FIRST, seed=3, width=width, height=height), folder / "0")
+    write_phantom(PhantomSpec("laparoscopy", frames=SECOND, seed=5, width=width, height=height), folder / "1")
+    frames = [(folder / "0", n) for n in range(FIRST)] + [(folder / "1", n) for n in range(SECOND)]
+    return _spliced(folder / "both", frames)
 
 
 @pytest.fixture(scope="module")
@@ -87,9 +88,7 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_
     assert counts == expected
     assert result.records[0].track.reason == "tracked in maps/1"
     assert "keyframe" in result.records[FIRST].track.reason
-    note = next(text for text in warned(result.provenance) if "submaps" in text)
-    assert note.startswith("2 submaps")
-    assert f"{SECOND - LOST_BEFORE_NEW} of {FIRST + SECOND - LOST_BEFORE_NEW} tracked frames are in the result" in note
+    assert any(text.startswith("2 submaps") for text in warned(result.provenance))
 
 
 def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
@@ -102,13 +101,6 @@ def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstr
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.5
 
 
-def test_only_the_kept_map_is_fused(result: Reconstruction, spliced: Path) -> None:
-    scene = spliced.parent / "1"
-    alone = reconstruct(open_sequence(scene, frames=slice(LOST_BEFORE_NEW, None)), with_true_depth(scene, **LIGHT))
-    for one, other in zip(result.mesh.bounds, alone.mesh.bounds, strict=True):
-        np.testing.assert_allclose(one, other, atol=2.0)
-
-
 def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
     (other,) = result.others
     assert [record.index for record in other.records] == list(range(FIRST))
@@ -116,9 +108,10 @@ def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: 
     off = inverse(other.trajectory.T_world_camera) @ true_poses(spliced)[:FIRST]
     assert rotation_angle_rad(off[:, :3, :3]).max() < np.radians(0.5)
     assert other.provenance["tracked"] == FIRST
-    scene = spliced.parent / "0"
-    alone = reconstruct(open_sequence(scene), with_true_depth(scene, **LIGHT))
-    np.testing.assert_allclose(other.mesh.bounds, alone.mesh.bounds, atol=1e-3)
+    for part, scene, first in ((result, "1", LOST_BEFORE_NEW), (other, "0", 0)):
+        folder = spliced.parent / scene
+        alone = reconstruct(open_sequence(folder, frames=slice(first, None)), with_true_depth(folder, **LIGHT))
+        np.testing.assert_allclose(part.mesh.bounds, alone.mesh.bounds, atol=2.0 if first else 1e-3)
     written = read_trajectory(out / "maps" / "1")
     assert written.indices.tolist() == list(range(FIRST))
     assert written.tracked.all()
@@ -133,26 +126,19 @@ def test_the_summary_has_the_maps_in_order_of_time(result: Reconstruction) -> No
     line = next(line for line in summary_lines(result) if line.startswith("maps in order of time"))
     assert line.index("maps/1 with") < line.index("the result with")
     assert f"maps/1 with {FIRST} frames (0 to {FIRST - 1}, " in line
-    doubtful = next(line for line in summary_lines(result) if line.startswith("most doubtful map"))
-    submaps = {submap.name: submap.inlier_share for submap in submaps_in_time(run_of(result))}
-    assert doubtful.startswith(f"most doubtful map: {min(submaps, key=lambda name: submaps[name])}, frames ")
 
 
 def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: Path, tmp_path: Path) -> None:
     write_submission(out, tmp_path, "Seq_001_a")
     assert submission_problems(tmp_path) == []
     found = read_trajectory(tmp_path / "Seq_001_a" / "5")
-    assert len(found.others) == 1
-    for number, (submap, own) in enumerate(zip((found, *found.others), (result, *result.others), strict=True)):
-        known = own.trajectory.rows(own.trajectory.tracked)
+    for number, (submap, one) in enumerate(zip((found, *found.others), (result, *result.others), strict=True)):
+        known = one.trajectory.rows(one.trajectory.tracked)
         assert submap.indices.tolist() == known.indices.tolist()
         np.testing.assert_allclose(submap.T_world_camera, known.T_world_camera, atol=1e-6)
-        folder = tmp_path / "Seq_001_a" / "5"
-        points = np.loadtxt(folder / "3D_maps" / str(number) / "points3D.txt")[:, 1:4]
-        assert (points >= own.mesh.bounds[0] - 1e-3).all()
-        assert (points <= own.mesh.bounds[1] + 1e-3).all()
-        rows = (folder / "camera_trajectory" / f"cam_traj_map_{number:03d}.txt").read_text().splitlines()
-        assert rows[1].split(",")[1] == f"{known.indices[0] + 1:06d}.png"
+        points = np.loadtxt(tmp_path / "Seq_001_a" / "5" / "3D_maps" / str(number) / "points3D.txt")[:, 1:4]
+        assert (points >= one.mesh.bounds[0] - 1e-3).all()
+        assert (points <= one.mesh.bounds[1] + 1e-3).all()
 
 
 def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: Path) -> None:
@@ -161,15 +147,6 @@ def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: P
     again = reconstruct(open_sequence(spliced, frames=slice(0, 3)), short, out=tmp_path / "out", overwrite=True)
     assert again.others == []
     assert not (tmp_path / "out" / "maps").exists()
-
-
-def test_small_submaps_are_left_out(spliced: Path) -> None:
-    some = open_sequence(spliced, frames=slice(1, None))
-    result = reconstruct(some, with_true_depth(spliced, **LIGHT, fusion__enabled=False))
-    assert result.provenance["tracked"] == SECOND - LOST_BEFORE_NEW
-    assert result.provenance["in_other_maps"] == FIRST - 1
-    assert result.records[0].track.reason == "tracked in a submap too small to be saved"
-    assert result.others == []
 
 
 def test_frames_that_are_fused_as_they_come_are_fused_by_map(spliced: Path, result: Reconstruction) -> None:
@@ -204,28 +181,13 @@ def test_maps_of_the_same_place_are_merged() -> None:
         frame, tracked[10 * number] = _keyframe(number, at_mm, worlds[number % 2], worlds[number % 2].scale)
         backend.add(frame, tracked[10 * number])
         frames.append(frame)
-    assert [backend.keyframes(number) for number in range(3)] == [5, 5, 0]
     correction = backend.adjust(0, tracked)
     assert sorted(correction.S_common_map) == [0, 1]
     assert correction.notice.values["maps"] == 2
     for frame, at_mm in zip(frames, places, strict=True):
         moved = corrected_frame(frame, correction)
-        assert moved.T_world_camera is not None
-        assert moved.depth_mm is not None
         np.testing.assert_allclose(moved.T_world_camera, plane_scene.pose(at_mm=at_mm), atol=0.1)
         np.testing.assert_allclose(moved.depth_mm, plane_scene.see(plane_scene.pose(at_mm=at_mm)).depth_mm, rtol=0.05)
-
-
-def test_maps_of_different_places_are_not_merged() -> None:
-    backend = Backend(MappingSettings(), DisFlow())
-    with pytest.raises(ValueError, match="no keyframe"):
-        backend.adjust()
-    for number in range(6):
-        at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 3 else (50.0 + 2 * number, 0.0, 0.0)
-        backend.add(*_keyframe(number, at_mm, Similarity.identity(), 1.0 + 0.2 * (number >= 3)))
-    correction = backend.adjust(1)
-    np.testing.assert_array_equal(correction.index, [30, 40, 50])
-    assert list(correction.S_common_map) == [1]
 
 
 @pytest.mark.parametrize("swelling", [False, True])
@@ -287,7 +249,6 @@ def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(far: bo
     assert submaps[0].main == int(split)
     if split:
         correction = submaps[0].correction
-        assert correction is not None
         poses = np.stack([correction.pose(n, plane_scene.pose(at_mm=(40 + n / 5, 0, 0))) for n in (40, 60)])
         np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
         np.testing.assert_allclose(poses[1, :3, 3], [4, 0, 0], atol=0.1)
@@ -314,17 +275,16 @@ def test_parts_of_maps_stay_together_by_what_they_observe_in_common() -> None:
 
 
 def test_dirt_on_the_lens_merges_no_maps() -> None:
-    backend, dirt = (
-        Backend(MappingSettings(), DisFlow()),
-        np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32),
-    )
-    dirt = cv2.GaussianBlur(dirt, (0, 0), 1.5)
+    backend = Backend(MappingSettings(), DisFlow())
+    dirt = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32), (0, 0), 1.5)
     for number in range(10):
         at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 5 else (45.0 + 2 * number, 0.0, 0.0)
         frame, pose = _keyframe(number, at_mm, Similarity.identity(), 1.0)
         frame.rgb[60:130, 80:170] = np.clip(100 + 30 * dirt / dirt.std(), 0, 255).astype(np.uint8)
         backend.add(frame, pose._replace(map=int(number >= 5)))
     assert list(backend.adjust().S_common_map) == [0]
+    with pytest.raises(ValueError, match="no keyframe"):
+        backend.adjust(2)
 
 
 def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,7 +294,7 @@ def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.Mon
 
     def failing(problem: BundleProblem) -> BundleSolution:
         found = adjust(problem)
-        return replace(found, state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
+        return found._replace(state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
 
     monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
     correction = backend.adjust()
@@ -348,15 +308,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A camera that goes into a colon and comes out again, filmed with a break on the way in."""
     folder, (width, height) = tmp_path_factory.mktemp("cut"), SIZE
     write_phantom(PhantomSpec(frames=81, seed=3, loop=True, width=width, height=height), folder / "whole")
-    (folder / "cut").mkdir()
-    kept = [*range(10), *range(37, 81)]
-    for number, index in enumerate(kept):
-        for source in (folder / "whole").glob(f"{index:04d}_*"):
-            shutil.copy(source, folder / "cut" / f"{number:04d}{source.name[4:]}")
-    poses = (folder / "whole" / "pose.txt").read_text().splitlines()
-    (folder / "cut" / "pose.txt").write_text("\n".join(poses[index] for index in kept) + "\n")
-    shutil.copy(folder / "whole" / "camera.yaml", folder / "cut")
-    return folder / "cut"
+    return _spliced(folder / "cut", [(folder / "whole", n) for n in (*range(10), *range(37, 81))])
 
 
 def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
@@ -391,8 +343,5 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     ratios = []
     for index in (2, 8, 20, 30, 50):
         true, depth_mm = truth.truth(index), depth.read(index)
-        assert true is not None
-        assert true.depth_mm is not None
-        assert depth_mm is not None
         ratios.append(np.nanmedian(depth_mm / np.where(true.depth_mm > 0, true.depth_mm, np.nan)))
     np.testing.assert_allclose(np.log(ratios), np.log(np.median(ratios)), atol=0.1)

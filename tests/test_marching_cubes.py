@@ -32,15 +32,6 @@ def _distance(point: np.ndarray, others: np.ndarray) -> np.ndarray:
     return cKDTree(others).query(point)[0]
 
 
-def test_a_sphere_is_closed_and_faces_outwards() -> None:
-    place = np.stack(np.indices((SIDE,) * 3), -1) - 11.3
-    mesh = _mesh(np.linalg.norm(place, axis=-1) - 8.2)
-    assert mesh.is_watertight
-    assert mesh.euler_number == 2
-    assert mesh.volume == np.clip(mesh.volume, 0.98 * 4 / 3 * np.pi * 8.2**3, 4 / 3 * np.pi * 8.2**3)
-    assert np.abs(np.linalg.norm(mesh.vertices - 11.3, axis=1) - 8.2).max() < 0.05
-
-
 def test_smooth_fields_give_the_vertices_and_the_area_of_scikit_image() -> None:
     for seed in range(4):
         field = _smooth(seed)
@@ -64,11 +55,6 @@ def test_only_the_cells_that_are_asked_for_give_faces() -> None:
     theirs, their_faces, _, _ = reference(field, 0.0, mask=np.pad(cells, ((1, 0),) * 3))
     assert len(faces) == pytest.approx(len(their_faces), rel=2e-3)
     assert np.mean(_distance(theirs[np.unique(their_faces)], vertices) < 1e-4) > 0.998
-
-
-def test_a_field_of_one_sign_gives_nothing() -> None:
-    vertices, faces = marching_cubes(np.ones((4, 4, 4)), np.ones((3, 3, 3), bool))
-    assert vertices.shape == faces.shape == (0, 3)
 
 
 @settings(max_examples=40, deadline=None)

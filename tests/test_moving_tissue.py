@@ -18,18 +18,15 @@ from scopemap.config import FusionSettings
 from scopemap.flow.corners import Correspondences2D3D
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import REGIONS, Frame
-from scopemap.fusion.frame_surface import frame_surface
-from scopemap.fusion.moving import MovingTissue, block_edge_mm
-from scopemap.fusion.seen_at import SeenAt
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.depth_mesh import depth_mesh
+from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.se3 import se3_exp
 from scopemap.io.decoding import read_decoded
 from scopemap.odometry import Step
-from scopemap.runner.provenance import motion_notices
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.corner_pose import nonrigidity
-from scopemap.tracking.track import MOVING_SIGMAS, Track
-from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap.tracking.track import MOVING_SIGMAS
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
@@ -66,11 +63,6 @@ def test_the_region_that_moves_is_found_and_no_other() -> None:
     np.testing.assert_array_equal(moves, expected)
 
 
-def test_false_matches_scatter_and_do_not_count() -> None:
-    wrong = np.random.default_rng(2).uniform(-12, 12, (COUNT, 2))
-    assert not _moves(_correspondences(wrong)[0]).any()
-
-
 def test_regions_with_few_corners_are_unknown() -> None:
     all_of_them, seen = _correspondences(np.zeros((COUNT, 2)))
     kept = seen[:, 0] < 150
@@ -78,18 +70,6 @@ def test_regions_with_few_corners_are_unknown() -> None:
     found = nonrigidity(few, CAMERA, MOTION, 0.2)
     assert np.isfinite(found[:, :3]).all()
     assert np.isnan(found[:, 4:]).all()
-
-
-def test_a_track_tells_how_much_moves_and_where() -> None:
-    found = np.full(REGIONS, np.nan, np.float32)
-    found[:, :4] = 1.0
-    found[2, 0] = found[2, 1] = 9.0
-    track = Track(0, "ok", "", np.eye(4), 0, nonrigidity=found)
-    assert track.moving == pytest.approx((2 / 24, 1 / 8, 2.5 / 6))
-    assert np.isnan(replace(track, nonrigidity=None).moving).all()
-    still = replace(track, nonrigidity=np.zeros(REGIONS, np.float32)).moving
-    assert still[0] == 0.0
-    assert np.isnan(still[1:]).all()
 
 
 def test_shares_are_of_the_frames_that_see_a_place() -> None:
@@ -115,7 +95,7 @@ def test_a_frames_surface_has_its_usable_pixels_and_no_wall_between_depths() -> 
     depth_mm[:, 160:] = 80.0
     valid = np.ones((240, 320), bool)
     valid[100:140, 40:80] = False
-    mesh = frame_surface(_frame(depth_mm, valid), 2, 0.1)
+    mesh = depth_mesh(_frame(depth_mm, valid), 2, 0.1)
     assert sorted(set(np.round(mesh.vertices[:, 2]))) == [40, 80]
     assert len(set(np.ptp(np.round(mesh.triangles[:, :, 2]), axis=1))) == 1  # no face joins the two depths
     pixels = np.round(CAMERA.project(np.asarray(mesh.vertices))).astype(int)
@@ -123,11 +103,6 @@ def test_a_frames_surface_has_its_usable_pixels_and_no_wall_between_depths() -> 
     assert len(mesh.vertices) == 120 * 160 - 20 * 20
     assert (mesh.face_normals[:, 2] < 0).all()
     assert (mesh.visual.vertex_colors[:, :3] == [200, 90, 80]).all()
-
-
-def test_a_frame_without_usable_pixels_has_an_empty_surface() -> None:
-    mesh = frame_surface(_frame(np.full((240, 320), 40.0), np.zeros((240, 320), bool)), 2, 0.1)
-    assert len(mesh.vertices) == len(mesh.faces) == 0
 
 
 @pytest.fixture(scope="module")
@@ -143,29 +118,6 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "phantom"
 
 
-def test_the_phantom_moves_where_it_is_pushed_and_nowhere_else(pushed: Path) -> None:
-    first, before, after, last = (
-        np.asarray(trimesh.load(pushed / "mesh_truth" / f"{index:04d}.ply", process=False).vertices)
-        for index in (0, 4, 6, 9)
-    )
-    assert np.abs(before - first).max() < 1e-6
-    np.testing.assert_allclose(after, last, atol=1e-6)
-    moved_mm = np.linalg.norm(last - first, axis=1)
-    assert moved_mm.max() == pytest.approx(8.0, rel=0.1)
-    assert np.median(moved_mm) < 0.1 * moved_mm.max()
-
-
-def test_depth_of_pushed_tissue_lies_on_it() -> None:
-    phantom = prepare(PhantomSpec("laparoscopy", 10, 96, 80, seed=3, events=parse_events("poke:4-6")))
-    _, surface = render_frame(phantom, 9)
-    seen = np.isfinite(surface.depth_mm)
-    camera, T = phantom.spec.camera, phantom.poses[9]
-    points = (camera.rays[seen] * surface.depth_mm[seen, None]) @ T[:3, :3].T + T[:3, 3]
-    rest = points - phantom.motion.at(9).at(points)
-    np.testing.assert_allclose(rest, surface.rest_mm[seen], atol=1e-2)
-    assert np.abs(phantom.volume.values_at(rest)[0]).max() < 1e-2
-
-
 @pytest.fixture(scope="module")
 def run(pushed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("at_rest") / "run"
@@ -178,6 +130,11 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
     with (run / "frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["initial"] + ["ok"] * 9
+    share = np.array([float(row["moving_share"] or "nan") for row in rows])
+    assert np.nanmax(share[:5]) == 0.0
+    assert 0.02 < np.nanmax(share[5:8]) < 0.5
+    most = rows[int(np.nanargmax(share))]
+    assert (float(most["moving_x"]), float(most["moving_y"])) == pytest.approx((0.68, 0.5), abs=0.15)
     lines = [line for line in (run / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
     assert {line.split(" ", 1)[1] for line in lines} == {lines[0].split(" ", 1)[1]}
     assert sorted(file.name for file in (run / "surfaces").iterdir()) == [f"{index:06d}.ply" for index in range(10)]
@@ -185,7 +142,7 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
     for index in (0, 9):
         vertices = np.asarray(trimesh.load(run / "surfaces" / f"{index:06d}.ply", process=False).vertices)
         column, row = np.rint(camera.project(vertices)).astype(int).T
-        truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)  # type: ignore[index]
+        truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)
         assert len(vertices) > 5000
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
 
@@ -213,17 +170,6 @@ def test_a_killed_run_of_a_camera_at_rest_ends_in_the_same_bytes(
     assert any("as seen at second 0.3" in note for note in said(whole.provenance))
 
 
-def test_motion_is_told_where_and_when_it_is(run: Path) -> None:
-    with (run / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    share = np.array([float(row["moving_share"] or "nan") for row in rows])
-    assert np.nanmax(share[:5]) == 0.0
-    assert 0.02 < np.nanmax(share[5:8]) < 0.5
-    most = rows[int(np.nanargmax(share))]
-    assert float(most["moving_x"]) == pytest.approx(0.68, abs=0.15)
-    assert float(most["moving_y"]) == pytest.approx(0.5, abs=0.15)
-
-
 def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
     settings = Config().tracking
     tracker = CameraAtRest(settings, DisFlow())
@@ -238,12 +184,6 @@ def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
     unknown = CameraAtRest(settings, DisFlow())
     unknown.track(_frame(wall, everywhere))
     assert not unknown.insert_keyframe(_frame(np.full((240, 320), np.nan), everywhere), measured=False)
-
-
-def test_notes_say_that_the_camera_was_stated_to_be_at_rest() -> None:
-    assert motion_notices([], Config()) == []
-    (notice,) = motion_notices([], Config.load(settings={"tracking.camera_at_rest": True}))
-    assert notice.code == "camera-at-rest-stated"
 
 
 def _states() -> list[Frame]:

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
+from drawn_surfaces import LENIENT, plane_frame
 from plane_scene import CAMERA, EVERYWHERE
-from test_fusion import LENIENT, plane_frame
 
 from scopemap.config import MaskSettings, TrackingSettings
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.masking.masker import Masker
 from scopemap.tracking.sharpness import PictureQuality
 from scopemap.tracking.tracker import Tracker

@@ -23,7 +23,7 @@ from scopemap.depth.anchor import depth_downscale
 from scopemap.errors import InputError, SettingsError, WeightsError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.odometry import Step
 from scopemap.preprocessing import Estimators
 from scopemap.tracking.track import Track

@@ -35,12 +35,6 @@ def test_drift_is_removed_and_noise_of_the_network_is_not_followed(per_keyframe:
     np.testing.assert_array_equal(path.T_world_camera[:, :3, :3], [pose.T_world_camera[:3, :3] for pose in tracked])
 
 
-def test_a_few_keyframes_keep_the_chained_scale() -> None:
-    noise = np.array([0.0, 0.3, -0.2, 0.1])
-    for count in (1, 4):
-        assert np.abs(path_without_drift(_tracked(np.zeros(count)), noise[:count]).drift).max() < 0.03
-
-
 def test_each_map_keeps_its_first_keyframe_and_has_a_drift_of_its_own() -> None:
     drifting, steady = 0.02 * np.arange(60), np.full(60, 0.7)
     mixed = [pose for pair in zip(_tracked(drifting), _tracked(steady, 1), strict=True) for pose in pair]

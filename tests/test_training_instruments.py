@@ -12,7 +12,7 @@ from drawn_buffers import HEIGHT, WIDTH, sphere
 from onnx import numpy_helper
 
 from scopemap.depth.scopenet import estimator as module
-from training.instrument_layers import Layer, LayerStore, part_of, render_layer, render_layers
+from training.instrument_layers import Layer, LayerStore, render_layer, render_layers
 from training.instrument_samples import make_instrument_sample
 from training.instruments import main
 
@@ -37,23 +37,10 @@ def test_layers_are_the_same_whoever_renders_them_and_survive_the_file(layers: L
         assert kept.row.max() < len(kept.materials)
 
 
-def test_a_part_of_a_layer_is_where_it_was(layers: LayerStore) -> None:
-    layer = layers[1]
-    whole = _drawn(layer)
-    part = part_of(layer, 4, 6, (20, 24), 2)
-    np.testing.assert_array_equal(_drawn(part), whole[4:44:2, 6:54:2])
-
-
-def _drawn(layer: Layer) -> np.ndarray:
-    image = np.zeros(layer.size, bool)
-    image.ravel()[layer.pixel] = True
-    return image
-
-
 def test_a_picture_shows_the_layer_and_is_true_of_it(layers: LayerStore) -> None:
     """The label is where the picture differs from the one without the layer, but for its shadow and its blur."""
     buffers, near = sphere(), layers[0]
-    for seed in range(4):
+    for seed in range(2):
         sample = make_instrument_sample(buffers, near, np.random.default_rng(seed))
         twin = make_instrument_sample(buffers, near, np.random.default_rng(seed))
         np.testing.assert_array_equal(sample.rgb, twin.rgb)

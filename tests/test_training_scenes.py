@@ -11,11 +11,9 @@ from scipy.ndimage import minimum_filter
 from scopemap.errors import InputError
 from training.buffers import Buffers, camera_rays, create_store, decode, encode, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
-from training.random_scene import kind_of, random_scene
-from training.render import render_buffers, render_store, unlit_share
+from training.render import render_buffers, render_store
 from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene
-from training.scene_tubes import wall_point
-from training.shapes import ELLIPSOID, bend_back, bump, shape_row, tube
+from training.shapes import ELLIPSOID, shape_row
 
 SIZE = (32, 40)
 CAMERA = np.array([0, 24.0, 24.3, 19.0, 16.2, 40, 32], np.float32)
@@ -23,7 +21,7 @@ CAMERA = np.array([0, 24.0, 24.3, 19.0, 16.2, 40, 32], np.float32)
 
 @pytest.fixture(scope="module")
 def frames() -> list[Buffers]:
-    return [render_buffers(5, n, SIZE[1], SIZE[0], kind=kind) for kind in KINDS for n in range(12)]
+    return [render_buffers(5, n, SIZE[1], SIZE[0], kind=kind) for kind in KINDS for n in range(6)]
 
 
 def _ball(radius: float) -> Scene:
@@ -41,22 +39,6 @@ def test_distances_in_a_ball_agree_with_the_closed_form() -> None:
     found = march_rays(_ball(20.0).arrays(), eye, rays, 0.9, 500.0)
     along = rays @ eye
     np.testing.assert_allclose(found, -along + np.sqrt(along**2 - eye @ eye + 400.0), rtol=3e-4)
-
-
-def test_distances_to_a_plane_agree_with_the_closed_form() -> None:
-    base = np.zeros(24)
-    base[0], base[16], base[19], base[21], base[22], base[23] = 1.0, 1.0, 1.0, 1.0, 1e4, 1.0
-    rays = camera_rays(CAMERA) * [1.0, 1.0, -1.0]
-    found = march_rays(Scene(kind=LAPAROSCOPY, base=base, seed=1).arrays(), np.array([0, 0, 30.0]), rays, 0.9, 500.0)
-    np.testing.assert_allclose(found, -30.0 / rays[..., 2], rtol=3e-4)
-
-
-def test_normals_in_a_ball_point_to_its_middle() -> None:
-    eye, rays, arrays = np.array([3.0, -4.0, 5.0]), camera_rays(CAMERA), _ball(20.0).arrays()
-    found = march_rays(arrays, eye, rays, 0.9, 500.0)
-    normal, part = np.zeros_like(rays), np.zeros(SIZE, np.uint8)
-    surface(arrays, eye, rays, found, 1 / 200.0, normal, part)
-    np.testing.assert_allclose(normal, -(eye + found[..., None] * rays) / 20.0, atol=2e-3)
 
 
 def test_a_ball_hides_a_lamp_from_what_lies_behind_it() -> None:
@@ -77,66 +59,11 @@ def test_a_ball_hides_a_lamp_from_what_lies_behind_it() -> None:
     assert (wall & (miss < 1.9)).sum() > 20
 
 
-def test_the_unlit_share_of_a_ball_is_what_its_lamps_leave_dark() -> None:
-    rays = camera_rays(CAMERA)
-    lit = np.ones((*SIZE, 2))
-    beside, beyond, none = np.array([1.0, 0, 0]), np.array([0, 0, 50.0]), np.full(3, np.nan)
-    assert unlit_share(10.0 * rays, -rays, lit, np.array([beside, none])) == 0
-    assert unlit_share(10.0 * rays, -rays, 0 * lit, np.array([beside, none])) == 1
-    # A lamp outside the ball shines on the wall's back.
-    assert unlit_share(10.0 * rays, -rays, lit, np.array([beyond, none])) == 1
-    assert unlit_share(10.0 * rays, -rays, lit, np.array([beyond, beside])) == 0
-
-
-def test_a_view_whose_lamp_is_buried_in_tissue_is_drawn_anew() -> None:
-    # The first draws of this frame have a wall between the lens and its lamp: 80 % of the picture would be black.
-    buffers = render_buffers(1002, 24, 160, 128)
-    points_mm = np.exp(buffers.log_distance)[..., None] * buffers.rays
-    assert unlit_share(points_mm, buffers.normal, buffers.lit, buffers.lamps_mm.astype(float)) <= 0.2
-
-
-def test_fisheye_rays_make_angles_that_grow_evenly() -> None:
-    rays = camera_rays(np.array([1, 20.0, 20.0, 19.0, 16.0, 40, 32]))
-    angles = np.arccos(rays[16, 19:, 2])
-    np.testing.assert_allclose(angles, np.arange(21) / 20.0, atol=1e-7)
-
-
-def test_the_centre_line_of_a_bent_tube_is_inside_it_at_one_radius_from_the_wall() -> None:
-    scene = random_scene(COLON, np.random.default_rng(2))
-    base = scene.base.copy()
-    base[[2, 5, 8, 9, 12, 21]] = 0.0
-    folds = scene.folds * 0.0
-    for u in np.linspace(base[17] + 40, base[18] - 40, 9):
-        x, y, z = bend_back(scene.bends, u, 0.0, 0.0)
-        assert tube(base, scene.bends, folds, x, y, z) <= base[1] + 1e-6
-        edge = wall_point(base, scene.bends, (u, 1.0, 1.0))
-        assert tube(base, scene.bends, folds, *edge) == pytest.approx(0.0, abs=1e-6)
-        assert tube(base, scene.bends, folds, *(0.5 * (edge + np.array([x, y, z])))) > 0.0
-
-
-def test_the_noise_is_smooth_and_of_mean_zero() -> None:
-    points = np.random.default_rng(1).uniform(-40, 40, (20000, 3))
-    values = np.array([bump(*p, 3) for p in points])
-    moved = np.array([bump(p[0] + 1e-4, p[1], p[2], 3) for p in points])
-    assert abs(values.mean()) < 0.01
-    assert 0.24 < values.std() < 0.30
-    assert np.abs(values).max() < 1.3
-    assert np.abs(moved - values).max() < 1e-3
-
-
 @pytest.mark.parametrize("kind", [COLON, LAPAROSCOPY])
 def test_the_same_seed_and_index_give_the_same_bytes(kind: int) -> None:
     first, second = (render_buffers(3, 7, 40, 32, kind=kind) for _ in range(2))
     assert _same(first, second)
     assert not _same(first, render_buffers(3, 8, 40, 32, kind=kind))
-
-
-def test_kinds_have_fixed_shares() -> None:
-    kinds = [kind_of(n, 11) for n in range(200)]
-    assert {KINDS[k]: kinds.count(k) for k in KINDS} == {
-        **{"colon": 70, "bag": 20, "airway": 16, "sinus": 20},
-        **{"laparoscopy": 50, "wall": 24},
-    }
 
 
 def test_ranges_hold_for_every_kind(frames: list[Buffers]) -> None:
@@ -157,19 +84,6 @@ def test_ranges_hold_for_every_kind(frames: list[Buffers]) -> None:
         assert np.linalg.norm(np.nan_to_num(frame.lamps_mm), axis=1).max() < 10.0
 
 
-def test_no_two_scenes_are_alike(frames: list[Buffers]) -> None:
-    pictures = np.array([np.nan_to_num(f.log_distance - np.nanmedian(f.log_distance)).ravel() for f in frames])
-    gaps = np.abs(pictures[:, None] - pictures[None]).mean(-1) + np.eye(len(frames))
-    assert gaps.min() > 0.02
-
-
-def test_normals_are_unit_and_face_the_camera(frames: list[Buffers]) -> None:
-    for frame in frames:
-        known = np.isfinite(frame.log_distance)
-        np.testing.assert_allclose(np.linalg.norm(frame.normal[known], axis=-1), 1.0, atol=1e-5)
-        assert ((frame.normal * frame.rays).sum(-1)[known] < 0.0).all()
-
-
 def test_normals_agree_with_differences_of_the_distances(frames: list[Buffers]) -> None:
     errors = []
     for frame in frames:
@@ -179,11 +93,12 @@ def test_normals_agree_with_differences_of_the_distances(frames: list[Buffers]) 
         normal = -np.cross(across, down)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         given = frame.normal[1:-1, 1:-1]
+        assert ((frame.normal * frame.rays).sum(-1)[np.isfinite(frame.log_distance)] < 0.0).all()
         inner = (given * frame.normal[1:-1, 2:]).sum(-1), (given * frame.normal[2:, 1:-1]).sum(-1)
         smooth = minimum_filter(np.minimum(*inner), 3) > 0.995
         errors.append(np.rad2deg(np.arccos(np.clip((normal * given).sum(-1)[smooth], -1, 1))))
     every = np.concatenate(errors)
-    assert len(every) > 5000
+    assert len(every) > 2500
     assert np.median(every) < 1.5
     assert np.percentile(every, 95) < 8.0
 

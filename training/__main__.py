@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +29,7 @@ def main() -> int:
     from training.calibrate import calibrated, fit_calibration
     from training.export import export
     from training.recipe import Recipe
-    from training.render import render_store
+    from training.render import counted, render_store
     from training.report import write_report
     from training.train import Training
 
@@ -43,7 +42,8 @@ def main() -> int:
     (options.out / "recipe.toml").write_text(recipe.toml(), encoding="utf-8")
     for n, part in enumerate((*recipe.parts, recipe.held_out)):
         size, seed = (part.height, part.width), recipe.scene_seed * 1000 + n
-        render_store(scenes / part.name, part.count, size, seed, workers=options.threads, progress=_counted(part.name))
+        progress = counted(f"{part.name} scenes", 1000, _say)
+        render_store(scenes / part.name, part.count, size, seed, workers=options.threads, progress=progress)
     device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
     network = Training(recipe, scenes, options.out, device, _say, start=options.start).run(options.threads)
     calibration = fit_calibration(network, [open_store(scenes / part.name) for part in recipe.parts])
@@ -53,16 +53,6 @@ def main() -> int:
     export(network, options.out / "scopenet.onnx", facts)
     write_report(network, open_store(scenes / recipe.held_out.name), options.out, _say)
     return 0
-
-
-def _counted(name: str) -> Callable[[int, int], None]:
-    """Say every thousandth scene, and the last."""
-
-    def progress(done: int, count: int) -> None:
-        if done == count or done // 1000 != (done - 16) // 1000:
-            _say(f"{name}: {done} of {count} scenes rendered")
-
-    return progress
 
 
 def _say(text: str) -> None:

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional
 
-from training.export import IR_VERSION, OPSET, Graph
+from training.export import Graph, save_graph
 
 _WIDTHS = (8, 16, 32, 64)
 _SHARE = 16  # of the features of each scale: a quarter of the descriptor
@@ -98,12 +98,7 @@ def export_alike(network: Alike, file: Path) -> None:
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, sides[name]) for name in ("scores", "head", *_MAPS)],
         graph.tensors,
     )
-    model = helper.make_model(
-        made, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="scopemap"
-    )
-    helper.set_model_props(model, _FACTS)
-    onnx.checker.check_model(model, full_check=True)
-    onnx.save(model, file)
+    save_graph(made, file, _FACTS)
 
 
 def read_alike(file: Path) -> Alike:
@@ -124,9 +119,8 @@ class _AlikeGraph(Graph):
         """Add the whole network; its outputs have the names that `export_alike` gives."""
         x, scores = rgb, []
         head = self._weight(network.convhead2, "weight")
-        of_descriptor, of_score = (
-            self._sliced(head, 0, part) for part in ((0, 4 * _SHARE), (4 * _SHARE, 4 * _SHARE + 1))
-        )
+        of_descriptor = self._sliced(head, 0, (0, 4 * _SHARE))
+        of_score = self._sliced(head, 0, (4 * _SHARE, 4 * _SHARE + 1))
         for n, (pool, block, aggregate) in enumerate(network.scales()):
             if pool > 1:
                 x = self._add("MaxPool", x, kernel_shape=(pool, pool), strides=(pool, pool))
@@ -139,9 +133,9 @@ class _AlikeGraph(Graph):
     def _block(self, part: Plain, x: str) -> str:
         inner = self._add("Relu", self._part(part.bn1, self._convolution(part.conv1, x)))
         inner = self._part(part.bn2, self._convolution(part.conv2, inner))
-        return self._relu(
-            self._add("Add", inner, self._convolution(part.downsample, x)) if isinstance(part, Residual) else inner
-        )
+        if isinstance(part, Residual):
+            inner = self._add("Add", inner, self._convolution(part.downsample, x))
+        return self._relu(inner)
 
     def _score(self, head: str, scale: int, own: str, rgb: str) -> str:
         """Add what a scale contributes to the scores, before the sigmoid, at the full size."""

@@ -1,7 +1,6 @@
 """What a camera sees of a scene before any light, and how many such frames are kept on disk.
 
-A store is a folder of memory-mapped arrays, one row a frame, so that a trainer reads any frame at once and re-shades
-it anew at every use.
+A store is a folder of memory-mapped arrays, one row a frame.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ _ARRAYS = {
 class Buffers:
     """One frame before any light: geometry, noise to paint with, and what of each lamp's light arrives.
 
-    Attributes
-    ----------
     log_distance : (H, W) float32, ln of the distance along the ray in mm, about 2..400 mm; NaN where nothing was hit.
     normal : (H, W, 3) float32 unit vectors, camera axes (x right, y down, z ahead), towards the camera; else 0.
     noise : (H, W, 8) float32, -1..1, standard deviation 0.27: smooth noise in space at the hits, of the periods
@@ -142,8 +139,6 @@ def decode(row: dict[str, np.ndarray]) -> Buffers:
 class Store:
     """Frames on disk, opened as memory maps: `len(store)`, `store[i]`. Rows that are not yet rendered raise.
 
-    Attributes
-    ----------
     arrays : by name, each with a row a frame.
     done : (N,) bool, which rows are rendered.
     """
@@ -175,9 +170,7 @@ def create_store(folder: Path, count: int, size: tuple[int, int]) -> Store:
         store = open_store(folder, mode="r+")
         have = (len(store), *store.arrays["part"].shape[1:])
         if have != (count, *size):
-            raise InputError(
-                f"opening the store {folder}: it holds {have}, wanted {(count, *size)}; use another folder."
-            )
+            raise InputError(f"opening the store {folder}: it holds {have}, not {(count, *size)}; use another folder")
         return store
     folder.mkdir(parents=True, exist_ok=True)
     shapes = {name: (count, *size, *rest) for name, (_, rest) in _ARRAYS.items()} | {"meta": (count, _META)}

@@ -7,7 +7,7 @@ numbers, fitted here and folded into the last convolution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,12 +23,9 @@ _PIXELS = 400
 _RANGE = (0.5, 2.5)
 
 
-@dataclass(frozen=True)
-class Calibration:
+class Calibration(NamedTuple):
     """How a network's answers are changed.
 
-    Attributes
-    ----------
     exponent : factor of ln distance about `pivot`. pivot : ln of mm, the mean over the pictures. spread : factor of the
     Laplace scale.
     """

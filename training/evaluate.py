@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +18,9 @@ _LEAST_PIXELS = 100
 _POOLED_PIXELS = 500
 
 
-@dataclass(frozen=True)
-class PictureScore:
+class PictureScore(NamedTuple):
     """Figures of one picture.
 
-    Attributes
-    ----------
     kind : of its scene. abs_rel, delta : after median scaling. tissue : abs_rel where no instrument is seen. unscaled :
     abs_rel of the millimetres as given. rank : Spearman's correlation of error and spread. errors, spreads : (n,), of
     pixels drawn at random.
@@ -59,8 +57,7 @@ class Summary:
         return cls(**means, pooled_rank=_rank(errors, spreads), pictures=len(scores))
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """How held-out scenes are looked at: every `stride`-th pixel, and with what nothing explains or without it."""
 
     stride: int = 1

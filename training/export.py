@@ -23,7 +23,7 @@ from training.network import (
     ScopeNet,
 )
 
-OPSET, IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
+_OPSET, _IR_VERSION = 17, 8  # of 2022: every runtime in use reads these
 
 
 def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
@@ -39,18 +39,14 @@ def export(network: ScopeNet, file: Path, facts: dict[str, str]) -> None:
     if network.instruments is not None:
         half = (1, 1, "half height", "half width")
         outputs.append(helper.make_tensor_value_info(INSTRUMENTS, TensorProto.FLOAT, half))
-    model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "scopenet",
-            [helper.make_tensor_value_info("planes", TensorProto.FLOAT, (1, PLANES, "height", "width"))],
-            outputs,
-            graph.tensors,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="scopemap",
-    )
+    planes = helper.make_tensor_value_info("planes", TensorProto.FLOAT, (1, PLANES, "height", "width"))
+    save_graph(helper.make_graph(graph.nodes, "scopenet", [planes], outputs, graph.tensors), file, facts)
+
+
+def save_graph(graph: onnx.GraphProto, file: Path, facts: dict[str, str]) -> None:
+    """Check a graph and write it as a model with these facts as metadata."""
+    versions = {"opset_imports": [helper.make_opsetid("", _OPSET)], "ir_version": _IR_VERSION}
+    model = helper.make_model(graph, producer_name="scopemap", **versions)
     helper.set_model_props(model, facts)
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, file)
@@ -92,14 +88,10 @@ class Graph:
         x = self._enlarged(self._convolution(net.from_coarse, x))
         x = self._relu(self._add("Add", x, self._sequence(net.from_planes, planes)))
         x = self._convolution(net.head, self._relu(self._sequence(net.detail, x)))
-        x = self._add(
-            "Add", x, self._constant("typical", np.float32([TYPICAL_LOG_MM, TYPICAL_LOG_SPREAD])[:, None, None])
-        )
+        typical = np.float32([TYPICAL_LOG_MM, TYPICAL_LOG_SPREAD])[:, None, None]
+        x = self._add("Add", x, self._constant("typical", typical))
         # The distance has no bounds.
-        low, high = (
-            np.float32([free, bound])[:, None, None]
-            for free, bound in zip((-np.inf, np.inf), SPREAD_RANGE, strict=True)
-        )
+        low, high = np.float32([[-np.inf, np.inf], SPREAD_RANGE]).T[..., None, None]
         return self._add("Min", self._add("Max", x, self._constant("low", low)), self._constant("high", high))
 
     def _instruments(self, head: InstrumentHead, planes: str, scales: list[str]) -> None:

@@ -25,8 +25,6 @@ _ARRAYS = ("pixel", "distance", "normal", "row", "along", "around")
 class Layer:
     """The instruments of one picture of H x W pixels, n of which show them; 1 = the tissue's median distance.
 
-    Attributes
-    ----------
     pixel : (n,) int32, flat. distance : (n,) float32 along the ray. normal : (n, 3) float32, camera axes.
     row : (n,) uint8, from 1, which shape is seen there. along, around : (n,) float32, place on the shape: along its
         axis in its own radii, and around it in turns, -0.5..0.5.

@@ -11,18 +11,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import MaskSettings
 from scopemap.depth.scopenet.planes import input_planes
-from scopemap.frame import Frame
-from scopemap.masking.masker import Masker
 from training.buffers import Buffers
 from training.instrument_layers import Layer
 from training.instrument_looks import light_of_instruments
 from training.light import INSTRUMENT, Light, brightest, draw_light, shade
-from training.samples import bounce_share, told_rays
+from training.samples import bounce_share, masked, told_rays
 from training.scene import log_uniform
-from training.sensor import take_picture
+from training.sensor import motion_kernel, take_picture
 
 _MASKED_SHARE, _ALWAYS_IN_FRONT, _MOVING = 0.8, 0.35, 0.25
 
@@ -31,8 +27,6 @@ _MASKED_SHARE, _ALWAYS_IN_FRONT, _MOVING = 0.8, 0.35, 0.25
 class InstrumentSample:
     """One picture with its truth.
 
-    Attributes
-    ----------
     rgb : (H, W, 3) uint8. planes : (8, H, W) float32, the network's input.
     instruments : (H, W) float32, 0..1, how much of the pixel shows one. field : (H, W) bool, field of view.
     """
@@ -60,9 +54,7 @@ def make_instrument_sample(
     rgb, field = take_picture(linear, rng, strange=hard)
     valid = field & np.isfinite(buffers.log_distance)
     if rng.random() < _MASKED_SHARE:
-        height, width = field.shape
-        camera = PinholeCamera(width, width, width / 2, height / 2, width, height)
-        valid = Masker(MaskSettings())(Frame(0, 0.0, rgb, camera, np.ones_like(field))).valid
+        valid = masked(rgb)
     rays = buffers.rays
     for axis in (0, 1):
         if rng.random() < 0.5:
@@ -121,12 +113,8 @@ def _blurred(image: np.ndarray, over: np.ndarray, rng: np.random.Generator) -> t
     sigma = rng.uniform(0.35, 0.7) if rng.random() < 0.8 else rng.uniform(0.7, 2.5) * over.shape[1] / 320
     both = cv2.GaussianBlur(both, (0, 0), sigma)
     if rng.random() < _MOVING:
-        reach = max(int(rng.uniform(1, 14) * over.shape[1] / 320), 1)
-        angle = rng.uniform(0, np.pi)
-        kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
-        dx, dy = reach * np.cos(angle), reach * np.sin(angle)
-        cv2.line(kernel, (round(reach - dx), round(reach - dy)), (round(reach + dx), round(reach + dy)), 1.0)
-        both = cv2.filter2D(both, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+        kernel = motion_kernel(max(int(rng.uniform(1, 14) * over.shape[1] / 320), 1), rng)
+        both = cv2.filter2D(both, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     return both[..., :3], np.clip(both[..., 3], 0, 1)
 
 

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from training.buffers import Store, cropped, open_store, thinned
 from training.instrument_layers import LayerStore, part_of, render_layers
 from training.instrument_samples import InstrumentSample, make_instrument_sample
 from training.network import InstrumentHead, ScopeNet
-from training.render import render_store
+from training.render import counted, render_store
 
 Say = Callable[[str], None]
 
@@ -32,13 +33,11 @@ Say = Callable[[str], None]
 class Recipe:
     """Settings: sets of scenes and layers (320x256 px), and the training; each may be changed by a TOML file.
 
-    Attributes
-    ----------
     scenes, layers : rendered to train on. held_out : of both, with other seeds. steps : batches that are drawn. again :
     updates on older batches after each of them, of which `kept` are. rate, warm_up, decay, ema : of AdamW with a cosine
-    and averaged weights. tissue_alone : share of the pictures without a layer. hard : of
-    those that `make_instrument_sample` calls so. false_share : of
-    the tissue's pixels that may lie above the threshold. pictures : that it and the figures are of.
+    and averaged weights. tissue_alone : share of the pictures without a layer. hard : of those that
+    `make_instrument_sample` calls so. false_share : of the tissue's pixels that may lie above the threshold. pictures :
+    that it and the figures are of.
     """
 
     seed: int = 0
@@ -98,8 +97,9 @@ def rendered(recipe: Recipe, folder: Path, workers: int, say: Say, name: str) ->
     """Return the scenes and layers "train" or "held-out", rendered where the folder does not hold them."""
     n = ("train", "held-out").index(name)
     scenes, layers = (recipe.held_out, recipe.held_out) if n else (recipe.scenes, recipe.layers)
-    shown = render_layers(folder / f"{name}-layers.npz", layers, SIZE, recipe.layer_seed + n, _counted("layers", say))
-    progress = _counted("scenes", say)
+    progress = counted("layers", 200, say)
+    shown = render_layers(folder / f"{name}-layers.npz", layers, SIZE, recipe.layer_seed + n, progress)
+    progress = counted("scenes", 200, say)
     render_store(folder / name, scenes, SIZE, recipe.scene_seed + n, workers=workers, progress=progress)
     return open_store(folder / name), shown
 
@@ -150,8 +150,7 @@ def _share_of_rate(step: int, recipe: Recipe) -> float:
     return min((step + 1) / recipe.warm_up, 0.005 + 0.995 * 0.5 * (1 + math.cos(math.pi * way)))
 
 
-@dataclass(frozen=True)
-class _Batch:
+class _Batch(NamedTuple):
     """Planes, features of the trunk, truth (N, 1, H/2, W/2) and its weight."""
 
     planes: Tensor
@@ -218,10 +217,8 @@ def figures(network: ScopeNet, scenes: Store, layers: LayerStore, recipe: Recipe
             for n in range(recipe.pictures):
                 sample = pictures.draw((seed, n), size, stride)
                 probability = 1 / (1 + np.exp(-cv2.resize(_logits(network, sample), size[::-1])))
-                mask, truth = (
-                    Masker(MaskSettings(instruments="auto")).instruments(probability),
-                    sample.instruments > 0.5,
-                )
+                mask = Masker(MaskSettings(instruments="auto")).instruments(probability)
+                truth = sample.instruments > 0.5
                 assert mask is not None
                 if truth.any():
                     shared, whole = np.count_nonzero(mask & truth), np.count_nonzero(mask | truth)
@@ -235,13 +232,3 @@ def figures(network: ScopeNet, scenes: Store, layers: LayerStore, recipe: Recipe
             f"false {name}": float(np.mean(wrong)) if wrong else np.nan,
         }
     return found
-
-
-def _counted(what: str, say: Say) -> Callable[[int, int], None]:
-    """Say every two-hundredth, and the last."""
-
-    def progress(done: int, count: int) -> None:
-        if done == count or done // 200 != (done - 16) // 200:
-            say(f"{what}: {done} of {count} rendered")
-
-    return progress

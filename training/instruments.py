@@ -28,9 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Render what is missing, train, fit the threshold, tell figures, export."""
     parser = argparse.ArgumentParser(prog="training.instruments", description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the log, figures and the network")
-    parser.add_argument(
-        "--start", type=Path, required=True, help="a scopenet.onnx, whose depth stays as it is; its head is trained on"
-    )
+    parser.add_argument("--start", type=Path, required=True, help="a scopenet.onnx, whose depth stays; its head learns")
     parser.add_argument("--scenes", type=Path, help="folder of the rendered scenes and layers (OUT/scenes)")
     parser.add_argument("--recipe", type=Path, help="TOML with settings of training/instrument_training.py")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="processor threads to use")

@@ -34,8 +34,6 @@ _TISSUES = np.array(
 class Light(NamedTuple):
     """How a scene is lit and painted; drawn by `draw_light`.
 
-    Attributes
-    ----------
     tints : (8, 3) linear RGB of each part. gloss : (8,) strength of mirroring of each part.
     mottling : (5,) strength of each period of noise. tone : (3,) how mottling colours.
     vessels : (2, 2) width (in units of the noise) and depth of colour. vessel_rgb : (3,).

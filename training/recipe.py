@@ -37,8 +37,6 @@ class Use:
 class Recipe:
     """Settings of one training.
 
-    Attributes
-    ----------
     seed : of the network's start and of every draw while training. scene_seed : of the scenes.
     steps : updates. rate, rate_end : learning rate after the warm-up and at the end (cosine). warm_up : steps.
     decay : weight decay. ema : decay of the averaged weights. clip : largest norm of the gradient.

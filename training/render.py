@@ -20,14 +20,19 @@ import numpy as np
 from scopemap.errors import InputError
 from training.buffers import NOISE_PERIODS, Buffers, camera_rays, create_store, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
-from training.random_scene import kind_of, random_scene
 from training.scene import AIRWAY, BAG, COLON, LAPAROSCOPY, SINUS, WALL, Scene, log_uniform
+from training.scene_abdomen import laparoscopy, wall
+from training.scene_cavities import bag, sinus
+from training.scene_tubes import airway, colon
 from training.shapes import noise_channels
 from training.viewpoint import FAR, SceneView, found_well, random_tools, random_view, rotated
 
 _NEAREST_MM, _FARTHEST_MM = 2.0, 400.0
 # Median distances in mm that a kind of scene is scaled to.
 _MEDIANS_MM = {COLON: (6, 90), BAG: (8, 130), AIRWAY: (6, 60), SINUS: (6, 100), LAPAROSCOPY: (16, 150), WALL: (6, 120)}
+_SHARES = ((COLON, 0.35), (LAPAROSCOPY, 0.25), (WALL, 0.12), (BAG, 0.10), (AIRWAY, 0.08), (SINUS, 0.10))
+MAKERS = {COLON: colon, AIRWAY: airway, BAG: bag, SINUS: sinus, LAPAROSCOPY: laparoscopy, WALL: wall}
+"""Of random scenes, by kind."""
 _SCENES, _VIEWS = 200, 6
 _CHUNK = 16
 _MOST_MISSED, _MOST_TOOL, _MOST_UNLIT = 0.02, 0.6, 0.2
@@ -39,15 +44,31 @@ def render_buffers(seed: int, index: int, width: int, height: int, *, kind: int 
     `kind` overrides the kind of scene that the set's fixed shares give to this index.
     """
     rng = np.random.default_rng((seed, index))
-    wanted = kind_of(index, seed) if kind is None else kind
+    wanted = _kind_of(index, seed) if kind is None else kind
     for _ in range(_SCENES):
-        scene = random_scene(wanted, rng)
+        scene = MAKERS[wanted](rng)
         for _ in range(_VIEWS):
             view = random_view(scene, rng, width, height)
             buffers = None if view is None else _rendered(scene, view, rng)
             if buffers is not None:
                 return buffers
     raise InputError(f"rendering frame {index} of set {seed}: no scene of kind {wanted} gave a view; widen the scenes.")
+
+
+def counted(what: str, every: int, say: Callable[[str], None]) -> Callable[[int, int], None]:
+    """Return a progress that says every so manieth scene, and the last."""
+
+    def progress(done: int, count: int) -> None:
+        if done == count or done // every != (done - _CHUNK) // every:
+            say(f"{what}: {done} of {count} rendered")
+
+    return progress
+
+
+def _kind_of(index: int, seed: int) -> int:
+    """Return the kind of scene `index` of a set: the shares are fixed, the order is shuffled in blocks of 100."""
+    deck = np.repeat([kind for kind, _ in _SHARES], [round(100 * share) for _, share in _SHARES])
+    return int(np.random.default_rng((seed, index // 100, 77)).permutation(deck)[index % 100])
 
 
 def _rendered(scene: Scene, view: SceneView, rng: np.random.Generator) -> Buffers | None:

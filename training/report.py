@@ -31,11 +31,9 @@ def write_report(network: ScopeNet, store: Store, folder: Path, say: Callable[[s
     for words, table in tables.items():
         say(f"held-out scenes, {words}:")
         for kind, row in table.items():
-            say(
-                f"{kind:12s} {row.pictures:4d} pictures: AbsRel {row.abs_rel:.3f} (tissue {row.tissue:.3f}), "
-                f"delta<1.25 {row.delta:.3f}, unscaled AbsRel {row.unscaled:.3f}, rank {row.rank:.2f} "
-                f"(pooled {row.pooled_rank:.2f})"
-            )
+            errors = f"AbsRel {row.abs_rel:.3f} (tissue {row.tissue:.3f}), unscaled {row.unscaled:.3f}"
+            others = f"delta<1.25 {row.delta:.3f}, rank {row.rank:.2f} (pooled {row.pooled_rank:.2f})"
+            say(f"{kind:12s} {row.pictures:4d} pictures: {errors}, {others}")
     if (folder / "log.csv").is_file():
         _draw_curves(folder)
 

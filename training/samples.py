@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,6 @@ _FIELD_OF_VIEW_ERROR = 0.02
 class Sample:
     """One picture with its truth.
 
-    Attributes
-    ----------
     rgb : (H, W, 3) uint8. valid : (H, W) bool, as the masker or the field of view says.
     rays : (H, W, 3) float32 true unit rays. given_rays : what the network is given of them, None = nothing.
     log_distance : (H, W) float32, ln of mm along the ray, NaN = unknown or outside the field of view.
@@ -46,8 +45,7 @@ class Sample:
         return input_planes(self.rgb, self.given_rays, self.valid)
 
 
-@dataclass(frozen=True)
-class Batch:
+class Batch(NamedTuple):
     """N samples of one size: planes (N, 8, H, W), log_distance (N, H, W), rays (N, 3, H, W), all float32."""
 
     planes: np.ndarray
@@ -60,9 +58,7 @@ def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = T
     rgb, field = take_picture(shade(buffers, draw_light(rng), bounce_share(rng)), rng, strange=strange)
     valid = field & np.isfinite(buffers.log_distance)
     if rng.random() < _MASKED_SHARE:
-        height, width = field.shape
-        camera = PinholeCamera(width, width, width / 2, height / 2, width, height)
-        valid = Masker(MaskSettings())(Frame(0, 0.0, rgb, camera, np.ones_like(field))).valid
+        valid = masked(rgb)
     rays, log_distance = buffers.rays, np.where(field, buffers.log_distance, np.float32(np.nan))
     tissue = buffers.part != INSTRUMENT
     for axis in (0, 1):
@@ -71,6 +67,13 @@ def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = T
             rgb, valid, rays, log_distance, tissue = (np.flip(image, axis) for image in images)
             rays = rays * np.where(np.arange(3) == 1 - axis, np.float32(-1), np.float32(1))
     return Sample(np.ascontiguousarray(rgb), valid, rays, told_rays(rays, rng), log_distance, tissue)
+
+
+def masked(rgb: np.ndarray) -> np.ndarray:
+    """Return the valid pixels (H, W) bool of a picture (H, W, 3) as a run finds them."""
+    height, width, _ = rgb.shape
+    camera = PinholeCamera(width, width, width / 2, height / 2, width, height)
+    return Masker(MaskSettings())(Frame(0, 0.0, rgb, camera, np.ones((height, width), bool))).valid
 
 
 def bounce_share(rng: np.random.Generator) -> float:
@@ -94,9 +97,5 @@ def make_batch(
     def sample(n: int) -> Sample:
         return make_sample(thinned(store[int(indices[n])], stride), np.random.default_rng((*seed, n)))
 
-    samples = list(pool.map(sample, range(len(indices))))
-    return Batch(
-        np.stack([s.planes for s in samples]),
-        np.stack([s.log_distance for s in samples]),
-        np.stack([s.rays.transpose(2, 0, 1) for s in samples]),
-    )
+    rows = [(s.planes, s.log_distance, s.rays.transpose(2, 0, 1)) for s in pool.map(sample, range(len(indices)))]
+    return Batch(*(np.stack(column) for column in zip(*rows, strict=True)))

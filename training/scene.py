@@ -27,8 +27,6 @@ def _rows(columns: int) -> Callable[[], np.ndarray]:
 class Scene:
     """One scene, before any camera. All lengths in scene units.
 
-    Attributes
-    ----------
     kind : one of `KINDS`.
     base : (31,) numbers of the tube or floor; base[0] says which (0 tube, 1 floor, 2 neither).
     bends, folds : (n, 9), (n, 9), of the tube; see `scene_tubes`.

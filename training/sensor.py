@@ -132,16 +132,20 @@ def _blurred(light: np.ndarray, scale: float, rng: np.random.Generator) -> np.nd
     sigma = rng.choice([rng.uniform(0.3, 0.8), rng.uniform(0.8, 2.5)], p=[0.75, 0.25]) * max(scale, 0.6)
     light = cv2.GaussianBlur(light, (0, 0), sigma)
     if rng.random() < 0.12:
-        reach = max(int(rng.uniform(2, 10) * scale), 1)
-        kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
-        angle = rng.uniform(0, np.pi)
-        dx, dy = reach * np.cos(angle), reach * np.sin(angle)
-        cv2.line(kernel, (round(reach - dx), round(reach - dy)), (round(reach + dx), round(reach + dy)), 1.0)
-        light = cv2.filter2D(light, -1, kernel / kernel.sum())
+        light = cv2.filter2D(light, -1, motion_kernel(max(int(rng.uniform(2, 10) * scale), 1), rng))
     if rng.random() < 0.3:
         # Processors sharpen; edges get halos.
         light = np.maximum(light + rng.uniform(0.2, 1.5) * (light - cv2.GaussianBlur(light, (0, 0), 1.2)), 0)
     return light.astype(np.float32)
+
+
+def motion_kernel(reach: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the kernel (2 reach + 1, 2 reach + 1) of a motion in a random direction, of sum 1."""
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    angle = rng.uniform(0, np.pi)
+    dx, dy = reach * np.cos(angle), reach * np.sin(angle)
+    cv2.line(kernel, (round(reach - dx), round(reach - dy)), (round(reach + dx), round(reach + dy)), 1.0)
+    return kernel / kernel.sum()
 
 
 def _noisy(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:

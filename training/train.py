@@ -106,11 +106,9 @@ class Training:
         held_out = evaluate(self.averaged.module.eval(), store, _CHECKED, self.device, limit=120)
         mean = {name: float(np.mean([entry[name] for entry in sums])) for name in sums[0]}
         row = {"step": self._step, "seconds": seconds, "rate": self._rate(), "held_out": held_out.abs_rel} | mean
-        file = self.folder / "log.csv"
-        fresh = not file.is_file()
-        with file.open("a", newline="", encoding="utf-8") as stream:
+        with (self.folder / "log.csv").open("a", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
-            if fresh:
+            if not stream.tell():
                 writer.writerow(_LOG_COLUMNS)
             writer.writerow([f"{row[name]:.6g}" for name in _LOG_COLUMNS])
         self._save()

@@ -24,8 +24,6 @@ _MOST_MISSED = 0.02
 class SceneView:
     """A camera in a scene.
 
-    Attributes
-    ----------
     camera : (7,) as in `Buffers.camera`.
     eye : (3,) in scene units.
     rotation : (3, 3) rotation, scene <- camera.

@@ -17,7 +17,7 @@ from scopemap.config import Config
 from scopemap.faults import notices_of_faults
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.volume import SurfaceFusion
+from scopemap.fusion.surface_fusion import SurfaceFusion
 from scopemap.mapping.submaps import Mapper
 from scopemap.notices import Notice
 from scopemap.odometry import Odometry, Step

@@ -23,7 +23,7 @@ from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.volume import SurfaceFusion
+from scopemap.fusion.surface_fusion import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import transform
 from scopemap.io import weights

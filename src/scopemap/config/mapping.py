@@ -85,7 +85,7 @@ class FusionAdvanced(Settings):
 
 
 class FusionSettings(Settings):
-    """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.volume`."""
+    """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.surface_fusion`."""
 
     enabled: bool = Field(True, description="false: no mesh")
     voxel_mm: float | None = Field(

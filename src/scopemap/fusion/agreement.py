@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,12 +18,9 @@ from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
 
 
-@dataclass(frozen=True)
-class FrameAgreement:
+class FrameAgreement(NamedTuple):
     """Agreement of a mesh with one frame.
 
-    Attributes
-    ----------
     coverage : share, 0..1, of the pixels with known depth where the mesh is seen.
     depth_error : median of |ln(depth of the mesh / depth of the frame)| where both are known; NaN where nowhere.
     ssim : mean structural similarity of grey values over all pixels with known depth; holes are black.
@@ -95,7 +92,7 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
 
     A figure that no frame has is absent.
     """
-    rows = [(a.coverage, a.depth_error, a.ssim, a.lpips) for a in agreements]
+    rows = list(agreements)
     coverage, depth_error, ssim, lpips = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 4).T)
     figures: dict[str, float] = {"frames": len(rows)}
     if coverage.size:

@@ -5,9 +5,9 @@ cosine of incidence c and the angle a off the optical axis is modelled as
 
     level = gain * albedo * c^0.1 * d^-0.8 * (cos a)^0.8
 
-Exponents: fitted to levels of the same points in different frames of three real clips and of two phantoms with
-predicted depth; d^-0.71 to d^-0.95 in each (d^-2 and sRGB's 1 / 2.2 give d^-0.9), cosines little, because predicted
-normals are noisy and walls light each other. The light is bounded: dark pixels are noise, and bright ones clipped.
+Exponents are fitted to levels of the same points in different frames. d^-2 and sRGB's 1 / 2.2 would give d^-0.9; the
+cosine counts little, because predicted normals are noisy and tissue lights tissue. The light is bounded: dark pixels
+are noise, and bright ones clipped.
 """
 
 from __future__ import annotations
@@ -81,13 +81,6 @@ class AlbedoPainter:
             return usual
         overlap = float(np.median(np.log(np.maximum(fused[known], 1.0) / levels[known])))
         return _FOLLOWED * overlap + (1 - _FOLLOWED) * usual
-
-
-def raw_picture(rgb: np.ndarray) -> np.ndarray:
-    """Return the pixels (H, W, 3) of a video as they are, with weight 1, (H, W, 4) float32."""
-    picture = np.ones((*rgb.shape[:2], 4), np.float32)
-    picture[..., :3] = rgb
-    return picture
 
 
 def relative_light(surface: MeasuredSurface, camera: TsdfCamera) -> np.ndarray:

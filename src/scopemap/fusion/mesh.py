@@ -6,15 +6,12 @@ grid edge, and the edge's address welds the chunks exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 from numba import njit
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from scopemap.config.mapping import FusionAdvanced
 from scopemap.fusion.albedo import displayed
@@ -40,8 +37,7 @@ _ON_ONE_FACE = (_ON_FACE[:, None] & _ON_FACE).any(-1)
 _MOST_TRIANGLES = len(_EDGES)  # of a cell
 
 
-@dataclass(frozen=True)
-class _Chunk:
+class _Chunk(NamedTuple):
     """Mesh of a chunk: vertices (V, 3) in voxels, edge addresses (V, 3), values (V, 4), faces (F, 3).
 
     values : colour, 0..255, and confidence, 0..1.
@@ -58,14 +54,10 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 
-    Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole, and so does the
-    space that a fold hides behind its silhouette. Components with
+    Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole. Components with
     less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
-    `vertex_attributes["confidence"]`: (V,) float32, 0..1, 1 - exp(-weight / 1.5): rises with the number of frames that
-    saw a vertex, and falls with their distance, obliqueness and uncertainty; the latter beside the median of its
-    frame: a frame that is uncertain everywhere counts like any other.
-
-    median_level : median grey level, 0..255, that the colours are scaled to; None: they stay as they are.
+    `vertex_attributes["confidence"]`: (V,) float32, 0..1, 1 - exp(-weight / 1.5). median_level : median grey level,
+    0..255, that the colours are scaled to; None: they stay as they are.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
     chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
@@ -85,8 +77,7 @@ def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min
     if not cells.any():
         return None
     local, faces = marching_cubes(tsdf, cells)
-    low, high = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64)
-    offset = corner * BLOCK
+    low, high, offset = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64), corner * BLOCK
     return _Chunk(local + offset, low + high + 2 * offset, _values(samples, local, low, high), faces)
 
 
@@ -133,9 +124,8 @@ def _without_floaters(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not len(faces):
         return vertices, faces, values
-    links = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    graph = coo_matrix((np.ones(links.shape[1], bool), links), shape=(len(vertices), len(vertices)))
-    component = connected_components(graph, directed=False)[1][faces[:, 0]]
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    component = trimesh.graph.connected_component_labels(edges, node_count=len(vertices))[faces[:, 0]]
     sizes = np.bincount(component)
     large = sizes >= min(min_share * len(faces), sizes.max())
     used, renumbered = np.unique(faces[large[component]], return_inverse=True)

@@ -14,35 +14,28 @@ from scopemap.geometry.rendering import vertex_colours
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
 _PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
-_WRITTEN_COLOURS, _COLOURS = "_COLOR_0", "COLOR_0"
+_WRITTEN_COLOURS = "_COLOR_0"
 
 
 def save_mesh(
     mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None, *, comment: str = ""
-) -> list[Path]:
-    """Write a mesh with vertex colours, world mm, as binary PLY and as GLB; return the files written.
+) -> None:
+    """Write a mesh with vertex colours, world mm, as binary PLY and as GLB.
 
-    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward), so a y-up viewer shows it upside
-    down; vertex attributes such as `confidence` are properties there. The GLB is glTF's: metres, y up, thus 0.001 of
-    the trajectory's unit with y and z negated; matt and visible from both sides, because a lumen is seen from inside
-    and outside; linear colours of 16 bits (glTF 2.0, section 3.7.2.1), because 8 bits would hold dark sRGB levels 0 to
-    12 in two steps. Both have vertex normals. A mesh without faces gives no GLB. The unit, the axes and `comment`, such
-    as that the scale is unknown, are comments in the PLY and `asset.extras` in the GLB.
+    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward); vertex attributes such as
+    `confidence` are properties there. The GLB has metres, y up: 0.001 of the trajectory's unit with y and z negated. It
+    is matt and visible from both sides, its colours are linear with 16 bits (glTF 2.0, section 3.7.2.1): 8 bits would
+    hold dark sRGB levels 0 to 12 in two steps. Both have vertex normals. A mesh without faces gives no GLB. The unit,
+    the axes and `comment` are comments in the PLY and `asset.extras` in the GLB.
     """
-    written: list[Path] = []
     if ply_file is not None:
-        Path(ply_file).write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
-        written.append(Path(ply_file))
+        ply_file.write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
     if glb_file is not None and len(mesh.faces):
-        Path(glb_file).write_bytes(_glb(mesh, comment))
-        written.append(Path(glb_file))
-    return written
+        glb_file.write_bytes(_glb(mesh, comment))
 
 
 def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
-    """Return a mesh, or its vertices where it has no faces, as binary PLY with these comments; empty ones are left
-    out.
-    """
+    """Return a mesh, or its vertices where it has no faces, as binary PLY with these comments but empty ones."""
     content = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=bool(len(mesh.faces)))
     head, end, rest = content.partition(b"\nelement vertex")
     for line in comments:
@@ -61,8 +54,14 @@ def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
     )
 
     def finish(tree: dict[str, Any]) -> None:
-        _with_colours_and_material(tree)
+        # Without a material viewers show metal.
+        matt = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": matt}]
         tree["asset"]["extras"] = {"unit": "m", "axes": "y up", "comment": comment}
+        for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
+            primitive["material"] = 0
+            colours = primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_WRITTEN_COLOURS)
+            tree["accessors"][colours]["normalized"] = True
 
     return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), include_normals=True, tree_postprocessor=finish)
 
@@ -74,15 +73,3 @@ def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:
     rgba = np.full((len(srgb), 4), 65535, np.uint16)
     rgba[:, :3] = np.round(65535 * linear).astype(np.uint16)[srgb]
     return rgba
-
-
-def _with_colours_and_material(tree: dict[str, Any]) -> None:
-    """Turn the attribute of all meshes of a glTF tree into colours; give them a matt material seen from both sides.
-
-    Without a material viewers show metal.
-    """
-    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}]
-    for primitive in (primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]):
-        primitive["material"] = 0
-        primitive["attributes"][_COLOURS] = primitive["attributes"].pop(_WRITTEN_COLOURS)
-        tree["accessors"][primitive["attributes"][_COLOURS]]["normalized"] = True

@@ -308,11 +308,9 @@ def integrate_blocks(
     """Fuse one frame into the blocks `slots` (N,), whose first voxels are `corners` (N, 3), in voxels.
 
     picture : (H, W, 4) float32, r g b and the weight of each pixel's colour beside that of the surface.
-
     The distance of a voxel is the one to the tangent plane of the surface that its pixel sees. Voxels farther behind
-    the surface than the truncation, measured along the optical axis, stay unchanged; towards there
-    the weight falls to 0 (Oleynikova et al., IROS 2017, eq. 6), so that views past a thin fold outweigh views of
-    its front. Changes `voxels`.
+    the surface than the truncation, along the optical axis, stay unchanged; towards there the weight falls to 0
+    (Oleynikova et al., IROS 2017, eq. 6). Changes `voxels`.
     """
     whole = _whole_cells(surface.inverse_depth, grid.largest_step)
     projection = np.empty((3, 4))
@@ -327,8 +325,6 @@ def integrate_blocks(
 class VoxelBlocks:
     """Blocks of 8^3 voxels found by the key of their block coordinate.
 
-    Attributes
-    ----------
     voxels : storage of at least `len(self) + 1` blocks; slot 0 is always an empty block.
     """
 
@@ -379,10 +375,7 @@ class VoxelBlocks:
 
         Where there is no block the weight is 0.
         """
-        steps = range(blocks)
-        x, y, z = (int(c) for c in corner)
-        find = self._slots.get
-        slots = np.array([find(pack.py_func(x + i, y + j, z + k), 0) for i in steps for j in steps for k in steps])
+        slots = self.find(corner + np.argwhere(np.ones((blocks,) * 3)))
         return Voxels(*(_assemble(array[slots], blocks) for array in self.voxels))
 
 

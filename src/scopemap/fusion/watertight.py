@@ -53,8 +53,7 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
         _relax(field, fixed, _SWEEPS)
     field = _one_space(np.where(np.abs(field) < _SMALLEST_CELLS, np.copysign(_SMALLEST_CELLS, field), field))
     vertices, faces = marching_cubes(field, np.ones(np.array(field.shape) - 1, bool))
-    faces = faces[:, ::side]
-    vertices = corner + (vertices + 0.5) * cell_mm
+    vertices, faces = corner + (vertices + 0.5) * cell_mm, faces[:, ::side]
     distance_mm, nearest = tree.query(vertices)
     seen = distance_mm <= _SEEN_CELLS * cell_mm
     colours = vertex_colours(mesh)[nearest]

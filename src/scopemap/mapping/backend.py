@@ -20,6 +20,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
+from scopemap.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
     depth_disagreement,
@@ -30,8 +31,8 @@ from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
-from scopemap.mapping.pose_interpolation import FrameCorrection, Refusal, TrackedPose
-from scopemap.mapping.reprojection import BundleProblem, Points, Priors, State
+from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
 # Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
@@ -52,9 +53,8 @@ _MIN_GRAPH_SUPPORT = 4
 class _Adjusted(NamedTuple):
     """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
 
-    Within the main map, the largest within one map, and between maps; the largest within one map before the adjustment,
-    from the pose graph. support : keyframes on either side of the accepted loops by which the least supported map is
-    connected.
+    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph.
+    between_px : between maps. support : keyframes on either side of the accepted loops of the least supported map.
     """
 
     correction: FrameCorrection
@@ -81,9 +81,9 @@ class _Adjusted(NamedTuple):
 class Backend:
     """Takes keyframes one by one, and returns the correction of all frames.
 
-    Feature tracks and loop closures are computed in a thread of their own; no other thread may use `flow` meanwhile.
-    Loop closures between maps merge them. The scale's drift is removed, and a pose graph spreads all loop closures over
-    the keyframes, before bundle adjustment. table : where observations are kept until then.
+    Feature tracks and loop closures are computed in another thread; no other one may use `flow` meanwhile. Before the
+    bundle adjustment loop closures between maps merge them, the scale's drift is removed, and a pose graph spreads all
+    loop closures over the keyframes. table : where observations are stored until then.
     """
 
     def __init__(
@@ -141,7 +141,6 @@ class Backend:
 
     def replace_tracked(self, change: Callable[[TrackedPose], TrackedPose]) -> None:
         """Change the poses as tracked of all keyframes, after the last one."""
-        self._finish()
         self._tracked = [change(pose) for pose in self._tracked]
 
     def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
@@ -149,7 +148,7 @@ class Backend:
 
         Nothing is returned where the camera was not lost within a map.
         """
-        self._finish()
+        self.settle()
         parts = {(pose.map, pose.segment) for pose in self._tracked}
         if self._camera is None or len(parts) == len({number for number, _ in parts}):
             return {}
@@ -167,10 +166,6 @@ class Backend:
         while self._pending:
             self._pending.popleft().result()
 
-    def _finish(self) -> None:
-        self.settle()
-        self._worker.shutdown()
-
     def adjust(
         self,
         map_number: int = 0,
@@ -185,8 +180,11 @@ class Backend:
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
-        self._finish()
-        self._close_loops_between_maps()
+        self.settle()
+        self._worker.shutdown()
+        if self._finder is not None and not self._all_weighed:
+            self._take(self._finder.between([pose.map for pose in self._tracked]))
+            self._all_weighed = True
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
         worlds = {map_number: Similarity.identity()}
         # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
@@ -210,13 +208,8 @@ class Backend:
         """Add a keyframe's feature tracks and loop closures."""
         self._camera = keyframe.camera
         self._tracks.add(keyframe, map_number)
-        self._take(self._finder.add(keyframe, map_number) if self._finder is not None else [])
-
-    def _close_loops_between_maps(self) -> None:
-        """Weigh all keyframes of every pair of maps, once."""
-        if self._finder is not None and not self._all_weighed:
-            self._take(self._finder.between([pose.map for pose in self._tracked]))
-            self._all_weighed = True
+        if self._finder is not None:
+            self._take(self._finder.add(keyframe, map_number))
 
     def _take(self, loops: Sequence[Loop]) -> None:
         for loop in loops:
@@ -225,14 +218,13 @@ class Backend:
 
     def _merged(self, map_number: int, allowed: Collection[int]) -> dict[int, Similarity]:
         """Return Sim(3) to the common world of the map and of the allowed maps that loop closures merge with it."""
-        map_of = [pose.map for pose in self._tracked]
-        points, _ = self._tracks.collected(np.flatnonzero(np.array(map_of) == map_number))
-        if len(set(map_of)) < 2 or not len(points.log_depth):
+        map_of = np.array([pose.map for pose in self._tracked])
+        points, _ = self._tracks.collected(np.flatnonzero(map_of == map_number))
+        if len(set(map_of.tolist())) < 2 or not len(points.log_depth):
             return {map_number: Similarity.identity()}
-        chosen = [k for k, number in enumerate(map_of) if number in {map_number, *allowed}]
-        some = [map_of[k] for k in chosen]
-        loops = self._loops_among(chosen, -self._path.drift[chosen])
-        return merge_maps(self._path.T_world_camera[chosen], some, loops, map_number, _median_depth_mm(points))
+        chosen = np.flatnonzero(np.isin(map_of, [map_number, *allowed])).tolist()
+        loops, T_world_camera = self._loops_among(chosen, -self._path.drift[chosen]), self._path.T_world_camera[chosen]
+        return merge_maps(T_world_camera, map_of[chosen].tolist(), loops, map_number, _median_depth_mm(points))
 
     def _loops_among(self, chosen: list[int], log_unit: np.ndarray) -> list[Loop]:
         """Return the loops between these keyframes, numbered by their place; log_unit as `Loop.among` takes it."""
@@ -256,17 +248,20 @@ class Backend:
 
         def sigmas_px(state: State) -> tuple[list[float], float]:
             length_px = errors_px(problem, state)
-            within = [_sigma_px(length_px[(host == number) & (observer == number)]) for number in worlds]
-            return within, _sigma_px(length_px[host != observer])
+            some = [*((host == number) & (observer == number) for number in worlds), host != observer]
+            *within, between = (robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan for chosen in some)
+            return within, between
 
-        graph = problem.tracked if problem.start is None else problem.start
+        graph = problem.begin
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
-        correction = _no_correction(np.array(self._frames)[chosen], found, refused)
         if not refused:
             correction = replace(self._correction(chosen, worlds, found), loops=loops, depth_fields=fields)
         elif len(worlds) > 1 and problem.start is not None:
-            by_graph = self._correction(chosen, worlds, replace(found, state=graph))
+            by_graph = self._correction(chosen, worlds, found._replace(state=graph))
             correction = replace(by_graph, loops=len(accepted), sigma_px=found.sigma_px, refused=refused)
+        else:
+            index, as_tracked = np.array(self._frames)[chosen], np.tile(np.eye(4), (len(chosen), 1, 1))
+            correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
         main_px, support = within[list(worlds).index(main)], _support(accepted, map_of, main)
@@ -275,25 +270,18 @@ class Backend:
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
     ) -> tuple[BundleProblem, np.ndarray]:
-        """Return the bundle adjustment of chosen keyframes, from the pose graph, and that's accepted loops (A, 2)."""
-        settings, own = self.settings, [self._tracked[k] for k in chosen]
-        T_own, unit = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in own]
-        T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(unit, T_own, strict=True)])
-        log_unit = np.log([S.scale for S in unit]) - self._path.drift[chosen]
+        """Return the bundle adjustment of chosen keyframes, from the pose graph, and its accepted loops (A, 2)."""
+        settings, poses = self.settings, [self._tracked[k] for k in chosen]
+        T_map_camera, to_common = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in poses]
+        T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(to_common, T_map_camera, strict=True)])
+        log_unit = np.log([S.scale for S in to_common]) - self._path.drift[chosen]
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
-        pairs = tracked_pairs([self._frames[k] for k in chosen], own)
-        problem = BundleProblem(
-            inverse(T_world_camera),
-            points,
-            observations,
-            priors,
-            pairs,
-            camera.fx,
-            correlated=settings.correlated_observations,
-        )
+        pairs = tracked_pairs([self._frames[k] for k in chosen], poses)
+        T, correlated = inverse(T_world_camera), settings.correlated_observations
+        problem = BundleProblem(T, points, observations, priors, pairs, camera.fx, correlated=correlated)
         loops = self._loops_among(chosen, log_unit)
         if not loops:
             return problem, np.zeros((0, 2), int)
@@ -304,8 +292,8 @@ class Backend:
 
     def _as_tracked(self, chosen: list[int], worlds: Mapping[int, Similarity]) -> np.ndarray:
         """Return the poses (C, 4, 4) of chosen keyframes as tracked, in the common world."""
-        own = [self._tracked[k] for k in chosen]
-        return np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in own])
+        poses = [self._tracked[k] for k in chosen]
+        return np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in poses])
 
     def _correction(
         self, chosen: list[int], worlds: Mapping[int, Similarity], found: BundleSolution
@@ -319,16 +307,16 @@ class Backend:
 
     def _judged(
         self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
-    ) -> tuple[Refusal | None, tuple[DepthCorrectionField, ...]]:
+    ) -> tuple[Notice | None, tuple[DepthCorrectionField, ...]]:
         """Return why a solution is refused, None where it is not, and its depth correction fields."""
         if reason := contradiction(problem.points, found, self.settings):
-            return Refusal("mapping-not-rigid", {"reason": reason}), ()
+            return Notice("mapping-not-rigid", {"reason": reason, "merged": ""}), ()
         fields: tuple[DepthCorrectionField, ...] = ()
         if (step_sigma := self.settings.depth_step_sigma) > 0:
             assert self._camera is not None
             points, drift = problem.points, self._path.drift[chosen]
             as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
-            error = (_depth_change(points, found), found.log_depth_sigma)
+            error = _depth_change(points, found), found.log_depth_sigma
             fields = fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
         return self._depth_contradiction(chosen, found, fields, worlds), fields
 
@@ -338,7 +326,7 @@ class Backend:
         found: BundleSolution,
         fields: tuple[DepthCorrectionField, ...],
         worlds: Mapping[int, Similarity],
-    ) -> Refusal | None:
+    ) -> Notice | None:
         """Return that the depths of keyframes agree less than as tracked, None where they agree."""
         assert self._camera is not None
         grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
@@ -353,7 +341,8 @@ class Backend:
         tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-                return Refusal("mapping-depth-disagrees", {"adjusted": float(now), "tracked": float(was)})
+                values = {"adjusted": float(now), "tracked": float(was), "merged": ""}
+                return Notice("mapping-depth-disagrees", values)
         return None
 
 
@@ -366,12 +355,6 @@ def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
         own = map_of[ends] == number
         least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
     return min(least, default=0)
-
-
-def _no_correction(index: np.ndarray, found: BundleSolution, refused: Refusal | None) -> FrameCorrection:
-    """Return the correction that changes nothing."""
-    identity = np.tile(np.eye(4), (len(index), 1, 1))
-    return FrameCorrection(index, identity, np.zeros(len(index)), found.sigma_px, refused=refused)
 
 
 def contradiction(points: Points, found: BundleSolution, settings: MappingAdvanced) -> str:
@@ -388,11 +371,6 @@ def contradiction(points: Points, found: BundleSolution, settings: MappingAdvanc
 
 def _median_depth_mm(points: Points) -> float:
     return float(np.exp(np.median(points.log_depth)))
-
-
-def _sigma_px(length_px: np.ndarray) -> float:
-    """Robust standard deviation of the lengths of 2-D errors; NaN of none."""
-    return robust_sigma_2d(length_px) if len(length_px) else float("nan")
 
 
 def _depth_change(points: Points, found: BundleSolution) -> np.ndarray:

@@ -1,17 +1,16 @@
 """Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the lens.
 
-With the notation of `reprojection`:
+With the notation of `bundle_problem`:
 
     sum of rho(|projected - observed| / s) / c  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)
     +  sum of (a_k / sigma_a)^2  +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
     +  sum of ((lens - expected) / sigma_lens)^2
 
-rho is Cauchy's kernel, s the robust standard deviation of the reprojection errors, and c the number of observations
-that count as one, because the errors of flow are alike at neighbouring corners: with c = 1 thousands of observations
-that share a small bias outweigh everything that is known of the scale along the path. The second sum holds points to
-the estimated depth, up to the keyframe's own factor exp(a_h); the third holds these factors to 1; the fourth holds a
-keyframe j to its tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement:
-Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
+rho is Cauchy's kernel, s the robust standard deviation of the reprojection errors, c the number of observations that
+count as one, because the errors of flow are alike at neighbouring corners. The second sum holds points to the estimated
+depth, up to the keyframe's factor exp(a_h); the third holds these factors to 1; the fourth holds a keyframe j to its
+tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement: Triggs et al., "Bundle
+Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
 
 More than a few hundred keyframes are adjusted window by window, so that time grows with their number, not its cube.
 """
@@ -19,7 +18,7 @@ More than a few hundred keyframes are adjusted window by window, so that time gr
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -29,7 +28,7 @@ from numba import njit
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, PointBlock, SchurModel, cauchy, minimise, robust_sigma_2d
 from scopemap.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
-from scopemap.mapping.reprojection import (
+from scopemap.mapping.bundle_problem import (
     BundleProblem,
     Observations,
     Points,
@@ -49,12 +48,9 @@ WINDOW = 300
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
-@dataclass(frozen=True)
-class BundleSolution:
+class BundleSolution(NamedTuple):
     """Where the adjustment ended.
 
-    Attributes
-    ----------
     state : the first keyframe's pose as it was; sigma_px : robust standard deviation of the reprojection errors.
     log_depth_sigma : (P,) standard deviation of ln depth by the observations alone, keyframes held; infinite where no
     other keyframe observes a point. iterations : accepted and rejected.
@@ -75,7 +71,7 @@ def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSol
 
     Keyframes of earlier windows that share points with a window are held, and their points by what is known of them.
     """
-    start, count = problem.tracked if problem.start is None else problem.start, len(problem.T_camera_world)
+    start, count = problem.begin, len(problem.T_camera_world)
     if count <= window:
         return adjust(problem)
     found = BundleSolution(start, np.full(len(start.log_depth), np.inf), 0)
@@ -85,40 +81,34 @@ def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSol
         found = _with_window(problem, found, first, end)
     lengths_px = errors_px(problem, found.state)
     sigma_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)], problem.least_sigma_px)
-    return replace(found, state=found.state._replace(sigma_px=sigma_px))
+    return found._replace(state=found.state._replace(sigma_px=sigma_px))
 
 
 def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end: int) -> BundleSolution:
     """Return the solution with the keyframes from `first` to before `end` adjusted, those before `first` being so."""
     points, seen, state = problem.points, problem.observations, found.state
     moved = state.T_camera_world.copy()
-    if first:  # The window goes on from where the one before has ended.
-        at_start = (problem.tracked if problem.start is None else problem.start).T_camera_world
+    if first:  # From where the window before has ended.
+        at_start = problem.begin.T_camera_world
         moved[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ moved[first - 1]
     host, observer = points.host[seen.point], seen.keyframe
     some = (np.maximum(host, observer) >= first) & (np.maximum(host, observer) < end)
     if not some.any():
-        return replace(found, state=state._replace(T_camera_world=moved))
+        return found._replace(state=state._replace(T_camera_world=moved))
     keyframes = np.union1d(np.union1d(host[some], observer[some]), np.arange(max(first - 1, 0), end))
     own = np.union1d(seen.point[some], np.flatnonzero((points.host >= first) & (points.host < end)))
     place = np.full(len(state.T_camera_world), -1)
     place[keyframes] = np.arange(len(keyframes))
     known, log_scale = points.host[own] < first, state.log_scale[points.host[own]]
-    part = BundleProblem(
-        problem.T_camera_world[keyframes],
-        Points(
-            place[points.host[own]],
-            points.pixel[own],
-            np.where(known, state.log_depth[own] - log_scale, points.log_depth[own]),
-            np.where(known, np.clip(found.log_depth_sigma[own], _HELD_SIGMA, points.sigma[own]), points.sigma[own]),
-        ),
-        Observations(np.searchsorted(own, seen.point[some]), place[seen.keyframe[some]], seen.pixel[some]),
-        problem.priors,
-        place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
-        problem.focal_px,
+    log_depth = np.where(known, state.log_depth[own] - log_scale, points.log_depth[own])
+    sigma = np.where(known, np.clip(found.log_depth_sigma[own], _HELD_SIGMA, points.sigma[own]), points.sigma[own])
+    part = replace(
+        problem,
+        T_camera_world=problem.T_camera_world[keyframes],
+        points=Points(place[points.host[own]], points.pixel[own], log_depth, sigma),
+        observations=Observations(np.searchsorted(own, seen.point[some]), place[observer[some]], seen.pixel[some]),
+        neighbours=place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
         start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.lens),
-        least_sigma_px=problem.least_sigma_px,
-        correlated=problem.correlated,
         held=int((keyframes < first).sum()),
     )
     solved, new = adjust(part), ~known
@@ -134,7 +124,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     The scale of the reprojection errors is estimated again after every accepted step: which are outliers is judged as
     the fit gets better.
     """
-    start = problem.tracked if problem.start is None else problem.start
+    start = problem.begin
     if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
         return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
@@ -171,16 +161,15 @@ def linearised(problem: BundleProblem, state: State) -> SchurModel:
     edges = _odometry_edges(problem, state)
     held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
     held += [np.arange(6), np.arange(_PER_KEYFRAME * problem.held)]
-    free = np.setdiff1d(np.arange(_PER_KEYFRAME * count + lens), np.concatenate(held))
+    unknowns = _PER_KEYFRAME * count + lens
+    free = np.setdiff1d(np.arange(unknowns), np.concatenate(held))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
         parts = _Rows(seen.error, _weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
         hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
         return hosts, _camera_blocks(problem, state, edges)
 
-    return SchurModel(
-        _cost(problem, state, seen, edges), build, free, _PER_KEYFRAME * count + lens, len(state.log_depth)
-    )
+    return SchurModel(_cost(problem, state, seen, edges), build, free, unknowns, len(state.log_depth))
 
 
 def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[_OdometryEdge]) -> float:
@@ -220,10 +209,8 @@ def _camera_blocks(problem: BundleProblem, state: State, edges: list[_OdometryEd
         J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
         blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
     if problem.priors.scale > 0:
-        information = np.full(len(T), problem.priors.scale**-2.0)
-        blocks.append(
-            CameraBlock(6 + _PER_KEYFRAME * np.arange(len(T)), np.diag(information), information * state.log_scale)
-        )
+        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
+        blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
     if problem.lens is not None:
         information, own = problem.lens.sigma**-2.0, _PER_KEYFRAME * len(T) + np.arange(2)
         blocks.append(CameraBlock(own, np.diag(information), information * (state.lens - problem.tracked.lens)))

@@ -21,7 +21,7 @@ from scipy import sparse
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.mapping.reprojection import Points
+from scopemap.mapping.bundle_problem import Points
 
 ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
 MAX_LOG_FACTOR = 0.7
@@ -45,8 +45,6 @@ _GRID_PX = 8  # between the pixels whose depth is compared between keyframes
 class DepthCorrectionField:
     """ln of the factor of a keyframe's depth, trilinear between the nodes of a grid.
 
-    Attributes
-    ----------
     values : (6, 7, 4) over rows, columns and ln depth; the first and last nodes are at the image's borders. nearest,
     farthest : ln mm of the first and the last level; the field is constant beyond them.
     """
@@ -84,7 +82,8 @@ def fit_depth_correction(
         return DepthCorrectionField(np.zeros(_SHAPE), 0.0, 1.0)
     nearest, farthest = (float(end) for end in np.percentile(log_depth[known], _LEVEL_PERCENTILES))
     farthest = max(farthest, nearest + 1e-3)
-    at = _interpolation(position[known], _level(log_depth[known], nearest, farthest))
+    level = np.clip((log_depth[known] - nearest) / (farthest - nearest), 0, 1) * (LEVELS - 1)
+    at = _interpolation(position[known], level)
     variance, target = sigma[known] ** 2 + _MIN_SIGMA**2, error[known]
     prior, weight = _prior(step_sigma), 1 / variance
     for _ in range(_ITERATIONS):
@@ -173,17 +172,9 @@ def _between_levels(flat: np.ndarray, log_depth: np.ndarray, nearest: float, far
 @lru_cache(4)
 def _pixel_coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Return column and row of each pixel, in nodes, (H, W) float32 each."""
-    x, y = np.meshgrid(_node_coordinates(width, COLUMNS), _node_coordinates(height, ROWS))
+    sides = ((width, COLUMNS), (height, ROWS))
+    x, y = np.meshgrid(*(((np.arange(n) + 0.5) / n * (nodes - 1)).astype(np.float32) for n, nodes in sides))
     return x, y
-
-
-def _node_coordinates(size: int, nodes: int) -> np.ndarray:
-    """Coordinates (size,) float32 of the pixels of a row or column, in nodes, 0..nodes - 1."""
-    return ((np.arange(size) + 0.5) / size * (nodes - 1)).astype(np.float32)
-
-
-def _level(log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
-    return np.clip((log_depth - nearest) / (farthest - nearest), 0, 1) * (LEVELS - 1)
 
 
 def _interpolation(position: np.ndarray, level: np.ndarray) -> sparse.csr_matrix:

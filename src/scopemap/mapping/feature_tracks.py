@@ -19,8 +19,8 @@ from scopemap.flow.corners import detect_corners, match_corners, normalised_brig
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.uncertainty import relative_sigma
+from scopemap.mapping.bundle_problem import Observations, Points
 from scopemap.mapping.loop_closure import Loop
-from scopemap.mapping.reprojection import Observations, Points
 
 _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
@@ -81,17 +81,14 @@ class FeatureTracks:
         recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self.settings.keyframe_gaps)))
         for oldest in [*self._recent][:-_MOST_MAPS]:
             del self._recent[oldest]
-        self._forget_flows_of_other_maps(map_number)
+        # With the flows of each new map memory would grow by tens of megabytes.
+        for past in (past for other, others in self._recent.items() if other != map_number for past in others):
+            past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self._keyframe_count, number_in_map, keyframe.rgb, keyframe.valid, corners, first)
         self._match_with(recent, new)
         recent.append(new)
         self._keyframe_count += 1
-
-    def _forget_flows_of_other_maps(self, map_number: int) -> None:
-        """Keep the flows of one map only: with each new map memory would grow by tens of megabytes."""
-        for past in (past for other, recent in self._recent.items() if other != map_number for past in recent):
-            past.composed = None
 
     def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
         """Match a new keyframe both ways with recent ones of its map."""
@@ -130,8 +127,8 @@ class FeatureTracks:
         place in it. most_observations : above about so many only every n-th point is returned.
         """
         new_number = np.full(self._keyframe_count, -1)
-        chosen = np.arange(self._keyframe_count) if keyframes is None else np.array(keyframes, dtype=int)
-        new_number[chosen] = np.arange(len(chosen))
+        chosen = range(self._keyframe_count) if keyframes is None else keyframes
+        new_number[list(chosen)] = np.arange(len(chosen))
         points, matches = self._points.read(), self._matches.read()
         point, keyframe = matches["point"], new_number[matches["keyframe"]]
         host = new_number[points["host"]]
@@ -180,7 +177,7 @@ class FeatureTracks:
 
 
 def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the flow (H, W, 2) from a to c by those from a to b and from b to c; borders of the second go on."""
+    """Return the flow (H, W, 2) from a to c by those from a to b and from b to c; borders are continued."""
     height, width = first.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     onwards = cv2.remap(second, u + first[..., 0], v + first[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -34,8 +34,6 @@ _NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 class Loop:
     """A loop closure: two keyframes that observe the same place, long after each other or in two maps.
 
-    Attributes
-    ----------
     past, new : numbers of the keyframes. T_new_past : (4, 4), mm of the past keyframe's depth. log_ratio : ln of the
     new keyframe's depth over the past one's, transformed into the new camera. pixels_past, pixels_new : (M, 2) of the
     matched features. log_depth_past, log_depth_new : (M,) ln of their depth, NaN = unknown.
@@ -134,14 +132,11 @@ class LoopFinder:
 
     def _of(self, keyframe: int) -> Features:
         rows = self._rows.read(*self._features[keyframe][1:])
-        pixels, descriptors, points_mm = (
-            np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm")
-        )
-        return Features(pixels, descriptors, points_mm, self._detector.max_ratio)
+        arrays = (np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm"))
+        return Features(*arrays, self._detector.max_ratio)
 
     def between(self, map_of: Sequence[int]) -> list[Loop]:
-        """Return further loops between maps, after the last keyframe: for each pair of maps all pairs of keyframes are
-        ranked, and the most similar ones verified.
+        """Return further loops between maps, after the last keyframe, of the most similar keyframes of each two maps.
 
         map_of : numbers of the keyframes' maps, which may have been split or joined since.
         """
@@ -164,7 +159,11 @@ class LoopFinder:
         """Return the loop between a past keyframe and a new one, by number; None where PnP does not verify it."""
         assert self._camera is not None
         found = relative_pose_pnp(old, new, self._camera, self._min_inliers)
-        if found is None or (other_map and self._static(old, new, found.pairs)):
+        if found is None:
+            return None
+        shift_px = np.linalg.norm(new.pixels[found.pairs[:, 1]] - old.pixels[found.pairs[:, 0]], axis=1)
+        # Dirt on the lens stays in place, and matches in unrelated places.
+        if other_map and int((shift_px > _STATIC_PX).sum()) < self._min_inliers:
             return None
         one, other = found.pairs[:: -(-len(found.pairs) // _MAX_PAIRS)].T
         T_new_past = found.T_current_reference
@@ -192,11 +191,6 @@ class LoopFinder:
             ranked = [some[k] for k in np.argsort(-similarity, kind="stable") if similarity[k] > 0]
             candidates += [k for k in ranked if self._allows_loop(k)][:_CANDIDATES]
         return candidates
-
-    def _static(self, past: Features, new: Features, pairs: np.ndarray) -> bool:
-        """Whether too few features moved in the image: dirt on the lens matches in unrelated places."""
-        shift_px = np.linalg.norm(new.pixels[pairs[:, 1]] - past.pixels[pairs[:, 0]], axis=1)
-        return int((shift_px > _STATIC_PX).sum()) < self._min_inliers
 
     @staticmethod
     def _similarity(strongest: np.ndarray, past: _KeptFeatures) -> float:

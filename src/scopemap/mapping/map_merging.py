@@ -100,7 +100,10 @@ def merge_maps(
                 latest, most, best = number, support, found
         if latest is not None:
             S_common_map[latest] = best
-    return _with_first_pose_kept(T_world_camera, map_of, S_common_map)
+    first = next(k for k, number in enumerate(map_of) if number in S_common_map)
+    motion = T_world_camera[first] @ inverse(S_common_map[map_of[first]].transform_poses(T_world_camera[first]))
+    moved = Similarity(1.0, motion[:3, :3], motion[:3, 3])
+    return {number: moved.after(S) for number, S in S_common_map.items()}
 
 
 def _hypothesis(
@@ -122,10 +125,9 @@ def _best(hypotheses: Sequence[_Hypothesis], depth_mm: float) -> tuple[int, Simi
 
     Two hypotheses agree if they give the second one's keyframe a similar position, with similar rotation and scale.
     """
-    scale = np.array([hypothesis.S_common_map.scale for hypothesis in hypotheses])
-    R, t = (np.stack([getattr(hypothesis.S_common_map, name) for hypothesis in hypotheses]) for name in ("R", "t"))
-    centre = np.stack([hypothesis.T_map_camera for hypothesis in hypotheses])[:, :3, 3]
-    own, other = (np.array([getattr(hypothesis, name) for hypothesis in hypotheses]) for name in ("own", "other"))
+    S, T_map_camera, own, other = zip(*hypotheses, strict=True)
+    scale, R, t = (np.array([getattr(each, name) for each in S]) for name in ("scale", "R", "t"))
+    own, other, centre = np.array(own), np.array(other), np.stack(T_map_camera)[:, :3, 3]
     position = scale[:, None] * np.einsum("nij,nj->ni", R, centre) + t
     best = (0, Similarity.identity())
     for k, (S_common_map, *_) in enumerate(hypotheses):
@@ -135,20 +137,8 @@ def _best(hypotheses: Sequence[_Hypothesis], depth_mm: float) -> tuple[int, Simi
         angle_rad = np.arccos(np.clip((np.einsum("ij,nij->n", R[k], R) - 1) / 2, -1, 1))
         distance = np.linalg.norm(S_common_map.transform_points(centre) - position, axis=1) / depth_mm
         log_ratio = np.abs(np.log(scale / scale[k]))
-        agree = np.all(
-            [d < limit for d, limit in zip((angle_rad, distance, log_ratio), _MAX_DIFFERENCE, strict=True)], 0
-        )
+        agree = (np.column_stack([angle_rad, distance, log_ratio]) < _MAX_DIFFERENCE).all(1)
         support = min(len(np.unique(own[agree])), len(np.unique(other[agree])))
         if support >= _MIN_SUPPORT and support > best[0]:
             best = (support, S_common_map)
     return best
-
-
-def _with_first_pose_kept(
-    T_world_camera: np.ndarray, map_of: Sequence[int], S_common_map: dict[int, Similarity]
-) -> dict[int, Similarity]:
-    """Return the same with the common world moved so that the first keyframe has the pose of its own map."""
-    first = next(k for k, number in enumerate(map_of) if number in S_common_map)
-    motion = T_world_camera[first] @ inverse(S_common_map[map_of[first]].transform_poses(T_world_camera[first]))
-    moved = Similarity(1.0, motion[:3, :3], motion[:3, 3])
-    return {number: moved.after(S) for number, S in S_common_map.items()}

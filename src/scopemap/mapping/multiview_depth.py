@@ -46,7 +46,7 @@ MAX_SIGMA = 0.08
 _MAX_LOG_FACTOR = 0.5
 _MIN_SPREAD = 4.0  # grey levels of normalised contrast, standard deviation
 _WARPS = 2
-_CARRIED_EVERY = 2  # pixels of a row and a column are compared with keyframes; what depth is off by is smooth
+_PROPAGATED_EVERY = 2  # pixels of a row and a column are compared with keyframes; what depth is off by is smooth
 _CACHED_VIEWS = 24
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
@@ -75,13 +75,6 @@ class TriangulatedDepth(NamedTuple):
     depth_mm: np.ndarray
     sigma: np.ndarray
     log_factor: np.ndarray
-
-
-class _Estimate(NamedTuple):
-    """One neighbour's ln factor of depth, its information (1 / variance, 0 = unknown), each (H, W) float32."""
-
-    log_factor: np.ndarray
-    information: np.ndarray
 
 
 def normalised_contrast(rgb: np.ndarray) -> np.ndarray:
@@ -146,14 +139,14 @@ def propagate_depth(
     depth_mm : (H, W) float32, NaN = unknown. keyframes : T_keyframe_camera (4, 4) and depth of each, at least one.
     """
     height, width = depth_mm.shape
-    total = np.zeros((2, -(-height // _CARRIED_EVERY), -(-width // _CARRIED_EVERY)), np.float32)
+    total = np.zeros((2, -(-height // _PROPAGATED_EVERY), -(-width // _PROPAGATED_EVERY)), np.float32)
     for T, keyframe in keyframes:
         add_comparison(total, depth_mm, T, _intrinsics(camera), keyframe.depth_mm, keyframe.sigma)
     weighted, information = total
     mean = np.divide(weighted, information, out=np.zeros_like(weighted), where=information > 0)
     # Keyframes err alike: their mean is not more certain than one of them.
     sigma = 1 / np.sqrt(information / len(keyframes) + np.float32(PRIOR_SIGMA**-2))
-    log_factor = _smoothed(mean, information, 1 / _CARRIED_EVERY)
+    log_factor = _smoothed(mean, information, 1 / _PROPAGATED_EVERY)
     log_factor, sigma = (_between(image, depth_mm.shape) for image in (log_factor, sigma))
     return TriangulatedDepth(depth_mm * np.exp(log_factor), sigma, log_factor)
 
@@ -227,8 +220,11 @@ class KeyframeDepths:
 
 def _estimates(
     view: StereoView, neighbours: Sequence[StereoView], camera: PinholeCamera, flow: FlowEstimator
-) -> list[_Estimate]:
-    """Return what each neighbour tells of a view's depth, without those that tell nothing."""
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return each neighbour's ln factor of a view's depth, and its information, without those that tell nothing.
+
+    Information : 1 / variance, 0 = unknown. Each (H, W) float32.
+    """
     # Flow of a picture without texture is what it started from.
     grey = view.contrast[..., 0].astype(np.float32)
     spread = _blurred(grey**2, _DISAGREEMENT_PX) - _blurred(grey, _DISAGREEMENT_PX) ** 2
@@ -243,7 +239,7 @@ def _estimates(
         variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _blurred(across, _DISAGREEMENT_PX)
         information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)
         if (information := np.where(textured, information, np.float32(0))).any():
-            found.append(_Estimate(log_factor, information))
+            found.append((log_factor, information))
     return found
 
 
@@ -253,7 +249,7 @@ def _intrinsics(camera: PinholeCamera) -> Intrinsics:
 
 def _between(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return an image of every n-th pixel of a row and a column, interpolated at all pixels of `shape` (H, W)."""
-    at = np.diag([1 / _CARRIED_EVERY, 1 / _CARRIED_EVERY, 1.0])[:2]
+    at = np.diag([1 / _PROPAGATED_EVERY, 1 / _PROPAGATED_EVERY, 1.0])[:2]
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(image, at, shape[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
 

@@ -10,10 +10,10 @@ millimetres of i's depth and the ratio exp(r_ij) of their depth scales:
 Edges are the tracked motions (r = 0) and the loop closures. Cauchy's loss makes false loops and tracking failures
 outliers. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
 
-Loop closures tell drift of the scale where the camera comes back. Along new places the network tells it: each frame's
-depth takes its scale from the one before (`depth/mapis.py`), whose errors add up, while the network's own scale is
-noisy from frame to frame but does not drift. ln of the chained scale over the network's is the drift plus that noise;
-the drift changes slowly, and is its smooth part (Whittaker, "On a new method of graduation", 1923).
+Loop closures show drift of the scale where the camera comes back, and the network's scale along new places: each
+frame's depth takes its scale from the one before (`depth/mapis.py`), and errors add up; the network's scale is noisy
+from frame to frame but does not drift. ln of the chained scale over the network's is drift plus noise. The drift is its
+smooth part (Whittaker, "On a new method of graduation", 1923).
 """
 
 from __future__ import annotations
@@ -59,11 +59,6 @@ class PoseGraph(NamedTuple):
     T_world_camera: np.ndarray
     log_scale: np.ndarray
     accepted: np.ndarray
-
-    @property
-    def accepted_loops(self) -> int:
-        """Number of accepted loops."""
-        return len(self.accepted)
 
 
 class _Edges(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,19 +29,10 @@ class TrackedPose(NamedTuple):
     segment: int = 0
 
 
-class Refusal(NamedTuple):
-    """Why an adjustment is refused: the code of a `Notice`, and its values but `merged`."""
-
-    code: str
-    values: dict[str, Any]
-
-
 @dataclass(frozen=True)
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
 
-    Attributes
-    ----------
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
     robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,
@@ -54,7 +45,7 @@ class FrameCorrection:
     T_world_world: np.ndarray
     log_scale: np.ndarray
     sigma_px: float = float("nan")
-    refused: Refusal | None = None
+    refused: Notice | None = None
     loops: int = 0
     depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
@@ -69,7 +60,7 @@ class FrameCorrection:
         if self.refused:
             merged = len(self.S_common_map)
             by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
-            return Notice(self.refused.code, self.refused.values | {"merged": by_loops})
+            return replace(self.refused, values={**self.refused.values, "merged": by_loops})
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
         facts: dict[str, float] = {"keyframes": len(self.index), "loops": self.loops}
@@ -127,7 +118,8 @@ class FrameCorrection:
             return after, after, 0.0
         reference = self._reference(index)
         if reference is not None:
-            if after == len(self.index) or not self._same_reference(index, int(self.index[after])):
+            follows = after < len(self.index) and self._reference(int(self.index[after])) == reference
+            if not follows or self._lost_between(index, int(self.index[after])):
                 return reference, reference, 0.0
             if reference != after - 1 or self._lost_between(int(self.index[reference]), index):
                 return after, after, 0.0
@@ -152,11 +144,6 @@ class FrameCorrection:
     def _motion(self, T_world_one: np.ndarray, T_world_other: np.ndarray) -> float:
         T = inverse(T_world_one) @ T_world_other
         return float(np.hypot(rotation_angle_rad(T[:3, :3]), np.linalg.norm(T[:3, 3]) / self.depth_mm))
-
-    def _same_reference(self, index: int, keyframe: int) -> bool:
-        """Whether a frame and a later keyframe were aligned to the same one, and the camera was not lost between."""
-        same = self._reference(index) == self._reference(keyframe)
-        return same and not self._lost_between(index, keyframe)
 
     def _lost_between(self, one: int, other: int) -> bool:
         segments = {self.tracked[frame].segment for frame in (one, other) if frame in self.tracked}

@@ -14,7 +14,7 @@ VIEW_SIGMA = 0.03
 """Standard deviation of ln depth from one neighbour that all pixels share: errors of poses."""
 
 _MAX_FLOW_PX = 20.0
-_MAX_CARRIED = 0.25  # larger differences between a frame's depth and its keyframe's are an occlusion
+_MAX_PROPAGATED = 0.25  # larger differences between a frame's depth and its keyframe's are an occlusion
 _CAUCHY, _ITERATIONS = 2.0, 4
 _LEAST_MM = 1e-3
 _OUTSIDE_PX = -1e4
@@ -173,7 +173,7 @@ def add_comparison(
                 continue
             r, c = int(v), int(u)
             log_factor = np.log(_bilinear(at_mm, r, c, u - c, v - r) / z)
-            if abs(log_factor) < _MAX_CARRIED:
+            if abs(log_factor) < _MAX_PROPAGATED:
                 information = 1 / (_bilinear(at_sigma, r, c, u - c, v - r) ** 2 + VIEW_SIGMA**2)
                 total[0, i, j] += information * log_factor
                 total[1, i, j] += information

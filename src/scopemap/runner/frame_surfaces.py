@@ -9,7 +9,7 @@ from scopemap.depth.anchor import depth_downscale
 from scopemap.errors import reporting
 from scopemap.estimators import scale_facts
 from scopemap.frame import Frame
-from scopemap.fusion.frame_surface import frame_surface
+from scopemap.fusion.depth_mesh import depth_mesh
 from scopemap.fusion.mesh_files import save_mesh
 from scopemap.preprocessing import Estimators
 from scopemap.reconstruction import scale_words
@@ -30,7 +30,7 @@ class SurfaceWriter:
     def __call__(self, frame: Frame) -> None:
         """Write the surface of a frame; without any usable pixel it has no vertex."""
         step_px = depth_downscale(self._config.depth, max(frame.valid.shape))
-        mesh = frame_surface(frame, step_px, max(self._config.fusion.advanced.min_incidence, 0.05))
+        mesh = depth_mesh(frame, step_px, max(self._config.fusion.advanced.min_incidence, 0.05))
         with reporting(f"cannot write to {self._folder}"):
             self._folder.mkdir(parents=True, exist_ok=True)
             scale = scale_words(scale_facts(self._estimators))

@@ -24,9 +24,8 @@ from scopemap.frame import Frame, Rows
 from scopemap.fusion.agreement import surface_agreement
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.moving import MovingTissue, block_edge_mm
-from scopemap.fusion.seen_at import SeenAt
-from scopemap.fusion.volume import FusedSurface, depth_notices
+from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
 from scopemap.io.checksums import input_checksum, write_checksums
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.io.sequence import Sequence

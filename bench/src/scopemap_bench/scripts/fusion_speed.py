@@ -16,7 +16,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
-from scopemap.fusion.volume import TsdfVolume
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 SETTINGS = FusionSettings(voxel_mm=1.0)

@@ -29,7 +29,7 @@ from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.bundle_adjustment import adjust, linearised
-from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors, State, UnknownLens
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State, UnknownLens
 from scopemap.notices import Notice
 
 _LOG_DEPTH_SIGMA, _DISTORTION_SIGMA, _LOG_FOCAL_SIGMA = 1.0, 0.3, 1.0
@@ -141,7 +141,7 @@ class FocalEstimate:
 
     focal_px : horizontal focal length at the sequence's working size, NaN = unknown. share : its standard deviation
     over itself. fov_deg : horizontal field of view. windows : number of windows used. distortion : radial distortion, b
-    of `mapping.reprojection`. reason : why there is no estimate, or "".
+    of `mapping.bundle_problem`. reason : why there is no estimate, or "".
     """
 
     focal_px: float

@@ -25,7 +25,7 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.geometry.least_squares import cauchy, robust_sigma_2d
 from scopemap.mapping.bundle_adjustment import adjust
-from scopemap.mapping.reprojection import BundleProblem, Observations, Points, Priors, State, reproject
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State, reproject
 
 KINDS: dict[str, tuple[float, ...]] = {
     "pinhole": (),

@@ -1,4 +1,4 @@
-"""Reprojection errors of points on the rays of their host keyframe, and their derivatives.
+"""The problem of bundle adjustment: reprojection errors of points on rays of their host keyframe, and derivatives.
 
 A point p is on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera, another
 keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p). A lens with focal length f and distortion b sees x where a
@@ -23,8 +23,6 @@ _FARTHEST = 10.0  # half widths, beyond which Newton's method would diverge
 class Points:
     """P points, sorted by host.
 
-    Attributes
-    ----------
     host : (P,) int, number of the keyframe whose pixel they are. pixel : (P, 2) from the principal point, px, y times
     fx / fy. log_depth : (P,) ln of the estimated depth, mm. sigma : (P,) its standard deviation, so the relative error
     of the depth.
@@ -45,8 +43,7 @@ class Observations:
     pixel: np.ndarray
 
 
-@dataclass(frozen=True)
-class Priors:
+class Priors(NamedTuple):
     """Standard deviations of what is known beforehand.
 
     scale : of ln of a keyframe's depth scale, 0 holds it. rotation_rad, translation_share : of the tracked motion
@@ -58,8 +55,7 @@ class Priors:
     translation_share: float = 0.1
 
 
-@dataclass(frozen=True)
-class UnknownLens:
+class UnknownLens(NamedTuple):
     """Prior of a lens: half_width_px of the image, standard deviations (2,) of ln f and of b; b is expected to be 0."""
 
     half_width_px: float
@@ -70,8 +66,6 @@ class UnknownLens:
 class BundleProblem:
     """What is adjusted.
 
-    Attributes
-    ----------
     T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
     keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
     to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
@@ -90,6 +84,11 @@ class BundleProblem:
     least_sigma_px: float = 0.1
     correlated: float = 1.0
     held: int = 0
+
+    @property
+    def begin(self) -> State:
+        """The state to begin with: `start`, or as tracked."""
+        return self.tracked if self.start is None else self.start
 
     @property
     def unit_mm(self) -> float:

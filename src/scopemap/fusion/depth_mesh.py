@@ -1,4 +1,4 @@
-"""The surface that one frame sees: its depth as a grid of triangles, without any other frame."""
+"""The mesh of one frame's depth: a grid of triangles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import transform
 
 
-def frame_surface(frame: Frame, step_px: int, min_incidence: float) -> trimesh.Trimesh:
+def depth_mesh(frame: Frame, step_px: int, min_incidence: float) -> trimesh.Trimesh:
     """Return the surface of every n-th usable pixel of a frame with depth and a pose, world mm, in the video's colours.
 
     step_px : n. min_incidence : cosine of incidence below which neighbours are two surfaces, not a slanted one.
@@ -23,14 +23,9 @@ def frame_surface(frame: Frame, step_px: int, min_incidence: float) -> trimesh.T
     depth_mm = np.where(frame.valid & (frame.depth_mm > 0), frame.depth_mm, np.nan)[some].astype(np.float64)
     rows, columns = depth_mm.shape
     number = np.arange(rows * columns).reshape(rows, columns)
-    upper, lower = (number[:-1, :-1], number[:-1, 1:]), (number[1:, :-1], number[1:, 1:])
+    a, b, c, d = (number[i : rows - 1 + i, j : columns - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
     # Counter-clockwise seen from the camera, which looks along z with y down.
-    faces = np.concatenate(
-        [
-            np.stack([upper[0], lower[0], upper[1]], -1).reshape(-1, 3),
-            np.stack([upper[1], lower[0], lower[1]], -1).reshape(-1, 3),
-        ]
-    )
+    faces = np.concatenate([np.column_stack([a, c, b]), np.column_stack([b, c, d])])
     corners_mm = depth_mm.ravel()[faces]
     largest_step = step_px * math.sqrt(1 / min_incidence**2 - 1) / min(frame.camera.fx, frame.camera.fy)
     with np.errstate(invalid="ignore"):

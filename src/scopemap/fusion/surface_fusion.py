@@ -13,7 +13,7 @@ import trimesh
 
 from scopemap.config import FusionSettings
 from scopemap.frame import Frame
-from scopemap.fusion.albedo import AlbedoPainter, raw_picture
+from scopemap.fusion.albedo import AlbedoPainter
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.mesh import extract_mesh
 from scopemap.fusion.tsdf import (
@@ -33,9 +33,9 @@ from scopemap.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
 _MIN_COSINE = 0.05
-# TSDF parameters that are not set follow the scene, since the scale of millimetres differs from clip to clip. Voxels of
-# 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); other depths keep the proportions.
-VOXELS_PER_MEDIAN_DEPTH = 60
+# Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); TSDF parameters that are
+# not set keep the proportions at other depths.
+_VOXELS_PER_MEDIAN_DEPTH = 60
 _VOXELS_PER_TRUNCATION = 5
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
 _VOXELS_PER_MAX_DEPTH = 200
@@ -61,7 +61,7 @@ class TsdfParameters(NamedTuple):
     def notice(self) -> Notice:
         """That the parameters follow the scene, and how to set others."""
         values = {"voxel_mm": self.voxel_mm, "max_depth_mm": self.max_depth_mm}
-        return Notice("fusion-scaled", values | {"divisor": VOXELS_PER_MEDIAN_DEPTH})
+        return Notice("fusion-scaled", values | {"divisor": _VOXELS_PER_MEDIAN_DEPTH})
 
 
 def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = None) -> TsdfParameters:
@@ -74,7 +74,7 @@ def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = 
         if median_depth_mm is None or not median_depth_mm > 0:
             raise ValueError("fusing without fusion.voxel_mm: the scene's median depth must be known")
         # Two digits: a clip cut at another frame gives the same.
-        voxel_mm = float(f"{max(median_depth_mm / VOXELS_PER_MEDIAN_DEPTH, _MIN_VOXEL_MM):.2g}")
+        voxel_mm = float(f"{max(median_depth_mm / _VOXELS_PER_MEDIAN_DEPTH, _MIN_VOXEL_MM):.2g}")
     return TsdfParameters(
         voxel_mm,
         settings.truncation_mm or round(_VOXELS_PER_TRUNCATION * voxel_mm, 4),
@@ -102,9 +102,9 @@ class TsdfVolume:
     def integrate(self, frame: Frame) -> None:
         """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
-        Unless weights are off, frames count by what their pictures are worth (`frame.quality`), pixels whose depth is
-        less certain than the frame's median pixel (`frame.depth_sigma_mm`) count less, and small highlights within the
-        picture weigh a tenth, in the colour of what is around them.
+        Unless weights are off, frames count by image quality (`frame.quality`), pixels whose depth is less certain than
+        the frame's median pixel (`frame.depth_sigma_mm`) count less, and small highlights within the picture weigh a
+        tenth, in the colour of what is around them.
 
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
@@ -132,7 +132,7 @@ class TsdfVolume:
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
         else:
-            picture = raw_picture(frame.rgb)
+            picture = np.dstack([frame.rgb, np.ones_like(frame.valid)]).astype(np.float32)
         if masked.any():
             _paint_masked(picture, masked)
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
@@ -140,7 +140,7 @@ class TsdfVolume:
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
 
     def coarsen(self) -> None:
-        """Go on with voxels of twice the size, and twice the truncation."""
+        """Double the size of voxels, and the truncation."""
         self._blocks.halve()
         voxel_mm, truncation_mm = 2 * self.parameters.voxel_mm, 2 * self.parameters.truncation_mm
         self.parameters = self.parameters._replace(voxel_mm=voxel_mm, truncation_mm=truncation_mm)
