@@ -279,14 +279,13 @@ def test_a_damaged_checkpoint_is_one_sentence(folder: Path, tmp_path: Path) -> N
     assert _run(folder, out, "realtime").provenance["resumed_after_frame"] is None
 
 
-def test_observers_go_on_and_no_file_of_the_run_is_left(folder: Path, tmp_path: Path) -> None:
-    out, pictures = tmp_path / "run", FramePictures()
+def test_observers_are_resumed_and_saved_with_the_result(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
     with pytest.raises(_Killed):
-        _run(folder, out, "realtime", observers=(pictures.observe, _killing(5)))
-    pictures = FramePictures()
-    _run(folder, out, "realtime", observers=(pictures.observe,))
-    pictures.save(out)
+        _run(folder, out, "realtime", observers=(FramePictures().observe, _killing(5)))
+    _run(folder, out, "realtime", observers=(FramePictures().observe,))
     assert len(list((out / "frames").glob("*_mask.png"))) == FRAMES
+    assert "frames/measures.csv" in (out / "SHA256SUMS").read_text()
     left = {CHECKPOINT, LOCK, "stored_frames", UNFINISHED, "replaced", "moving"}
     assert not left & {path.name for path in out.rglob("*")}
 
