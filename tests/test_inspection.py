@@ -62,39 +62,17 @@ def beside(number: int, _: np.ndarray) -> np.ndarray:
     return np.hstack([wide[:, 8:], wide[:, :-8]])
 
 
-CHANGES: dict[str, tuple[Change, ...]] = {
-    "clean": (),
-    "circle": (inside(circle),),
-    "octagon": (inside(octagon),),
-    "rounded": (inside(rounded),),
-    "bars": (inside(bars),),
-    "drifting": (drifting,),
-    "text": (text(),),
-    "text in circle": (inside(circle), text(at=(110, 60)), text("ID 7", (2, 20))),
-    "inset": (inset,),
-    "blur": (during(15, 24, blurred),),
-    "black": (during(0, 9, black),),
-    "drape": (during(38, 49, drape),),
-    "interlaced": (combed,),
-    "stereo": (beside,),
-}
-Inspect = Callable[[str], Inspection]
-
-
-@pytest.fixture
-def inspected(tmp_path: Path) -> Inspect:
+def inspected(folder: Path, *changes: Change, count: int = COUNT) -> Inspection:
     """The inspection of a made-up video."""
-    return lambda name: inspect(
-        write(tmp_path / f"{name}.mp4", clip(75 if name == "drifting" else COUNT, *CHANGES[name]))
-    )
+    return inspect(write(folder / "video.mp4", clip(count, *changes)))
 
 
 def by_code(inspection: Inspection) -> dict[str, VideoFinding]:
     return {finding.code: finding for finding in inspection.findings}
 
 
-def test_nothing_is_found_in_a_clean_video(inspected: Inspect, tmp_path: Path) -> None:
-    found = inspected("clean")
+def test_nothing_is_found_in_a_clean_video(tmp_path: Path) -> None:
+    found = inspected(tmp_path)
     assert found.findings == ()
     assert (found.overlays, found.insets, found.packed, found.field.shape) == ((), (), None, "full")
     assert (found.facts["codec"], found.facts["bits"], found.facts["pictures"]) == ("mpeg4", 8, COUNT)
@@ -107,14 +85,13 @@ def test_nothing_is_found_in_a_clean_video(inspected: Inspect, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("name", "shape", "draw"),
-    [("circle", "circle", circle), ("octagon", "cut corners", octagon), ("rounded", "rounded corners", rounded),
-     ("bars", "bars", bars)],
-)  # fmt: skip
+    ("shape", "draw"),
+    [("circle", circle), ("cut corners", octagon), ("rounded corners", rounded), ("bars", bars)],
+)
 def test_the_field_of_view_is_reported_with_its_outline(
-    inspected: Inspect, name: str, shape: str, draw: Callable[[np.ndarray], None]
+    tmp_path: Path, shape: str, draw: Callable[[np.ndarray], None]
 ) -> None:
-    found = inspected(name)
+    found = inspected(tmp_path, inside(draw))
     assert list(by_code(found)) == [f"field-{shape.replace(' ', '-')}"]
     assert (found.field.shape, found.findings[0].severity) == (shape, "info")
     truth, drawn = np.zeros(SIZE[::-1], np.uint8), np.zeros(SIZE[::-1], np.uint8)
@@ -124,27 +101,27 @@ def test_the_field_of_view_is_reported_with_its_outline(
     assert found.field.share == pytest.approx(truth.mean(), abs=0.03)
 
 
-def test_a_field_that_moves_is_reported(inspected: Inspect) -> None:
-    found = inspected("drifting")
+def test_a_field_that_moves_is_reported(tmp_path: Path) -> None:
+    found = inspected(tmp_path, drifting, count=75)
     assert set(by_code(found)) == {"field-circle", "field-moves"}
     assert found.field.moved == pytest.approx(28 / SIZE[0], abs=0.02)
 
 
-def test_text_over_tissue_and_beside_it(inspected: Inspect) -> None:
-    alone = inspected("text")
+def test_text_over_tissue_and_beside_it(tmp_path: Path) -> None:
+    alone = inspected(tmp_path, text())
     assert set(by_code(alone)) == {"overlay", "overlay-privacy"}
     (overlay,) = alone.overlays
     assert overlay.in_field
     left, top, right, bottom = np.array(overlay.box) * [*SIZE, *SIZE]
     assert 80 < left < 95 < 180 < right < 195
     assert 42 < top < 52 < 58 < bottom < 68
-    both = inspected("text in circle")
+    both = inspected(tmp_path, inside(circle), text(at=(110, 60)), text("ID 7", (2, 20)))
     assert set(by_code(both)) == {"field-circle", "overlay", "overlay-outside", "overlay-privacy"}
     assert sorted(one.in_field for one in both.overlays) == [False, True]
 
 
-def test_a_picture_in_the_picture_is_found_and_its_mask_is_read_by_runs(inspected: Inspect, tmp_path: Path) -> None:
-    found = inspected("inset")
+def test_a_picture_in_the_picture_is_found_and_its_mask_is_read_by_runs(tmp_path: Path) -> None:
+    found = inspected(tmp_path, inset)
     assert set(by_code(found)) == {"inset"}
     (box,) = found.insets
     assert np.array(box) * [*SIZE, *SIZE] == pytest.approx([220, 0, 320, 80], abs=3)
@@ -157,13 +134,13 @@ def test_a_picture_in_the_picture_is_found_and_its_mask_is_read_by_runs(inspecte
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "segment", "advice"),
-    [("blur", "blurred", (15, 24), "the longest part without them: --frames 25:"),
-     ("black", "black", (0, 9), "leave them out with --frames 10:"),
-     ("drape", "not-tissue", (38, 49), "leave them out with --frames :38")],
+    ("change", "code", "segment", "advice"),
+    [(blurred, "blurred", (15, 24), "the longest part without them: --frames 25:"),
+     (black, "black", (0, 9), "leave them out with --frames 10:"),
+     (drape, "not-tissue", (38, 49), "leave them out with --frames :38")],
 )  # fmt: skip
-def test_segments_of_no_use(inspected: Inspect, name: str, code: str, segment: tuple[int, int], advice: str) -> None:
-    found = by_code(inspected(name))
+def test_segments_of_no_use(tmp_path: Path, change: Change, code: str, segment: tuple[int, int], advice: str) -> None:
+    found = by_code(inspected(tmp_path, during(*segment, change)))
     assert set(found) - {"cut"} == {code}
     (first, last), *others = found[code].segments
     assert not others
@@ -171,12 +148,9 @@ def test_segments_of_no_use(inspected: Inspect, name: str, code: str, segment: t
     assert found[code].advice.endswith(advice)
 
 
-def test_interlaced_pictures_name_their_option(inspected: Inspect) -> None:
-    assert by_code(inspected("interlaced"))["interlaced"].advice == "--deinterlace"
-
-
-def test_two_views_are_found_and_the_camera_may_be_that_of_one(inspected: Inspect, tmp_path: Path) -> None:
-    found, camera = inspected("stereo"), tmp_path / "camera.yaml"
+def test_fields_and_two_views_are_found_and_the_camera_may_be_that_of_one(tmp_path: Path) -> None:
+    assert by_code(inspected(tmp_path, combed))["interlaced"].advice == "--deinterlace"
+    found, camera = inspected(tmp_path, beside), tmp_path / "camera.yaml"
     assert by_code(found)["stereo"].advice == "--stereo left-right"
     camera.write_text(
         "%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"

@@ -7,33 +7,28 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from process_tasks import act
+from process_tasks import FAULTS, WHATS, act, soon
 
 from scopemap.runner.processes import ProcessLimits, run_in_processes, usable_cores
 
 
 def test_each_task_has_the_outcome_that_it_deserves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
-    whats = ["work", "die", "refuse", "hang", "work", "die once", "fault", "work"]
-    files = [tmp_path / f"{number}" for number in range(len(whats))]
+    files = [tmp_path / f"{number}" for number in range(len(WHATS))]
     started: list[int] = []
-    limits = ProcessLimits(2, seconds=8.0, retries=1)
-    found = dict(run_in_processes(act, list(zip(whats, files, strict=True)), limits, started.append))
-    assert sorted(found) == list(range(len(whats)))
-    faults = [found[number].fault for number in range(len(whats))]
-    killed = "its process was ended by SIGKILL (out of memory?)"
-    assert (faults[0], *faults[4:6], faults[7]) == ("", "", "", "")
-    assert faults[1:4] == [killed, "reading it: refused in two lines", "took longer than 8 s"]
-    assert faults[6] == "ZeroDivisionError: of its own"
+    limits = ProcessLimits(2, seconds=12.0, retries=1)
+    found = dict(run_in_processes(act, list(zip(WHATS, files, strict=True)), limits, started.append))
+    faults = [found[number].fault for number in range(len(WHATS))]
+    assert faults[1] == "its process was ended by SIGKILL (out of memory?)"
+    assert [*faults[:1], *faults[2:]] == [*FAULTS[:1], *FAULTS[2:]]
     attempts = [file.stat().st_size for file in files]
-    assert attempts == [1, 2, 1, 1, 1, 2, 2, 1] == [found[number].attempts for number in range(len(whats))]
+    assert attempts == [1, 2, 1, 1, 2, 2] == [found[number].attempts for number in range(len(WHATS))]
     assert len(started) == sum(attempts)
-    assert found[3].seconds == pytest.approx(8, abs=2)
+    assert found[3].seconds == pytest.approx(12, abs=3)
     assert found[0].value[1] == str(max(1, usable_cores() // 2))
     assert "NUMBA_NUM_THREADS" not in os.environ
     assert multiprocessing.active_children() == []
@@ -45,9 +40,8 @@ def test_a_process_does_one_task_after_the_other(tmp_path: Path) -> None:
 
 
 def test_processes_end_with_who_waits_for_them(tmp_path: Path) -> None:
-    with closing(
-        run_in_processes(act, [("work", tmp_path / "a"), ("hang", tmp_path / "b")], ProcessLimits(2))
-    ) as ended:
+    tasks = [("work", tmp_path / "a"), ("hang", tmp_path / "b")]
+    with closing(run_in_processes(act, tasks, ProcessLimits(2))) as ended:
         assert next(ended)[0] == 0
     assert multiprocessing.active_children() == []
 
@@ -62,23 +56,19 @@ def test_processes_end_where_their_parent_is_killed(tmp_path: Path) -> None:
     (tmp_path / "parent.py").write_text(code)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     parent = subprocess.Popen([sys.executable, tmp_path / "parent.py"], env=environment)
-    while not (tmp_path / "a").exists() and parent.poll() is None:
-        time.sleep(0.05)
+    assert soon(lambda: (tmp_path / "a").exists() or parent.poll() is not None)
     children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
     if not children.exists():
         parent.kill()
         pytest.skip("this system does not list the children of a process")
-    pids = [int(pid) for pid in children.read_text().split()]
+    pids = children.read_text().split()
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    until = time.monotonic() + 20
-    while (alive := [pid for pid in pids if _runs(pid)]) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert len(pids) >= 1
-    assert alive == []
+    assert pids
+    assert soon(lambda: not any(_runs(pid) for pid in pids))
 
 
-def _runs(pid: int) -> bool:
+def _runs(pid: str) -> bool:
     """Whether a process is there, and not only waiting to be asked for its end."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
