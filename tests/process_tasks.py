@@ -11,6 +11,7 @@ from pathlib import Path
 from scopemap.errors import InputError
 
 WHATS = ["work", "die", "refuse", "hang", "die once", "fault"]
+LIMIT_S = 12.0
 FAULTS = ["", "", "reading it: refused in two lines", "took longer than 12 s", "", "ZeroDivisionError: of its own"]
 """How they fail, with two attempts of 12 s; the second in the words of what runs it."""
 

@@ -17,6 +17,7 @@ from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
+from scopemap.depth.correspondence import DenseMatcher
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.scopenet.estimator import ScopeNetDepth
@@ -75,6 +76,13 @@ def test_the_first_and_the_last_frame_may_fail(
     _break(monkeypatch, FilesDepth, "estimate", {at}, RuntimeError("it broke"))
     reconstruct(open_sequence(folder), with_true_depth(folder), out=tmp_path / "out")
     assert _lost(tmp_path / "out") == {at: "depth failed: it broke"}
+
+
+def test_a_frame_without_flow_to_the_one_before_is_still_tracked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _break(monkeypatch, DenseMatcher, "match", {4}, RuntimeError("it broke"))
+    result = reconstruct(open_sequence(folder), Config())
+    assert result.provenance["tracked"] == FRAMES
+    assert "frame 4, flow failed: it broke" in warned(result.provenance)[0]
 
 
 def test_where_many_frames_fail_the_run_ends_with_the_reason(

@@ -100,10 +100,6 @@ def _half(data: bytes) -> bytes:
     return data[: len(data) // 2]
 
 
-def _empty(data: bytes) -> bytes:
-    return b""
-
-
 def _picture(damage: Callable[[bytes], bytes]) -> Alter:
     return lambda planted, at: planted.rgb_damage.update({at: damage})
 
@@ -157,14 +153,7 @@ def _later(step_s: float) -> Alter:
 FAULTS: dict[str, Fault] = {
     # pictures
     "a picture cut off": Fault(_picture(_half), UNREAD, _stored_alone, named=0),
-    "a text named as a picture": Fault(_picture(lambda data: b"text\n"), UNREAD, _stored_alone, named=0),
     "a stream cut off": Fault(_stream(_half), UNREAD, _streamed),
-    "a stream of zero bytes": Fault(_stream(_empty), UNREAD, _streamed),
-    "all pictures but one cut off": Fault(
-        lambda planted, at: planted.rgb_damage.update(dict.fromkeys(planted.numbers[1:], _half)),
-        ("frame-few", *UNREAD),
-        _stored_alone,
-    ),
     "one picture alone": Fault(
         lambda planted, at: [planted.rgb.pop(number) for number in planted.numbers[1:]], ("frame-few", "refused")
     ),
@@ -199,11 +188,7 @@ FAULTS: dict[str, Fault] = {
     "pixels that are not square": Fault(_camera(lambda c: replace(c, fy=1.3 * c.fx)), ("camera-aspect",)),
     # poses
     "a pose of NaN": Fault(_pose(lambda T: np.full((4, 4), np.nan)), NO_POSE, _posed, named=0),
-    "a pose that is no motion": Fault(_pose(lambda T: T @ np.diag([-1.0, 1, 1, 1])), NO_POSE, _posed, named=0),
     "a pose missing": Fault(lambda planted, at: planted.poses.pop(at), ("refused", "source", "pose-missing"), _posed),
-    "the poses cut off": Fault(
-        lambda planted, at: setattr(planted, "poses_damage", lambda data: data[: int(0.6 * len(data))]), NO_POSE, _posed
-    ),
     "a pose far away": Fault(_away, ("pose-jump",), _posed, named=0),
     "a pose turned": Fault(
         _pose(lambda T: T @ se3_exp(np.array([0, 0, 0.8, 0, 0, 0]))), ("pose-turn",), _posed, named=0
