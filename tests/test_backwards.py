@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,7 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.mapping import Mapper
-from scopemap.runner.backwards import _agree, _moved
+from scopemap.runner.backwards import _agree
 from scopemap.tracking.keyframe_alignment import Keyframe, KeyframeAligner
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track, TrackingLoss
@@ -58,6 +58,12 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
     return reconstruct(open_sequence(phantom), with_true_depth(phantom, **LIGHT | changes))
 
 
+def _rows(result: Reconstruction, folder: Path) -> list[dict[str, str]]:
+    result.save(folder)
+    with (folder / "frames.csv").open(newline="", encoding="utf-8") as table:
+        return list(csv.DictReader(table))
+
+
 def _off(result: Reconstruction, phantom: Path, frames: range) -> tuple[float, float]:
     true, found = true_poses(phantom, frames[0]), result.trajectory.T_world_camera
     off = [inverse(true[k]) @ inverse(found[frames[0]]) @ found[k] for k in frames]
@@ -65,38 +71,39 @@ def _off(result: Reconstruction, phantom: Path, frames: range) -> tuple[float, f
     return turn, max(float(np.linalg.norm(T[:3, 3])) for T in off)
 
 
-def test_a_map_that_leads_back_to_an_earlier_one_joins_it(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_that_leads_back_to_an_earlier_one_joins_it(
+    phantom: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = _run(phantom, monkeypatch)
-    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (FRAMES - 1)
-    assert {record.map for record in result.records} == {0}
-    assert [result.records[k].track.reason for k in LOST] == ["tracked backwards"] * len(LOST)
-    assert result.records[LOST.stop].track.reason == "relocalised"
+    assert result.trajectory.status.tolist() == ["initial"] + ["ok"] * (FRAMES - 1)
+    rows = _rows(result, tmp_path)
+    assert {row["map"] for row in rows} == {"0"}
+    assert [rows[k]["reason"] for k in LOST] == ["tracked backwards"] * len(LOST)
+    assert rows[LOST.stop]["reason"] == "relocalised"
     turn, way_mm = _off(result, phantom, range(FRAMES))
     assert turn < np.radians(1.0)
     assert way_mm < 0.5
 
 
-def test_lost_frames_are_tracked_backwards_in_a_map_of_its_own(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_frames_are_tracked_backwards_in_a_map_of_its_own(
+    phantom: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = _run(phantom, monkeypatch, twice=range(LOST.start), mapping__min_loop_inliers=0)
     # The earlier frames are never found from the later ones: two maps, the larger with the lost frames.
-    assert [record.track.status for record in result.records] == ["other-map"] * LOST.start + ["ok"] * len(LOST) + [
-        "ok"
-    ] * (FRAMES - LOST.stop)
-    assert result.records[LOST.stop].track.reason == "new map"
+    assert result.trajectory.status.tolist() == ["other-map"] * LOST.start + ["ok"] * (FRAMES - LOST.start)
+    assert _rows(result, tmp_path)[LOST.stop]["reason"] == "new map"
     np.testing.assert_allclose(result.trajectory.T_world_camera[LOST.start], np.eye(4), atol=1e-9)
     turn, way_mm = _off(result, phantom, range(LOST.start, FRAMES))
     assert turn < np.radians(1.0)
     assert way_mm < 0.5
 
 
-@pytest.mark.parametrize(
-    "changes", [{"tracking__relocalisation_keyframes": 0}, {"mapping__method": "none"}, {"smoothing__method": "wema"}]
-)
+@pytest.mark.parametrize("changes", [{"tracking__relocalisation_keyframes": 0}, {"smoothing__method": "wema"}])
 def test_nothing_goes_back_where_it_is_not_wanted(
     phantom: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
 ) -> None:
     result = _run(phantom, monkeypatch, **changes)
-    assert [result.records[k].track.status for k in LOST] == ["lost"] * len(LOST)
+    assert [result.trajectory.status[k] for k in LOST] == ["lost"] * len(LOST)
 
 
 def test_motions_that_differ_join_nothing() -> None:
@@ -107,25 +114,3 @@ def test_motions_that_differ_join_nothing() -> None:
     assert not _agree([here, turned, here], 50.0)
     assert not _agree([here, here, moved], 50.0)
     assert _agree([here, here, moved], 60.0)
-
-
-def test_a_joined_map_takes_the_earlier_number_and_world(phantom: Path) -> None:
-    T = np.eye(4)
-    T[0, 3] = 7.0
-    config = with_true_depth(phantom)
-    mapper = Mapper(config.mapping, _NoFlow())
-    tracks = [Track(0, "initial", "", np.eye(4), 0), Track(1, "lost", "", np.eye(4), 0)]
-    tracks += [Track(2, "initial", "new map", np.eye(4), 2, map=1), Track(3, "ok", "", T, 2, map=1)]
-    for track in tracks:
-        mapper.observe(track)
-    mapper.join(tracks[2], tracks[0], T)
-    moved = [_moved(track, tracks[2], tracks[0], T) for track in tracks]
-    assert [track.map for track in moved] == [0, 0, 0, 0]
-    assert [track.status for track in moved] == ["initial", "lost", "ok", "ok"]
-    assert moved[3].T_world_camera[0, 3] == 14.0
-    (submap,), _ = mapper.submaps()
-    assert submap.frames == {0, 2, 3}
-
-
-class _NoFlow:
-    name = "none"

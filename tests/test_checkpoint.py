@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from scopemap.config import TrackingSettings
 from scopemap.errors import InputError
 from scopemap.flow.dis import DisFlow
-from scopemap.fusion.tsdf import VoxelBlocks
 from scopemap.io.checkpoint import SavedState
 from scopemap.tracking.track import Track
 
@@ -99,30 +98,6 @@ def test_own_objects_come_back_shared_and_keep_what_is_not_stored(tmp_path: Path
     assert found["foreign"] == _Foreign(2)
 
 
-def test_a_volume_grows_after_it_came_back(tmp_path: Path) -> None:
-    blocks, more = VoxelBlocks(), np.arange(2 * len(VoxelBlocks().voxels.weight))
-    blocks.slots(more[:5])
-    found = _through(tmp_path / "state", blocks, VoxelBlocks())
-    assert found.slots(more).tolist() == blocks.slots(more).tolist()
-    assert _same(tuple(found.voxels), tuple(blocks.voxels))
-
-
-def test_what_is_not_committed_does_not_count(tmp_path: Path) -> None:
-    file = tmp_path / "state"
-    assert _through(file, {"frame": 1}) == {"frame": 1}
-    broken = SavedState(file)
-    broken.put("part", {"frame": 2})
-    broken.close()
-    assert SavedState(file).restore("part", None) == {"frame": 1}
-
-
-def test_arrays_that_are_no_longer_held_are_deleted(tmp_path: Path) -> None:
-    file = tmp_path / "state"
-    for seed in range(8):
-        _through(file, np.random.default_rng(seed).normal(size=50_000))
-    assert file.stat().st_size < 2.5 * 8 * 50_000
-
-
 def test_no_class_but_scopemaps_is_made(tmp_path: Path) -> None:
     file = tmp_path / "state"
     _through(file, Track(3, "ok", "", np.eye(4), 1))
@@ -158,16 +133,3 @@ def test_a_checkpoint_cut_anywhere_is_refused_or_whole(tmp_path: Path) -> None:
         except InputError:
             refused += 1
     assert refused > 0.9 * len(content) / 64
-
-
-def test_a_changed_byte_is_found(tmp_path: Path) -> None:
-    rng = np.random.default_rng(4)
-    value = rng.normal(size=(30, 30))
-    _through(tmp_path / "whole", value)
-    content = bytearray((tmp_path / "whole").read_bytes())
-    place = bytes(content).find(value.tobytes()[:200])
-    assert place > 0
-    content[place + 100] ^= 1
-    (tmp_path / "changed").write_bytes(content)
-    with pytest.raises(InputError, match="damaged"):
-        SavedState(tmp_path / "changed").restore("part", None)

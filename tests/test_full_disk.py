@@ -30,9 +30,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="files are limited as on POSIX systems")
-@pytest.mark.parametrize("most_bytes", [10, 10_000, 200_000, 2_000_000])
+@pytest.mark.parametrize("most_bytes", [10, 200_000])
 def test_a_disk_that_is_full_is_one_sentence_and_nothing_is_left(most_bytes: int, folder: Path, tmp_path: Path) -> None:
-    """As a limit on the size of files: of the lock, a picture, the stored frames, the mesh."""
+    """As a limit on the size of files: of the lock, of the stored frames."""
     ask = ("run", folder, "--out", tmp_path / "out", "--depth", f"files:{folder}", "--quiet")
     command = [sys.executable, "-c", _LIMITED, str(most_bytes), *map(str, ask)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)

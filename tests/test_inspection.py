@@ -36,7 +36,7 @@ from hypothesis import strategies as st
 from scopemap.errors import InputError
 from scopemap.inspection.clip import VideoFinding, covered, segments_of
 from scopemap.inspection.inspecting import Inspection, inspect
-from scopemap.inspection.picture import write_mask
+from scopemap.inspection.inspection_sheet import write_mask
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles
 
@@ -62,61 +62,36 @@ def beside(number: int, _: np.ndarray) -> np.ndarray:
     return np.hstack([wide[:, 8:], wide[:, :-8]])
 
 
-CHANGES: dict[str, tuple[Change, ...]] = {
-    "clean": (),
-    "circle": (inside(circle),),
-    "octagon": (inside(octagon),),
-    "rounded": (inside(rounded),),
-    "bars": (inside(bars),),
-    "drifting": (drifting,),
-    "text": (text(),),
-    "text in circle": (inside(circle), text(at=(110, 60)), text("ID 7", (2, 20))),
-    "inset": (inset,),
-    "blur": (during(15, 24, blurred),),
-    "black": (during(0, 9, black),),
-    "drape": (during(38, 49, drape),),
-    "interlaced": (combed,),
-    "stereo": (beside,),
-}
-Inspect = Callable[[str], Inspection]
-
-
-@pytest.fixture(scope="module")
-def inspected(tmp_path_factory: pytest.TempPathFactory) -> Inspect:
-    """The inspection of a made-up video, each once."""
-    known: dict[str, Inspection] = {}
-    folder = tmp_path_factory.mktemp("clips")
-
-    def one(name: str) -> Inspection:
-        if name not in known:
-            count = 75 if name == "drifting" else COUNT
-            known[name] = inspect(write(folder / f"{name}.mp4", clip(count, *CHANGES[name])))
-        return known[name]
-
-    return one
+def inspected(folder: Path, *changes: Change, count: int = COUNT) -> Inspection:
+    """The inspection of a made-up video."""
+    return inspect(write(folder / "video.mp4", clip(count, *changes)))
 
 
 def by_code(inspection: Inspection) -> dict[str, VideoFinding]:
     return {finding.code: finding for finding in inspection.findings}
 
 
-def test_nothing_is_found_in_a_clean_video(inspected: Inspect) -> None:
-    found = inspected("clean")
+def test_nothing_is_found_in_a_clean_video(tmp_path: Path) -> None:
+    found = inspected(tmp_path)
     assert found.findings == ()
     assert (found.overlays, found.insets, found.packed, found.field.shape) == ((), (), None, "full")
     assert (found.facts["codec"], found.facts["bits"], found.facts["pictures"]) == ("mpeg4", 8, COUNT)
     assert found.facts["usual_rate_hz"] == pytest.approx(25)
+    assert found.forecast == "good: nothing in its motion, sharpness and texture endangers a reconstruction"
+    assert not write_mask(found, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    every_tenth = inspect(found.path, frames=slice(None, None, 10))
+    assert every_tenth.forecast.startswith("of one frame in 10: ")
 
 
 @pytest.mark.parametrize(
-    ("name", "shape", "draw"),
-    [("circle", "circle", circle), ("octagon", "cut corners", octagon), ("rounded", "rounded corners", rounded),
-     ("bars", "bars", bars)],
-)  # fmt: skip
-def test_the_field_of_view_is_told_with_its_outline(
-    inspected: Inspect, name: str, shape: str, draw: Callable[[np.ndarray], None]
+    ("shape", "draw"),
+    [("circle", circle), ("cut corners", octagon), ("rounded corners", rounded), ("bars", bars)],
+)
+def test_the_field_of_view_is_reported_with_its_outline(
+    tmp_path: Path, shape: str, draw: Callable[[np.ndarray], None]
 ) -> None:
-    found = inspected(name)
+    found = inspected(tmp_path, inside(draw))
     assert list(by_code(found)) == [f"field-{shape.replace(' ', '-')}"]
     assert (found.field.shape, found.findings[0].severity) == (shape, "info")
     truth, drawn = np.zeros(SIZE[::-1], np.uint8), np.zeros(SIZE[::-1], np.uint8)
@@ -126,28 +101,27 @@ def test_the_field_of_view_is_told_with_its_outline(
     assert found.field.share == pytest.approx(truth.mean(), abs=0.03)
 
 
-def test_a_field_that_moves_is_told(inspected: Inspect) -> None:
-    found = by_code(inspected("drifting"))
-    assert set(found) == {"field-circle", "field-moves"}
-    assert inspected("drifting").field.moved == pytest.approx(28 / SIZE[0], abs=0.02)
+def test_a_field_that_moves_is_reported(tmp_path: Path) -> None:
+    found = inspected(tmp_path, drifting, count=75)
+    assert set(by_code(found)) == {"field-circle", "field-moves"}
+    assert found.field.moved == pytest.approx(28 / SIZE[0], abs=0.02)
 
 
-def test_text_over_tissue_and_beside_it(inspected: Inspect) -> None:
-    alone = inspected("text")
+def test_text_over_tissue_and_beside_it(tmp_path: Path) -> None:
+    alone = inspected(tmp_path, text())
     assert set(by_code(alone)) == {"overlay", "overlay-privacy"}
     (overlay,) = alone.overlays
     assert overlay.in_field
     left, top, right, bottom = np.array(overlay.box) * [*SIZE, *SIZE]
     assert 80 < left < 95 < 180 < right < 195
     assert 42 < top < 52 < 58 < bottom < 68
-    both = inspected("text in circle")
+    both = inspected(tmp_path, inside(circle), text(at=(110, 60)), text("ID 7", (2, 20)))
     assert set(by_code(both)) == {"field-circle", "overlay", "overlay-outside", "overlay-privacy"}
     assert sorted(one.in_field for one in both.overlays) == [False, True]
-    assert "--set mask.files=" in by_code(both)["overlay"].advice
 
 
-def test_a_picture_in_the_picture_is_found_and_its_masks_are_read_by_runs(inspected: Inspect, tmp_path: Path) -> None:
-    found = inspected("inset")
+def test_a_picture_in_the_picture_is_found_and_its_mask_is_read_by_runs(tmp_path: Path) -> None:
+    found = inspected(tmp_path, inset)
     assert set(by_code(found)) == {"inset"}
     (box,) = found.insets
     assert np.array(box) * [*SIZE, *SIZE] == pytest.approx([220, 0, 320, 80], abs=3)
@@ -157,18 +131,16 @@ def test_a_picture_in_the_picture_is_found_and_its_masks_are_read_by_runs(inspec
     assert mask[:76, 224:].all()
     assert not mask[90:].any()
     assert not mask[:, :210].any()
-    assert not write_mask(inspected("clean"), tmp_path / "none")
-    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "segment", "advice"),
-    [("blur", "blurred", (15, 24), "the longest part without them: --frames 25:"),
-     ("black", "black", (0, 9), "leave them out with --frames 10:"),
-     ("drape", "not-tissue", (38, 49), "leave them out with --frames :38")],
+    ("change", "code", "segment", "advice"),
+    [(blurred, "blurred", (15, 24), "the longest part without them: --frames 25:"),
+     (black, "black", (0, 9), "leave them out with --frames 10:"),
+     (drape, "not-tissue", (38, 49), "leave them out with --frames :38")],
 )  # fmt: skip
-def test_segments_of_no_use(inspected: Inspect, name: str, code: str, segment: tuple[int, int], advice: str) -> None:
-    found = by_code(inspected(name))
+def test_segments_of_no_use(tmp_path: Path, change: Change, code: str, segment: tuple[int, int], advice: str) -> None:
+    found = by_code(inspected(tmp_path, during(*segment, change)))
     assert set(found) - {"cut"} == {code}
     (first, last), *others = found[code].segments
     assert not others
@@ -176,11 +148,17 @@ def test_segments_of_no_use(inspected: Inspect, name: str, code: str, segment: t
     assert found[code].advice.endswith(advice)
 
 
-def test_interlaced_and_stereo_pictures_name_their_option(inspected: Inspect) -> None:
-    assert by_code(inspected("interlaced"))["interlaced"].advice == "--deinterlace"
-    stereo = inspected("stereo")
-    assert by_code(stereo)["stereo"].advice == "--stereo left-right"
-    assert stereo.packed is not None
+def test_fields_and_two_views_are_found_and_the_camera_may_be_that_of_one(tmp_path: Path) -> None:
+    assert by_code(inspected(tmp_path, combed))["interlaced"].advice == "--deinterlace"
+    found, camera = inspected(tmp_path, beside), tmp_path / "camera.yaml"
+    assert by_code(found)["stereo"].advice == "--stereo left-right"
+    camera.write_text(
+        "%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+        "   cols: 3\n   dt: d\n   data: [300.,0.,159.5,0.,300.,119.5,0.,0.,1.]\n"
+    )
+    of_one = inspect(found.path, camera=camera)
+    assert of_one.size == SIZE
+    assert of_one.packed is not None
 
 
 def test_freezes_and_duplicates(tmp_path: Path) -> None:
@@ -206,29 +184,33 @@ def test_holes_and_an_uneven_rate_of_time_stamps(tmp_path: Path) -> None:
     assert set(by_code(inspect(write(tmp_path / "uneven.mp4", pictures, uneven)))) == {"rate-variable"}
 
 
+def images(folder: Path, pictures: list[np.ndarray], number: Callable[[int], int] = int) -> Path:
+    folder.mkdir()
+    for place, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number(place):03d}.png"), picture[..., ::-1])
+    return folder
+
+
 def test_a_folder_of_images(tmp_path: Path) -> None:
-    for number, picture in enumerate(clip(30)):
-        cv2.imwrite(str(tmp_path / f"{number + 5 * (number > 14):03d}.png"), picture[..., ::-1])
-    found = inspect(tmp_path)
+    found = inspect(images(tmp_path / "in", clip(30), lambda place: place + 5 * (place > 14)))
     assert set(by_code(found)) == {"frames-dropped"}
     assert "numbers in the names" in found.findings[0].message
     assert found.container is None
 
 
 def test_positions_count_unreadable_images_as_frames_does(tmp_path: Path) -> None:
-    for number, picture in enumerate(clip(40, during(25, 39, drape))):
-        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), picture[..., ::-1])
+    folder = images(tmp_path / "in", clip(40, during(25, 39, drape)))
     for number in range(3, 9):
-        (tmp_path / f"{number:03d}.png").write_bytes(b"")
-    inspection = inspect(tmp_path)
+        (folder / f"{number:03d}.png").write_bytes(b"")
+    inspection = inspect(folder)
     found = by_code(inspection)
     assert set(found) == {"source", "not-tissue", "cut"}
     assert found["not-tissue"].segments == ((25, 39),)
     assert found["not-tissue"].advice.endswith("--frames :25")
     assert [view.measures.position for view in inspection.samples][-1] > 30
-    told = [finding.message for finding in inspection.findings if finding.code == "source"]
-    assert (len(told), told[-1]) == (4, "and 3 more warnings of the reader")
-    part = by_code(inspect(tmp_path, frames=slice(10, None, 2)))["not-tissue"]
+    messages = [finding.message for finding in inspection.findings if finding.code == "source"]
+    assert (len(messages), messages[-1]) == (4, "and 3 more warnings of the reader")
+    part = by_code(inspect(folder, frames=slice(10, None, 2)))["not-tissue"]
     assert part.segments == ((26, 38),)
     assert part.advice.endswith("--frames 10:26:2")
 
@@ -240,46 +222,60 @@ def test_time_stamps_of_bags_and_dicom_are_their_own(tmp_path: Path) -> None:
         bag.image(IMAGE, number + (8 if number > 15 else 0), picture, "rgb8")
     found = inspect(bag.write_bag1(tmp_path / "hole.bag"))
     assert "time stamps leave 1 hole(s), about 8" in by_code(found)["frames-dropped"].message
-    assert found.container is None
     pytest.importorskip("pydicom")
     video = inspect(write_dicom_video(tmp_path / "video"))
     assert video.container is not None
     assert video.container["width"] == video.size[0]
 
 
-def test_the_camera_may_be_that_of_one_of_two_views(tmp_path: Path) -> None:
-    video, camera = write(tmp_path / "both.mp4", clip(12, beside)), tmp_path / "camera.yaml"
-    camera.write_text(
-        "%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
-        "   cols: 3\n   dt: d\n   data: [300.,0.,159.5,0.,300.,119.5,0.,0.,1.]\n"
-    )
-    found = inspect(video, camera=camera)
-    assert found.size == SIZE
-    assert open_sequence(video, camera=camera).source.width == SIZE[0]
-    assert found.packed is not None
-
-
-def test_what_breaks_off_is_said_and_what_is_no_video_refused(tmp_path: Path) -> None:
+def test_what_breaks_off_is_reported_and_what_is_no_video_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "whole.avi", clip(COUNT))
     broken = tmp_path / "broken.avi"
     broken.write_bytes(file.read_bytes()[: 2 * file.stat().st_size // 3])
-    found = by_code(inspect(broken))
-    assert "breaks off" in found["source"].message
+    assert "breaks off" in by_code(inspect(broken))["source"].message
     (tmp_path / "no.mp4").write_bytes(b"no video")
     for path in (tmp_path / "no.mp4", tmp_path / "absent.mp4"):
         with pytest.raises(InputError):
             inspect(path)
 
 
-@pytest.mark.parametrize("name", ["circle", "blur", "black", "drape", "interlaced"])
-def test_an_overlay_changes_no_other_finding(inspected: Inspect, tmp_path: Path, name: str) -> None:
-    at = np.random.default_rng(len(name)).integers((70, 100), (110, 180))
-    written = clip(COUNT, *CHANGES[name], text("DR. X 09:15", tuple(at.tolist())))
-    codes = {f.code: f.segments for f in inspect(write(tmp_path / "text.mp4", written)).findings}
-    without = {f.code: f.segments for f in inspected(name).findings if f.code != "cut"}
-    others = {code: where for code, where in codes.items() if not code.startswith(("overlay", "cut"))}
-    assert others == without
-    assert "overlay" in codes
+# ---- what endangers a run
+
+
+def moved(picture: np.ndarray, step_px: int, blur_px: Callable[[int], int] = lambda number: 1) -> list[np.ndarray]:
+    """40 views (240, 320, 3) of a picture (H, 2400, 3), each so many px beside the one before, there and back."""
+    places = [abs((step_px * number + 1800) % 3600 - 1800) for number in range(40)]
+    return [cv2.blur(picture[:240, x : x + 320], (blur_px(n),) * 2) for n, x in enumerate(places)]
+
+
+def mottled(seed: int) -> np.ndarray:
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(240, 2400)).astype(np.float32), (0, 0), 2.0)
+    level = 120 + 35 * noise / noise.std()
+    return np.clip(np.stack([level, 0.5 * level, 0.4 * level], -1), 20, 250).astype(np.uint8)
+
+
+def test_fast_motion_makes_a_poor_forecast(tmp_path: Path) -> None:
+    found = inspect(images(tmp_path / "in", moved(mottled(2), 97)))
+    assert {"motion-fast", "unlike"} & set(by_code(found))
+    assert found.forecast.startswith("poor: ")
+    assert "separate maps" in found.forecast
+
+
+def test_a_cut_is_found_where_it_is(tmp_path: Path) -> None:
+    found = inspect(images(tmp_path / "in", moved(mottled(3), 3)[:17] + moved(mottled(4), 3)[17:]))
+    cut = by_code(found)["cut"]
+    assert cut.segments == ((17, 17),)
+    assert cut.advice.endswith("--frames 18:")
+    assert found.forecast.startswith("fair: 1 frames are hard to track, 1 cut;")
+
+
+def test_soft_frames_and_missing_texture_are_reported(tmp_path: Path) -> None:
+    soft = inspect(images(tmp_path / "soft", moved(mottled(5), 3, lambda number: 9 if 10 <= number < 16 else 1)))
+    assert by_code(soft)["soft"].segments == ((10, 15),)
+    ramp = np.linspace(60, 200, 2400)[None, :, None] * np.array([1.0, 0.5, 0.4]) * np.ones((240, 1, 1))
+    bare = inspect(images(tmp_path / "bare", moved(ramp.astype(np.uint8), 3)))
+    assert "texture-low" in by_code(bare)
+    assert bare.forecast.startswith("poor: walls without texture")
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(0, 4))

@@ -5,14 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from scopemap.errors import InputError
-from scopemap.io.result_folder import UNFINISHED, result_folder
+from scopemap.io.result_folder import result_folder
 
 
 def _make(folder: Path, *, overwrite: bool = False) -> None:
@@ -27,13 +25,6 @@ def _fail(folder: Path, error: type[BaseException], *, overwrite: bool) -> None:
         (made / "depth").mkdir()
         (made / "provenance.json").write_text("half of it")
         raise error
-
-
-def test_a_new_folder_and_an_empty_one_are_taken(tmp_path: Path) -> None:
-    _make(tmp_path / "a" / "b")
-    assert [path.name for path in (tmp_path / "a" / "b").iterdir()] == ["provenance.json"]
-    (tmp_path / "empty").mkdir()
-    _make(tmp_path / "empty")
 
 
 def test_what_is_in_the_way_is_refused(tmp_path: Path) -> None:
@@ -114,15 +105,6 @@ def test_overwrite_takes_the_place_of_a_link_and_spares_what_it_leads_to(tmp_pat
     assert (disk / "000000.png").read_text() == "old"
 
 
-def test_what_a_killed_run_has_left_does_not_block_the_next(tmp_path: Path) -> None:
-    left = tmp_path / UNFINISHED
-    (left / "depth").mkdir(parents=True)
-    (left / "depth" / "000000.png").write_text("")
-    (left / "process").write_text("1 on another machine")
-    _make(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
-
-
 _HOLD = """
 import sys
 from scopemap.io.result_folder import result_folder
@@ -148,31 +130,6 @@ def test_a_folder_that_another_run_is_writing_is_refused_until_it_ends_or_is_kil
     assert [path.name for path in tmp_path.iterdir()] == ["provenance.json"]
 
 
-def test_two_threads_cannot_write_to_one_folder(tmp_path: Path) -> None:
-    with result_folder(tmp_path / "out", overwrite=False), pytest.raises(InputError, match="is writing one there"):
-        _make(tmp_path / "out")
-
-
-@pytest.mark.skipif(os.name != "posix", reason="files are locked on POSIX systems alone")
-def test_of_runs_that_start_at_once_one_writes(tmp_path: Path) -> None:
-    def attempt(number: int) -> str:
-        try:
-            with result_folder(tmp_path / "out", overwrite=True) as made:
-                assert made is not None
-                (made / "provenance.json").write_text(f"{number}")
-                starting.wait()
-        except InputError as error:
-            starting.wait()
-            return str(error)
-        return ""
-
-    starting = threading.Barrier(8)
-    with ThreadPoolExecutor(8) as threads:
-        said = list(threads.map(attempt, range(8)))
-    assert said.count("") == 1
-    assert (tmp_path / "out" / "provenance.json").read_text() == str(said.index(""))
-
-
 def test_overwrite_spares_a_folder_that_is_no_run(tmp_path: Path) -> None:
     """A data set too may hold `camera.yaml` and `depth/`: they are its owner's."""
     (tmp_path / "depth").mkdir()
@@ -182,14 +139,3 @@ def test_overwrite_spares_a_folder_that_is_no_run(tmp_path: Path) -> None:
         _make(tmp_path, overwrite=True)
     assert (tmp_path / "depth" / "0000.png").read_text() == "measured"
     assert (tmp_path / "camera.yaml").read_text() == "calibrated"
-
-
-def test_a_folder_that_cannot_be_looked_into_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: Path) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "iterdir", refuse)
-    with pytest.raises(InputError, match=r"cannot write a run to .*Permission denied"):
-        _make(tmp_path)
-    with pytest.raises(InputError, match=r"cannot write a run to .*File name too long"):
-        _make(tmp_path / ("x" * 300))

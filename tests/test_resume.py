@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -17,15 +16,12 @@ from tiny_phantom import FRAMES, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
 from scopemap.errors import InputError
-from scopemap.estimators import create_estimators
 from scopemap.io import result_folder
 from scopemap.io.checkpoint import CHECKPOINT
 from scopemap.io.result_folder import LOCK, UNFINISHED
 from scopemap.odometry import Step
-from scopemap.pipeline import Pipeline
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.runner.checkpoints import Checkpoints, check_resumable, discard_unfinished, identity_of
-from scopemap.runner.run import Clock, Run
+from scopemap.runner.checkpoints import check_resumable, discard_unfinished, identity_of
 
 # Seconds, and sums of files that hold some.
 _OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
@@ -110,42 +106,13 @@ def test_a_run_killed_after_the_last_frame_tracks_none_again(
     assert _bytes(out) == _bytes(wanted)
 
 
-def test_a_run_killed_while_it_is_put_in_place_is_put_there_again(
-    folder: Path, whole: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    preset, wanted = whole
-    out, real, undo_moves = tmp_path / "run", result_folder._move, result_folder._undo_moves
-    for most in (1, 4):
-        moved: list[str] = []
-
-        def move(names: list[str], source: Path, target: Path, most: int = most, moved: list[str] = moved) -> None:
-            for name in names:
-                if len(moved) == most:
-                    raise _Killed
-                real([name], source, target)
-                moved.append(name)
-
-        def undo(unfinished: Path, folder: Path, moved: list[str] = moved) -> None:
-            if not moved:  # a process that ends undoes nothing
-                undo_moves(unfinished, folder)
-
-        with monkeypatch.context() as patched:
-            patched.setattr(result_folder, "_move", move)
-            patched.setattr(result_folder, "_undo_moves", undo)
-            with pytest.raises(_Killed):
-                _run(folder, out, preset, overwrite=most == 4)
-    _run(folder, out, preset)
-    assert _bytes(out) == _bytes(wanted)
-
-
-def test_an_earlier_result_survives_a_kill_at_any_move(folder: Path, tmp_path: Path) -> None:
+def test_a_run_killed_at_any_move_into_its_place_is_put_there_again(folder: Path, tmp_path: Path) -> None:
+    """The earlier result is there again before the next run begins."""
     out = tmp_path / "run"
     _run(folder, out, "realtime")
-    before = _bytes(out)
-    unfinished = out / UNFINISHED
+    before, unfinished, real = _bytes(out), out / UNFINISHED, result_folder._move
     unfinished.mkdir()
     (unfinished / "mesh.ply").write_text("new")
-    real = result_folder._move
     for most in range(12):
         count = iter(range(most))
 
@@ -163,53 +130,8 @@ def test_an_earlier_result_survives_a_kill_at_any_move(folder: Path, tmp_path: P
         result_folder._undo_moves(unfinished, out)
         assert (unfinished / "mesh.ply").read_text() == "new"
         assert {name: content for name, content in _bytes(out).items() if UNFINISHED not in name} == before
-
-
-def test_a_run_killed_when_it_was_in_place_goes_on_from_nowhere(
-    folder: Path, whole: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    preset, wanted = whole
-    out = tmp_path / "run"
-
-    remove = shutil.rmtree
-
-    def kill(path: Path, **options: Any) -> None:
-        if path.name == UNFINISHED:
-            raise _Killed
-        remove(path, **options)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(result_folder.shutil, "rmtree", kill)
-        with pytest.raises(_Killed):
-            _run(folder, out, preset)
-    assert (out / UNFINISHED / LOCK).is_file()
-    _run(folder, out, preset, overwrite=True)
-    assert _bytes(out) == _bytes(wanted)
-
-
-def test_frames_that_fail_between_the_states_of_two_stages_are_counted(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sequence, config = open_sequence(folder), Config.load("realtime")
-    runs = [
-        Run(sequence, config, Pipeline(config, create_estimators(config, sequence)), Clock(), None, lambda *_: None)
-        for _ in range(2)
-    ]
-    pipeline, frame = runs[0].pipeline, next(sequence.frames())
-    checkpoints = Checkpoints(tmp_path, {}, runs[0])
-    estimated = pipeline.estimate(frame)
-    checkpoints.keep("preprocess")
-    monkeypatch.setattr(pipeline.matching._matcher, "match", lambda *_, **__: 1 / 0)
-    monkeypatch.setattr(pipeline.odometry._tracker, "track", lambda _: 1 / 0)
-    matched = pipeline.match(estimated)
-    checkpoints.keep("match")
-    pipeline.track(matched)
-    checkpoints.keep("track")
-    checkpoints.commit(frame.index)
-    checkpoints.close()
-    Checkpoints(tmp_path, {}, runs[1]).restore()
-    assert runs[1].pipeline.notices == pipeline.notices
-    assert (pipeline.notices[0].code, pipeline.notices[0].values["frames"]) == ("frames-failed", 2)
+    _run(folder, out, "realtime", overwrite=True)
+    assert _bytes(out) == before
 
 
 def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path: Path) -> None:
@@ -234,17 +156,16 @@ def test_another_input_and_no_resume_begin_anew(folder: Path, tmp_path: Path) ->
     assert _run(folder, out, "realtime", overwrite=True).provenance["resumed_after_frame"] is None
 
 
-@pytest.mark.parametrize("setting", ["mask.files", "depth.model", "depth.anchor_model"])
-def test_files_beside_the_input_are_part_of_a_run(setting: str, folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "own").mkdir()
-    file = tmp_path / "own" / "0001.png"
-    file.write_bytes(b"one")
-    config, sequence = Config.load(settings={setting: str(tmp_path / "own")}), open_sequence(folder)
-    before = identity_of(sequence, config)
-    assert identity_of(sequence, config) == before
-    file.write_bytes(b"two")
-    changed = {name for name, value in identity_of(sequence, config).items() if before[name] != value}
-    assert changed == {f"content of {setting}"}
+def test_files_beside_the_input_are_part_of_a_run(folder: Path, tmp_path: Path) -> None:
+    sequence, file = open_sequence(folder), tmp_path / "own" / "0001.png"
+    file.parent.mkdir()
+    for setting in ("mask.files", "depth.model", "depth.anchor_model"):
+        config = Config.load(settings={setting: str(file.parent)})
+        file.write_bytes(b"one")
+        before = identity_of(sequence, config)
+        file.write_bytes(b"two")
+        changed = {name for name, value in identity_of(sequence, config).items() if before[name] != value}
+        assert changed == {f"content of {setting}"}
 
 
 def test_an_input_that_changes_while_it_is_read_is_told(folder: Path, tmp_path: Path) -> None:
@@ -260,13 +181,6 @@ def test_an_input_that_changes_while_it_is_read_is_told(folder: Path, tmp_path: 
         assert kept == warned(result.provenance)
 
 
-def test_two_inputs_without_a_checksum_are_two(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.runner.checkpoints.input_checksum", lambda _: {"files": "more than 20000"})
-    inputs = [open_sequence(folder), open_sequence(write_tiny(tmp_path / "other"))]
-    one, other = (identity_of(sequence, Config()) for sequence in inputs)
-    assert one["input"] != other["input"]
-
-
 def test_a_damaged_checkpoint_is_one_sentence(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     _kill(folder, out, "realtime", 5)
@@ -279,19 +193,18 @@ def test_a_damaged_checkpoint_is_one_sentence(folder: Path, tmp_path: Path) -> N
     assert _run(folder, out, "realtime").provenance["resumed_after_frame"] is None
 
 
-def test_observers_go_on_and_no_file_of_the_run_is_left(folder: Path, tmp_path: Path) -> None:
-    out, pictures = tmp_path / "run", FramePictures()
+def test_observers_are_resumed_and_saved_with_the_result(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
     with pytest.raises(_Killed):
-        _run(folder, out, "realtime", observers=(pictures.observe, _killing(5)))
-    pictures = FramePictures()
-    _run(folder, out, "realtime", observers=(pictures.observe,))
-    pictures.save(out)
+        _run(folder, out, "realtime", observers=(FramePictures().observe, _killing(5)))
+    _run(folder, out, "realtime", observers=(FramePictures().observe,))
     assert len(list((out / "frames").glob("*_mask.png"))) == FRAMES
+    assert "frames/measures.csv" in (out / "SHA256SUMS").read_text()
     left = {CHECKPOINT, LOCK, "stored_frames", UNFINISHED, "replaced", "moving"}
     assert not left & {path.name for path in out.rglob("*")}
 
 
-def test_the_command_line_goes_on_and_says_so(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_command_resumes_and_reports_it(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     _kill(folder, out, "realtime", 4)
     ask = ("run", folder, "--out", out, "--preset", "realtime", "--resume")
@@ -299,8 +212,4 @@ def test_the_command_line_goes_on_and_says_so(folder: Path, tmp_path: Path, capf
     assert call(*ask) == 0
     said = capfd.readouterr()
     assert "resuming after" in said.err
-    found = re.search(r"time: ([\d.]+) s since it was resumed after frame (\d), ([\d.]+) frames/s", said.out)
-    assert found is not None
-    # Seconds are printed to a tenth: the rate is that of some time within it.
-    frames, seconds = FRAMES - 1 - int(found[2]), float(found[1])
-    assert frames / (seconds + 0.05) - 0.05 <= float(found[3]) <= frames / max(seconds - 0.05, 1e-9) + 0.05
+    assert "s since it was resumed after frame " in said.out

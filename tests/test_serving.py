@@ -22,7 +22,6 @@ from drawn_run import draw_run
 from front_door import refused
 
 from scopemap.errors import InputError
-from scopemap.report.page import full_page
 from scopemap.report.serving import LocalServer, live_page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -71,12 +70,10 @@ def test_pages_and_actions_answer(served: tuple[LocalServer, list[str]]) -> None
 @pytest.mark.parametrize(
     ("host", "origin"),
     [
-        ("evil.example", ""),
         ("evil.example:PORT", ""),
         ("localhost", ""),
         ("", "http://evil.example"),
         ("", "null"),
-        ("", "http://localhost:1"),
         ("", "https://localhost:PORT"),
     ],
 )
@@ -130,12 +127,6 @@ def test_the_live_page_shows_the_state_and_its_buttons_work(
         browser.close()
 
 
-def test_a_full_page_has_all_faces(tmp_path: Path) -> None:
-    page = full_page(draw_run(tmp_path))
-    assert f'"all_faces": {48 * 2 * 60 + 48}' in page
-    assert page.count('"faces"') >= 2
-
-
 def test_view_serves_a_runs_page(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run = draw_run(tmp_path / "run")
     command = [sys.executable, "-m", "scopemap", "view", str(run), "--no-browser"]
@@ -147,7 +138,7 @@ def test_view_serves_a_runs_page(tmp_path: Path, capfd: pytest.CaptureFixture[st
         assert process.stdout is not None
         url = next(word for word in process.stdout.readline().split() if word.startswith("http"))
         with urlopen(url, timeout=10) as answer:
-            assert b"all_faces" in answer.read()
+            assert f'"all_faces": {48 * 2 * 60 + 48}'.encode() in answer.read()
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
         timer.cancel()

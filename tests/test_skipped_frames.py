@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from drawn_videos import encode
-from front_door import said
+from front_door import call, said
 from tiny_phantom import only_images, write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cli.app import main
 from scopemap.config import Config
 from scopemap.io.frame_choice import FrameChoice
 from scopemap.io.source import SourceFrame
@@ -40,23 +38,16 @@ def video(pictures: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) 
     return encode(tmp_path_factory.mktemp("video") / "v.mp4", shown)
 
 
-def _run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["scopemap", *map(str, arguments)])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
-
-
 def _rows(out: Path) -> list[dict[str, str]]:
     with (out / "frames.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def test_skipped_frames_are_named_counted_and_have_no_pose(
-    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert _run(monkeypatch, "run", video, "--out", out, "--preset", "realtime") == 0
+    assert call("run", video, "--out", out, "--preset", "realtime") == 0
     rows = _rows(out)
     assert [int(row["index"]) for row in rows] == list(range(10))
     skipped = {int(row["index"]): row for row in rows if row["status"] == "skipped"}
@@ -65,32 +56,29 @@ def test_skipped_frames_are_named_counted_and_have_no_pose(
     assert float(skipped[3]["time_s"]) == pytest.approx(3 / 25)
     # Black is no repetition of anything: it is lost, with its own reason.
     assert rows[0]["status"] == "lost"
-    said = capfd.readouterr().out
-    assert "skipped: 2 frames, which repeat the one before" in said
+    assert "skipped: 2 frames, which repeat the one before" in capfd.readouterr().out
     facts = json.loads((out / "provenance.json").read_text())
     assert (facts["frames"], facts["skipped"]) == (8, {"repeated": 2})
     read = read_trajectory(out)
     assert read.indices.tolist() == [0, 1, 2, 4, 5, 6, 8, 9]
     assert not (out / "depth" / "000003.png").exists()
-    assert _run(monkeypatch, "evaluate", out, "--truth", out) == 0
+    assert call("evaluate", out, "--truth", out) == 0
 
 
-def test_options_choose_frames(video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_choose_frames(video: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert _run(monkeypatch, "run", video, "--out", out, "--fps", 12.5, *FAST) == 0
+    assert call("run", video, "--out", out, "--fps", 12.5, *FAST) == 0
     rows = _rows(out)
     used = [int(row["index"]) for row in rows if row["status"] != "skipped"]
     assert used == [0, 2, 4, 6, 8]
     assert {row["reason"] for row in rows if row["status"] == "skipped"} == {"beyond 12.5 frames/s"}
     assert Config.load(file=out / "config.toml").input.fps == 12.5
     other = tmp_path / "all"
-    assert _run(monkeypatch, "run", video, "--out", other, "--set", "input.skip_duplicates=false", *FAST) == 0
+    assert call("run", video, "--out", other, "--set", "input.skip_duplicates=false", *FAST) == 0
     assert "skipped" not in {row["status"] for row in _rows(other)}
 
 
-def test_stereo_and_fields_by_option(
-    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stereo_and_fields_by_option(pictures: list[np.ndarray], tmp_path: Path) -> None:
     height, width = pictures[0].shape[:2]
     stacked = encode(tmp_path / "v.mp4", [np.vstack([one, one[:, ::-1]]) for one in pictures])
     out = tmp_path / "out"
@@ -98,8 +86,8 @@ def test_stereo_and_fields_by_option(
     camera = PinholeCamera(1.6 * width, 1.6 * width, width, height, 2 * width, 2 * height)
     write_calibration(camera, tmp_path / "camera.yaml")
     arguments = ("--stereo", "top-bottom", "--deinterlace", "--camera", tmp_path / "camera.yaml", *FAST)
-    assert _run(monkeypatch, "run", stacked, "--out", out, *arguments) == 1
-    assert _run(monkeypatch, "run", stacked, "--out", out, *arguments, "--camera-fit", "scale") == 0
+    assert call("run", stacked, "--out", out, *arguments) == 1
+    assert call("run", stacked, "--out", out, *arguments, "--camera-fit", "scale") == 0
     facts = json.loads((out / "provenance.json").read_text())
     assert (facts["camera"]["width"], facts["camera"]["height"]) == (width, height)
     assert facts["camera"]["fx"] == pytest.approx(0.8 * width)
@@ -107,22 +95,6 @@ def test_stereo_and_fields_by_option(
     assert any(note.startswith("deinterlaced") for note in said(facts))
     read = Config.load(file=out / "config.toml").input
     assert (read.stereo, read.deinterlace, read.camera_fit) == ("top-bottom", True, "scale")
-
-
-def test_a_check_reads_as_it_is_told(
-    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    stacked = encode(tmp_path / "v.mp4", [np.vstack([one, one[:, ::-1]]) for one in pictures])
-    for setting in ("none", "top-bottom"):
-        assert _run(monkeypatch, "datasets", "check", stacked, "--set", f"input.stereo={setting}", "--json") == 0
-        notes = [finding["message"] for finding in json.loads(capfd.readouterr().out)["findings"]]
-        assert any(note.startswith("stereo, top-bottom") for note in notes) == (setting == "top-bottom")
-
-
-def test_the_published_method_takes_every_frame() -> None:
-    assert not Config.load("paper").input.skip_duplicates
-    assert Config.load("paper").input.focal == "auto"  # Depth Pro's
-    assert Config.load().input.skip_duplicates
 
 
 @pytest.mark.parametrize(("rate_hz", "fps", "step"), [(30, 30, 1), (30, 15, 2), (60, 60, 1), (25, 25, 1), (24, 12, 2)])

@@ -87,10 +87,9 @@ def run_clip(
         if step.frame.index in drawn:
             raw_mm[step.frame.index], refined_mm[step.frame.index] = step.raw_mm, np.asarray(step.frame.depth_mm)
 
-    pictures = FramePictures()
-    seen = (*observers, keep_depth, pictures.observe)
+    seen = (*observers, keep_depth, FramePictures().observe)
     result = reconstruct(sequence, config, out=out / "run", overwrite=True, observers=seen, progress=progress)
-    write_report(out / "run", pictures)
+    write_report(out / "run")
     return Demonstration(clip, sequence, result, raw_mm, refined_mm)
 
 

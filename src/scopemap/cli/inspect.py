@@ -47,7 +47,7 @@ def inspect(
     file = out or Path(f"{source.resolve().stem if source.is_file() else source.resolve().name}_inspection.png")
     _refuse(file, masks, overwrite)
     from scopemap.inspection.inspecting import inspect as inspection_of
-    from scopemap.inspection.picture import MASK_NAME, draw_inspection, write_mask
+    from scopemap.inspection.inspection_sheet import MASK_NAME, draw_inspection, write_mask
 
     with count_progress("inspecting", "inspected", silent=quiet or as_json) as listener:
         found = inspection_of(source, dataset=dataset, camera=camera, frames=frames, listener=listener)
@@ -67,7 +67,7 @@ def inspect(
 
 
 def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
-    from scopemap.inspection.picture import MASK_NAME
+    from scopemap.inspection.inspection_sheet import MASK_NAME
 
     check_output(file, (".png",), overwrite)
     if masks is None or not masks.exists():

@@ -20,7 +20,6 @@ from scopemap.cli.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
     from scopemap.odometry import Step
-    from scopemap.report.frame_pictures import FramePictures
     from scopemap.runner.live import LiveSession
     from scopemap.runner.reconstructor import Reconstructor
 
@@ -105,10 +104,13 @@ def live(
         result = finished(reconstructor, reading)
         if folder is not None:
             result.save(folder)
+            pictures.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     state = session.state()
     if out is not None:
-        _write_report(out, pictures)
+        from scopemap.report.page import write_report
+
+        write_report(out)
     if as_json:
         print_json(result.provenance | {"live": state | {"path": len(state["path"])}})
     elif not quiet:
@@ -206,12 +208,6 @@ def _line(state: dict[str, Any]) -> str:
     full = ", surface full" if state["full"] else ""
     drops = f"{state['dropped']} of {state['read']} frames dropped"
     return f"{state['words']}: {state['frames_per_s']} frames/s, {latency}, {drops}, map {state['map'] + 1}{full}"
-
-
-def _write_report(out: Path, pictures: FramePictures) -> None:
-    from scopemap.report.page import write_report
-
-    write_report(out, pictures)
 
 
 def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from scopemap.inspection.frame_measures import FrameMeasures
+from scopemap.io.frame_choice import LEAST_DIFFERENCE
 
 _NAMED = 4
 Severity = Literal["error", "warning", "info"]
@@ -38,11 +38,8 @@ class VideoFinding(Finding):
 def segments_of(flags: np.ndarray, least: int = 1, gap: int = 0) -> tuple[Segment, ...]:
     """Return where `flags` (N,) bool is True for `least` frames or more; up to `gap` False between two are bridged."""
     true = np.flatnonzero(flags)
-    if not true.size:
-        return ()
-    cuts = [0, *(i for i, (a, b) in enumerate(pairwise(true), start=1) if b - a > gap + 1), len(true)]
-    found = ((int(true[a]), int(true[b - 1])) for a, b in pairwise(cuts))
-    return tuple((first, last) for first, last in found if last - first + 1 >= least)
+    parts = np.split(true, np.flatnonzero(np.diff(true) > gap + 1) + 1) if true.size else []
+    return tuple((int(part[0]), int(part[-1])) for part in parts if part[-1] - part[0] + 1 >= least)
 
 
 def covered(segments: Sequence[Segment], count: int) -> np.ndarray:
@@ -51,12 +48,6 @@ def covered(segments: Sequence[Segment], count: int) -> np.ndarray:
     for first, last in segments:
         flags[first : last + 1] = True
     return flags
-
-
-def worded(segments: Sequence[Segment]) -> str:
-    """Return the segments in words, those after the fourth counted."""
-    named = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in segments[:_NAMED])
-    return named + (f" and {len(segments) - _NAMED} more" if len(segments) > _NAMED else "")
 
 
 @dataclass(frozen=True)
@@ -75,11 +66,6 @@ class Clip:
         return np.array([getattr(measures, name) for measures in self.measures])
 
     @property
-    def is_whole(self) -> bool:
-        """Whether all of the video was to be read."""
-        return (self.selection.start or 0, self.selection.stop, self.step) == (0, None, 1)
-
-    @property
     def step(self) -> int:
         """From one position that was read to the next."""
         return int(self.selection.step or 1)
@@ -96,20 +82,32 @@ class Clip:
         usual_s = float(np.median(steps_s)) if steps_s.size else 0.0
         return 1 / usual_s if usual_s > 0 else 0.0
 
+    @property
+    def repeats(self) -> np.ndarray:
+        """Which frames repeat the last one that was no repeat, (N,) bool; blank frames repeat nothing."""
+        return (self["change"] < LEAST_DIFFERENCE) & ~self["blank"]
+
     def segments(self, flags: np.ndarray, seconds: float, least: int, gap: int = 0) -> tuple[Segment, ...]:
         """Return the segments of `flags` (N,) bool that last `seconds` and have at least `least` frames."""
         return segments_of(flags, max(least, round(seconds * self.rate_hz / self.step)), gap)
 
-    def positions(self, segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
-        """Return segments of the frames that were read as segments of positions in the video."""
-        return tuple((self.measures[a].position, self.measures[b].position) for a, b in segments)
+    def finding(
+        self, severity: Severity, code: str, message: str, segments: tuple[Segment, ...], advice: str = ""
+    ) -> VideoFinding:
+        """Return a finding about segments of the frames that were read.
 
-    def counted(self, segments: tuple[Segment, ...]) -> str:
-        """Return the number of frames in segments of the frames that were read, and their positions, in words."""
+        In `message` "{frames}" stands for their number and positions, "{positions}" for the positions alone. In
+        `advice` "{selection}" stands for the option that leaves them out.
+        """
+        places = tuple((self.measures[a].position, self.measures[b].position) for a, b in segments)
+        named = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in places[:_NAMED])
+        named += f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
         count = sum(last - first + 1 for first, last in segments)
-        return f"{count} frame{'s' * (count != 1)} ({worded(self.positions(segments))})"
+        message = message.replace("{frames}", f"{count} frame{'s' * (count != 1)} ({named})")
+        message = message.replace("{positions}", named)
+        return VideoFinding(severity, code, message, advice.replace("{selection}", self._selecting(segments)), places)
 
-    def selecting(self, segments: tuple[Segment, ...]) -> str:
+    def _selecting(self, segments: tuple[Segment, ...]) -> str:
         """Return the option that leaves out segments of the frames that were read, in words; "" if nothing is left."""
         parts = segments_of(~covered(segments, len(self)))
         if not parts:

@@ -50,14 +50,16 @@ def read_container(media: str) -> dict[str, Any] | None:
 
 def check_container(facts: dict[str, Any]) -> Iterator[VideoFinding]:
     """Yield what in the header is unusual."""
-    if abs(facts["pixel_aspect"] - 1) > 1e-3:
-        message = f"pixels are {facts['pixel_aspect']:.4g} times as wide as high; runs reckon with it"
-        yield VideoFinding("info", "pixel-aspect", message)
-    if facts["bits"] > 8:
-        yield VideoFinding("info", "bit-depth", f"{facts['bits']} bits per channel; runs work on 8")
-    if facts["rotation_deg"]:
-        message = f"players turn the picture by {facts['rotation_deg']} deg"
-        yield VideoFinding("info", "rotation", f"{message}; a calibration must fit the picture that runs see")
+    aspect, rotation, bits = facts["pixel_aspect"], facts["rotation_deg"], facts["bits"]
+    if abs(aspect - 1) > 1e-3:
+        yield VideoFinding(
+            "info", "pixel-aspect", f"pixels are {aspect:.4g} times as wide as high; runs reckon with it"
+        )
+    if bits > 8:
+        yield VideoFinding("info", "bit-depth", f"{bits} bits per channel; runs work on 8")
+    if rotation:
+        message = f"players turn the picture by {rotation} deg; a calibration must fit the picture that runs see"
+        yield VideoFinding("info", "rotation", message)
     if facts["interlaced"]:
         message = "the header says that the pictures are interlaced"
         yield VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too")

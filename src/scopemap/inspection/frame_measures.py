@@ -10,13 +10,10 @@ import numpy as np
 from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant
 from scopemap.io.frame_choice import LEAST_DIFFERENCE, mean_difference
-from scopemap.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, is_lit, specular
+from scopemap.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, darker_channels, is_lit, specular
 from scopemap.tracking.sharpness import sharpness
 
-SMALL_PX = 320
-"""Longer side of the small copies."""
-
-_FLOW_PX = 160
+_SMALL_PX, _FLOW_PX = 320, 160
 _MASK = MaskSettings()
 # A frame with a smaller lit share is blank: text on black shows no tissue.
 _LEAST_LIT = 0.05
@@ -26,19 +23,15 @@ _LEAST_LIT = 0.05
 class FrameMeasures:
     """Measures of one frame.
 
-    Attributes
-    ----------
-    position : in the input, from 0, as `--frames` counts. index, time_s : from the reader.
-    blank : whether it shows next to nothing that is not black. brightness : mean level in the field, 0-255.
-    detail : the tracker's sharpness. change : mean difference from the last frame that was no repeat, grey levels.
-    motion : median flow since the frame before, share of the width. likeness : correlation with the frame before,
-        moved by that flow, -1 to 1; 1 for the first frame.
-    redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the field.
-    usable : share of the frame that a run would use.
+    position : in the input, from 0, as `--frames` counts. time_s : from the reader. blank : whether it shows next to
+    nothing that is not black. brightness : mean level in the field, 0-255. detail : the tracker's sharpness.
+    change : mean difference from the last frame that was no repeat, grey levels. motion : median flow since the frame
+    before, share of the width. likeness : correlation with the frame before, moved by that flow, -1 to 1; 1 for the
+    first frame. redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the
+    field. usable : share of the frame that a run would use.
     """
 
     position: int
-    index: int
     time_s: float
     blank: bool
     brightness: float
@@ -57,11 +50,9 @@ class FrameMeasures:
 class InspectedFrame:
     """One frame of the video.
 
-    Attributes
-    ----------
-    rgb : (H, W, 3) uint8 as in the video. small : (h, w, 3) uint8, its longer side at most 320 px.
-    lit : (h, w) bool, which pixels are not black. field : (h, w) bool, field of view as known so far.
-    frame : as a run sees it, rectified and masked. measures : of it.
+    rgb : (H, W, 3) uint8 as in the video. small : (h, w, 3) uint8, its longer side at most 320 px. lit : (h, w) bool,
+    which pixels are not black. field : (h, w) bool, field of view as known so far. frame : as a run sees it, rectified
+    and masked. measures : of it.
     """
 
     rgb: np.ndarray
@@ -83,34 +74,27 @@ class FrameInspector:
 
     def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
         """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
-        small = smaller(rgb, SMALL_PX)
+        small = smaller(rgb, _SMALL_PX)
         lit = is_lit(small, _MASK.advanced.dark_level)
-        field = self._field(lit, np.ones_like(lit))
-        masked = self._masker(frame)
+        field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
         inside = field if field.any() else np.ones_like(field)
-        count, mask = np.count_nonzero(inside), inside.astype(np.uint8)
-        red, green, blue = cv2.split(small)
-        low, high = cv2.min(red, green), cv2.max(red, green)
-        middle = cv2.max(low, cv2.min(high, blue))
+        darkest, middle = darker_channels(small)
         clipped = (middle >= BRIGHT_LEVEL) & inside
-        means = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
-        lit_share = np.count_nonzero(lit & inside) / count
-        highlights = specular(cv2.min(low, blue), inside) & inside
+        red, green, blue, _ = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
         motion, likeness = self._motion(small)
         measures = FrameMeasures(
             position=position,
-            index=masked.index,
             time_s=masked.time_s,
-            blank=bool(is_constant(small) or lit_share < _LEAST_LIT),
-            brightness=sum(cv2.mean(small, mask)[:3]) / 3,
+            blank=bool(is_constant(small) or lit[inside].mean() < _LEAST_LIT),
+            brightness=sum(cv2.mean(small, inside.astype(np.uint8))[:3]) / 3,
             detail=sharpness(masked.rgb, masked.valid),
             change=self._change(rgb, small),
             motion=motion,
             likeness=likeness,
-            redness=means[0] / max(means[1], means[2], 1.0),
-            clipped=np.count_nonzero(clipped) / count,
-            dark=1 - lit_share,
-            highlights=np.count_nonzero(highlights) / count,
+            redness=red / max(green, blue, 1.0),
+            clipped=float(clipped[inside].mean()),
+            dark=1 - float(lit[inside].mean()),
+            highlights=float(specular(darkest, inside)[inside].mean()),
             usable=float(masked.valid.mean()),
         )
         return InspectedFrame(rgb, small, lit, field, masked, measures)
@@ -133,13 +117,12 @@ class FrameInspector:
         if before is None:
             return 0.0, 1.0
         flow = self._flow.calc(before, grey, np.zeros((*grey.shape, 2), np.float32))
-        height, width = grey.shape
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        y, x = np.indices(grey.shape, np.float32)
         # Large shades agree whatever moves: fine ones tell.
         fine, moved = _fine(before), cv2.remap(_fine(grey), x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
         norm = float(np.sqrt((fine**2).mean() * (moved**2).mean()))
         likeness = float((fine * moved).mean()) / norm if norm > 0 else 1.0
-        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / width, likeness
+        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1], likeness
 
 
 def _fine(grey: np.ndarray) -> np.ndarray:

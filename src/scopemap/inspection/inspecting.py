@@ -14,16 +14,14 @@ from scopemap.config import InputSettings
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import Frame
 from scopemap.inspection import checks
+from scopemap.inspection.burned_in import InsetWatcher, Overlay, OverlayWatcher
 from scopemap.inspection.clip import Clip, VideoFinding
 from scopemap.inspection.container import check_container, read_container
-from scopemap.inspection.dangers import check_dangers, forecast
-from scopemap.inspection.field import Field, FieldWatcher
+from scopemap.inspection.field_shape import Field, FieldWatcher, ShareBox
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
-from scopemap.inspection.overlays import InsetWatcher, Overlay, OverlayWatcher, ShareBox
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import OF_UNKNOWN_VIEWS, sample_pictures
 from scopemap.io.sequence import Sequence
-from scopemap.io.source import Source
 from scopemap.io.video_format.stereo_packing import Packing, packing
 
 _KEPT = 8
@@ -35,11 +33,9 @@ _ORDER = ("error", "warning", "info")
 class Inspection:
     """What was found in a video.
 
-    Attributes
-    ----------
-    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : figures of every picture.
-    container : facts in the file's header, or None. packed : layout of two views in a picture, or None.
-    insets : left, top, right, bottom, shares of width and height. findings : worst first. samples : a few views.
+    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : measures of every
+    picture. container : facts in the file's header, or None. packed : layout of two views in a picture, or None.
+    findings : worst first. samples : a few frames.
     """
 
     path: Path
@@ -56,26 +52,25 @@ class Inspection:
     @property
     def facts(self) -> dict[str, Any]:
         """What the video is, and the usual shares of its pictures; what is not known is left out."""
-        times_s = self.clip["time_s"]
         facts = (self.container or {}) | {
             "width": self.size[0],
             "height": self.size[1],
             "pictures": len(self.clip),
-            "span_s": float(times_s[-1] - times_s[0]),
+            "span_s": float(np.diff(self.clip["time_s"][[0, -1]])[0]),
             "usual_rate_hz": self.clip.rate_hz,
             "motion_per_frame_share": float(np.median(self.clip["motion"])),
             "motion_fastest_share": float(np.percentile(self.clip["motion"], 95)),
-            "repeated": int(checks.repeated(self.clip).sum()),
+            "repeated": int(self.clip.repeats.sum()),
             "field": self.field.shape,
             "field_share": self.field.share,
+            **checks.exposure_figures(self.clip),
         }
-        facts |= checks.exposure_figures(self.clip)
         return {name: value for name, value in facts.items() if value is not None}
 
     @property
     def forecast(self) -> str:
         """What a run can be expected to make of the video, in words."""
-        return forecast(self.clip)
+        return checks.forecast(self.clip)
 
     @property
     def report(self) -> dict[str, Any]:
@@ -106,7 +101,9 @@ def inspect(
     """
     plain = InputSettings(stereo="none", skip_duplicates=False)
     # Whether there are two views comes first: the camera may be that of one.
-    packed = _packed(open_source(path, dataset=dataset, settings=plain))
+    source = open_source(path, dataset=dataset, settings=plain)
+    unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
+    packed = packing(sample_pictures(source), source.pixel_aspect) if unknown else None
     settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
     sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
     media = sequence.source.media()
@@ -135,7 +132,7 @@ def inspect(
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
         *checks.check_frames(clip),
-        *check_dangers(clip),
+        *checks.check_dangers(clip),
     ]
     return Inspection(
         path=sequence.path,
@@ -149,12 +146,6 @@ def inspect(
         findings=tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.severity))),
         samples=tuple(sampled.kept),
     )
-
-
-def _packed(source: Source) -> Packing | None:
-    if source.name not in OF_UNKNOWN_VIEWS:
-        return None  # the readers of data sets know what a picture holds
-    return packing(sample_pictures(source), source.pixel_aspect)
 
 
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:

@@ -109,7 +109,7 @@ class Masker:
         Under-exposed is a pixel whose brightest channel, or the mean around it, is at most `dark_level`; over-exposed
         one whose second brightest channel reaches `BRIGHT_LEVEL`: red alone clips on sound tissue.
         """
-        darkest, middle = _darker_channels(frame.rgb)
+        darkest, middle = darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
         lit = is_lit(frame.rgb, self.settings.advanced.dark_level)
         valid = frame.valid & lit & ~clipped if self.settings.advanced.exposure else frame.valid
@@ -178,7 +178,7 @@ def is_lit(rgb: np.ndarray, dark_level: int) -> np.ndarray:
     return cv2.min(*brightest) > dark_level
 
 
-def _darker_channels(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def darker_channels(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the darkest and the middle channel of each pixel, (H, W) uint8 each."""
     r, g, b = cv2.split(rgb)
     low, high = cv2.min(r, g), cv2.max(r, g)

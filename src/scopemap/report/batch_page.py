@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+import io
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -45,13 +46,11 @@ class BatchRow:
 
 def write_batch_table(rows: Sequence[BatchRow], file: Path) -> None:
     """Write one line of CSV for each row. Raises `InputError` where the file cannot be written."""
-    with reporting(f"cannot write {file}"):
-        draft = file.with_name(f".{file.name}.{os.getpid()}")
-        with draft.open("w", newline="", encoding="utf-8", errors="replace") as table:
-            writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(asdict(row) | {"seconds": f"{row.seconds:.1f}"} for row in rows)
-        draft.replace(file)
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(asdict(row) | {"seconds": f"{row.seconds:.1f}"} for row in rows)
+    write_at_once(file, table.getvalue())
 
 
 def write_batch_page(rows: Sequence[BatchRow], file: Path) -> None:
@@ -60,13 +59,19 @@ def write_batch_page(rows: Sequence[BatchRow], file: Path) -> None:
     It asks no network for anything. Raises `InputError` where the file cannot be written.
     """
     shown = sorted(rows, key=lambda row: _ORDER.index(row.status))
-    template = (files("scopemap.report") / "assets" / "batch.html").read_text(encoding="utf-8")
-    page = template.replace("{{counts}}", html.escape(counts_of(rows))).replace(
-        "{{rows}}", "\n".join(map(_card, shown))
-    )
+    page = (files("scopemap.report") / "assets" / "batch.html").read_text(encoding="utf-8")
+    page = page.replace("{{counts}}", html.escape(counts_of(rows)))
+    write_at_once(file, page.replace("{{rows}}", "\n".join(map(_card, shown))))
+
+
+def write_at_once(file: Path, text: str) -> None:
+    """Write a text so that whoever reads the file meanwhile finds the old or the new one, whole.
+
+    Raises `InputError` where the file cannot be written.
+    """
     with reporting(f"cannot write {file}"):
         draft = file.with_name(f".{file.name}.{os.getpid()}")
-        draft.write_text(page, encoding="utf-8", errors="replace")
+        draft.write_bytes(text.encode("utf-8", "replace"))
         draft.replace(file)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from scopemap.errors import reporting
 from scopemap.io.checksums import SUMS, write_checksums
 from scopemap.report.frame_pictures import FOLDER as PICTURES
-from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.kept_run import read_run
 from scopemap.report.page_data import MOST_FACES, page_data, shown_meshes
 from scopemap.report.shown_mesh import base64_of
@@ -29,14 +28,11 @@ _LICENCES = (
 )
 
 
-def write_report(folder: Path | str, pictures: FramePictures | None = None) -> list[Path]:
+def write_report(folder: Path | str) -> list[Path]:
     """Write report.html and summary.png into a run's folder, from what the folder holds; return the two files.
 
-    pictures : of the run's frames, saved to the folder first; by default those that it holds.
     Raises `InputError` where it holds no finished run, or cannot be written.
     """
-    if pictures is not None:
-        pictures.save(Path(folder))
     run = read_run(folder)
     meshes = shown_meshes(run, MOST_FACES)
     page, picture = Path(folder) / PAGE, Path(folder) / PICTURE

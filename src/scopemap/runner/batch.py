@@ -25,7 +25,7 @@ from scopemap.errors import reporting
 from scopemap.io.inputs import NamedInput, RemoteFile
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence as Frames
-from scopemap.report.batch_page import BatchRow, write_batch_page, write_batch_table
+from scopemap.report.batch_page import BatchRow, write_at_once, write_batch_page, write_batch_table
 from scopemap.report.kept_run import read_run
 from scopemap.report.page import write_report
 from scopemap.report.verdict import frames_in_result, verdict
@@ -148,7 +148,7 @@ def run_batch(
 
     def put(row: BatchRow) -> None:
         rows[row.folder] = row
-        _write_record(row, out)
+        write_at_once(out / RECORDS / f"{row.folder}.json", json.dumps(asdict(row), indent=1))
         on_change(row, left)
 
     def begin(number: int) -> None:
@@ -210,17 +210,15 @@ def _row_before(video: Video, out: Path, *, overwrite: bool) -> BatchRow:
 def _row_after(row: BatchRow, outcome: Outcome, out: Path) -> BatchRow:
     """Return the row of a video whose process has ended it."""
     log = out / LOGS / f"{row.folder}.txt"
-    where = ""
-    if log.is_file():
-        if log.stat().st_size:
-            where = f"; see {LOGS}/{log.name}"
-        else:
-            log.unlink()
-    seconds = round(row.seconds + outcome.seconds, 3)
-    if outcome.fault:
-        tries = f" ({outcome.attempts} attempts)" if outcome.attempts > 1 else ""
-        return replace(row, status="failed", reason=outcome.fault + tries + where, seconds=seconds)
-    return replace(row, status="done", reason="", seconds=seconds, **outcome.value)
+    has_log = log.is_file() and log.stat().st_size > 0
+    if not has_log:
+        log.unlink(missing_ok=True)
+    row = replace(row, seconds=round(row.seconds + outcome.seconds, 3))
+    if not outcome.fault:
+        return replace(row, status="done", reason="", **outcome.value)
+    tries = f" ({outcome.attempts} attempts)" if outcome.attempts > 1 else ""
+    where = f"; see {LOGS}/{log.name}" if has_log else ""
+    return replace(row, status="failed", reason=outcome.fault + tries + where)
 
 
 def read_record(out: Path, name: str) -> BatchRow | None:
@@ -231,21 +229,13 @@ def read_record(out: Path, name: str) -> BatchRow | None:
         return None
 
 
-def _write_record(row: BatchRow, out: Path) -> None:
-    file = out / RECORDS / f"{row.folder}.json"
-    with reporting(f"cannot write {file}"):
-        draft = file.with_name(f".{file.name}")
-        draft.write_text(json.dumps(asdict(row), indent=1), encoding="utf-8")
-        draft.replace(file)
-
-
 def _write_part(rows: list[BatchRow], out: Path, part: tuple[int, int]) -> None:
     write_batch_table(rows, out / (TABLE if part[1] == 1 else f"batch-{part[0]}-of-{part[1]}.csv"))
 
 
 def _write_overview(videos: Sequence[Video], rows: dict[str, BatchRow], out: Path) -> None:
     """Write table and page of all videos, and of those of earlier calls."""
-    earlier = [file.stem for file in sorted((out / RECORDS).glob("*.json")) if not file.name.startswith(".")]
+    earlier = [file.stem for file in sorted((out / RECORDS).glob("*.json"))]
     found = {name: rows.get(name) or read_record(out, name) for name in [*(v.name for v in videos), *earlier]}
     waiting = {video.name: BatchRow(str(video.path), video.name) for video in videos}
     shown = [row or waiting[name] for name, row in found.items() if row or name in waiting]

@@ -43,6 +43,10 @@ class Outcome:
     attempts: int
 
 
+NEW = Outcome(None, "", 0.0, 0)
+"""Of a task that nobody has begun."""
+
+
 @dataclass(frozen=True)
 class ProcessLimits:
     """Bounds of tasks: processes at once, seconds for one attempt (None: any), and further attempts where one dies."""
@@ -50,6 +54,10 @@ class ProcessLimits:
     processes: int
     seconds: float | None = None
     retries: int = 0
+
+    def allow_another(self, outcome: Outcome) -> bool:
+        """Whether a task that has failed may be tried again."""
+        return bool(outcome.fault) and outcome.attempts <= self.retries
 
 
 def run_in_processes(
@@ -64,7 +72,7 @@ def run_in_processes(
     takes longer than its limit, or raises a `ScopemapError`, is not tried again. Closed early, or where this process
     ends, all processes end.
     """
-    waiting = deque((number, Outcome(None, "", 0.0, 0)) for number in range(len(tasks)))
+    waiting = deque((number, NEW) for number in range(len(tasks)))
     idle: list[_Worker] = []
     busy: list[_Worker] = []
     try:
@@ -80,7 +88,7 @@ def run_in_processes(
                 outcome, again = worker.end(limits.seconds)
                 if worker.process.is_alive():
                     idle.append(worker)
-                if outcome.fault and again and outcome.attempts <= limits.retries:
+                if again and limits.allow_another(outcome):
                     waiting.append((worker.number, outcome))
                 else:
                     yield worker.number, outcome
@@ -115,7 +123,7 @@ class _Worker:
     def __init__(self, call: Callable[[Any], Any], threads: int) -> None:
         self.connection, theirs = _PROCESSES.Pipe()
         self.number, self.begun = 0, 0.0
-        self._before = Outcome(None, "", 0.0, 0)
+        self._before = NEW
         self.process = _PROCESSES.Process(target=_serve, args=(theirs, call, threads), daemon=True)
         with _environment({name: str(threads) for name in THREADS}):
             self.process.start()

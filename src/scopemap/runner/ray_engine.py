@@ -21,12 +21,11 @@ import cv2
 
 from scopemap.errors import InputError, reporting
 from scopemap.runner.engines import WorkerNeeds
-from scopemap.runner.processes import THREADS, Outcome, ProcessLimits, attempt, threads_of_each
+from scopemap.runner.processes import NEW, THREADS, Outcome, ProcessLimits, attempt, threads_of_each
 
 _LONGEST_START_S, _LONGEST_CONNECT_S = 300.0, 10.0
 _MOST_FAILED_STARTS = 3
 _OBJECTS_BYTES = 100 << 20  # videos and results go by files
-_NEW = Outcome(None, "", 0.0, 0)
 
 
 @dataclass(frozen=True)
@@ -49,20 +48,22 @@ class RayEngine:
         started: Callable[[int], None] = lambda number: None,
     ) -> Generator[tuple[int, Outcome], None, None]:
         """Yield (number, outcome) of each task, as they end; `limits.processes` bounds the actors."""
-        waiting = deque((number, _NEW) for number in range(len(tasks)))
+        waiting = deque((number, NEW) for number in range(len(tasks)))
         workers: list[_Worker] = []
+        failed_starts = 0
         with self._connected(limits.processes) as ray:
-            starts = _Starts(ray, self._actor(ray, limits.processes))
+            actor = self._actor(ray, limits.processes)
             while waiting or any(worker.is_busy for worker in workers):
                 # An actor that is placed nowhere yet holds no task: those that run do them all.
                 starting = sum(not worker.is_busy for worker in workers)
                 lacking = min(limits.processes - len(workers), len(waiting) - starting)
-                workers += [starts.new() for _ in range(lacking)]
+                workers += [_Worker(ray, actor()) for _ in range(lacking)]
                 for worker in _ready(ray, workers, limits.seconds):
                     was_busy, (outcome, again) = worker.is_busy, worker.end(limits.seconds)
                     if not was_busy:
-                        starts.check(outcome.fault)
-                    elif outcome.fault and again and outcome.attempts <= limits.retries:
+                        failed_starts = failed_starts + 1 if outcome.fault else 0
+                        _check_starts(failed_starts, outcome.fault)
+                    elif again and limits.allow_another(outcome):
                         waiting.append((worker.number, outcome))
                     else:
                         yield worker.number, outcome
@@ -139,7 +140,7 @@ class _Worker:
     """An actor as it is seen from here: it starts, then it does tasks."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
-        self._ray, self._actor, self._before = ray, actor, _NEW
+        self._ray, self._actor, self._before = ray, actor, NEW
         self.number, self.is_busy, self.is_alive, self.begun = -1, False, True, time.monotonic()
         self.answer = actor.start.remote()
 
@@ -166,20 +167,10 @@ class _Worker:
         self._ray.kill(self._actor)
 
 
-class _Starts:
-    """Starts actors, and gives up where none does."""
-
-    def __init__(self, ray: Any, actor: Callable[[], Any]) -> None:
-        self._ray, self._actor, self._failed = ray, actor, 0
-
-    def new(self) -> _Worker:
-        return _Worker(self._ray, self._actor())
-
-    def check(self, fault: str) -> None:
-        """Take note of a start that has ended; raises `InputError` after several that failed."""
-        self._failed = self._failed + 1 if fault else 0
-        if self._failed > _MOST_FAILED_STARTS:
-            raise InputError(f"no worker starts on Ray: {fault}; is the same scopemap installed on its nodes?")
+def _check_starts(failed: int, fault: str) -> None:
+    """Raise `InputError` where too many starts have failed one after the other."""
+    if failed > _MOST_FAILED_STARTS:
+        raise InputError(f"no worker starts on Ray: {fault}; is the same scopemap installed on its nodes?")
 
 
 def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Worker]:

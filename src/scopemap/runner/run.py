@@ -34,12 +34,7 @@ from scopemap.mapping.submaps import FinalFrames, Submap
 from scopemap.notices import Notice
 from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
-from scopemap.reconstruction import (
-    DepthWriter,
-    FrameRecord,
-    Reconstruction,
-    notices_of_frames,
-)
+from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, notices_of_frames
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.frame_surfaces import SurfaceWriter
@@ -70,7 +65,7 @@ def reconstruct(
     """Turn a sequence into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result. Observers are resumed with it that are methods of an object with an attribute `NOT_IN_CHECKPOINT`.
+    result. Observers that are methods of an object with an attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
 
     The settings in the result are the resolved ones: the TSDF parameters are numbers.
     Of several submaps the one with most frames is the result, and `others` holds the others.
@@ -115,15 +110,21 @@ def reconstruct(
             progress("writing", 0, 0)
             write.finish(scale_known=result.provenance["scale"]["known"])
             result.save(folder)
+            for owner in _kept_with(observers):
+                owner.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     return result
 
 
 def _track_with_checkpoints(run: Run, observers: tuple[Observer, ...], folder: Path, identity: dict[str, Any]) -> None:
-    owners = (getattr(observer, "__self__", None) for observer in observers)
-    kept = tuple(owner for owner in owners if hasattr(owner, "NOT_IN_CHECKPOINT"))
-    with closing(Checkpoints(folder, identity, run, kept)) as checkpoints:
+    with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
         run.track(observers, checkpoints)
+
+
+def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:
+    """Return the objects that observe a run by a method, and are resumed and saved with it."""
+    owners = (getattr(observer, "__self__", None) for observer in observers)
+    return tuple(owner for owner in owners if hasattr(owner, "NOT_IN_CHECKPOINT"))
 
 
 @dataclass

@@ -13,7 +13,7 @@ from typing import Any
 
 from scopemap.errors import InputError, reporting
 from scopemap.runner.engines import WorkerNeeds
-from scopemap.runner.processes import Outcome, ProcessLimits, run_in_processes
+from scopemap.runner.processes import NEW, Outcome, ProcessLimits, run_in_processes
 
 _SECONDS_BETWEEN_LOOKS = 0.5
 _MINUTES_AROUND = 5  # of a job, for its start and its end
@@ -47,7 +47,7 @@ class SlurmEngine:
         if limits.seconds is None:
             raise InputError("Slurm plans by the time of jobs: limit the seconds for one video (--time-limit)")
         one = replace(limits, processes=1)
-        waiting = deque((number, Outcome(None, "", 0.0, 0)) for number in range(len(tasks)))
+        waiting = deque((number, NEW) for number in range(len(tasks)))
         jobs: dict[int, tuple[Any, Outcome]] = {}
         with tempfile.TemporaryDirectory(prefix=".jobs-", dir=self.folder, ignore_cleanup_errors=True) as folder:
             executor = self._executor(folder, limits)
@@ -61,14 +61,15 @@ class SlurmEngine:
                     ended = [number for number, (job, _) in jobs.items() if job.done()]
                     for number in ended:
                         outcome, again = _outcome(*jobs.pop(number))
-                        if outcome.fault and again and outcome.attempts <= limits.retries:
+                        if again and limits.allow_another(outcome):
                             waiting.append((number, outcome))
                         else:
                             yield number, outcome
                     if not ended:
                         time.sleep(_SECONDS_BETWEEN_LOOKS)
             finally:
-                _cancel([job for job, _ in jobs.values()])
+                for job, _ in jobs.values():
+                    job.cancel(check=False)
 
     def _executor(self, folder: str, limits: ProcessLimits) -> Any:
         """Return what submits jobs."""
@@ -104,8 +105,3 @@ def _outcome(job: Any, before: Outcome) -> tuple[Outcome, bool]:
     lines = [line.strip() for line in str(job.stderr() or "").splitlines() if line.strip()]
     fault = f"its job ended without a result ({job.state})" + (f": {lines[-1][:300]}" if lines else "")
     return Outcome(None, fault, before.seconds, before.attempts + 1), True
-
-
-def _cancel(jobs: list[Any]) -> None:
-    for job in jobs:
-        job.cancel(check=False)

@@ -23,9 +23,8 @@ def reconstruct_with_report(
     progress: Progress = lambda doing, done, total: None,
 ) -> Reconstruction:
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
-    pictures = FramePictures()
-    seen = (pictures.observe, *observers)
+    seen = (FramePictures().observe, *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
     progress("writing the report", 0, 0)
-    write_report(out, pictures)
+    write_report(out)
     return result

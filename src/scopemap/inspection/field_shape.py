@@ -14,14 +14,15 @@ from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.masker import hull_of_largest
 
 Shape = Literal["full", "bars", "circle", "cut corners", "rounded corners"]
-Box = tuple[float, float, float, float]
+ShareBox = tuple[float, float, float, float]
+"""Left, top, right, bottom as shares of width and height."""
 
 _WORDS: dict[Shape, str] = {
     "circle": "a circle",
     "cut corners": "a rectangle with cut corners",
     "rounded corners": "a rectangle with rounded corners",
 }
-_FULL_SHARE, _BAR_SHARE = 0.995, 0.01
+_FULL_SHARE, _BAR_SHARE, _EDGE_PX = 0.995, 0.01, 2
 # Shares of a circle's radius: deviation of its outline, and least part of the outline.
 _ROUND_TOLERANCE, _LEAST_ARC = 0.02, 0.3
 _LEAST_CORNER, _LEAST_CORNER_PX, _INSIDE_PX = 0.03, 6, 2
@@ -31,24 +32,21 @@ _WINDOW, _MOST_WINDOWS = 25, 400
 # Pixels lit less often are coding artefacts beside a bright rim.
 _LIT_SHARE = 0.1
 _MOVED, _FAR = 0.006, 0.04
-_EDGE_PX = 2
 
 
 @dataclass(frozen=True)
 class Field:
-    """The field of view of a video, in shares of width and height.
+    """The field of view of a video.
 
-    Attributes
-    ----------
-    shape : full: no border; bars: a rectangle inside borders. share : of the picture.
-    outline : (N, 2) x, y of all that was ever lit. moved : by how much it moves. box : left, top, right, bottom.
+    shape : full: no border; bars: a rectangle inside borders. share : of the picture. outline : (N, 2) x, y of all that
+    was ever lit, shares of width and height. moved : by how much it moves, a share, too. box : around it.
     """
 
     shape: Shape
     share: float
     outline: np.ndarray
     moved: float
-    box: Box
+    box: ShareBox
 
 
 class FieldWatcher:
@@ -58,8 +56,8 @@ class FieldWatcher:
         # Grow to (h, w) with the first frame; all frames of a video have one size.
         self._times = self._window = np.zeros((1, 1), np.int32)
         self._count = 0
-        self._latest: np.ndarray | None = None
-        self._boxes: list[Box] = []
+        self._latest = np.ones((1, 1), bool)
+        self._boxes: list[ShareBox] = []
 
     def add(self, item: InspectedFrame) -> None:
         """Add the next frame; blank ones do not count."""
@@ -78,14 +76,13 @@ class FieldWatcher:
             corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
             return Field("full", 1.0, corners, 0.0, (0.0, 0.0, 1.0, 1.0))
         hull = hull_of_largest(self._times > _LIT_SHARE * self._count)
-        height, width = hull.shape
         points = _points(hull)
         # From pixel centres to the pixels' outer edges.
         centre = (points.min(0) + points.max(0)) / 2
-        outline = (points + 0.5 + 0.5 * np.sign(points - centre)) / (width, height)
+        outline = (points + 0.5 + 0.5 * np.sign(points - centre)) / hull.shape[::-1]
         moved = self._moved()
         # The union of the places of a field that moves has another shape than each.
-        shape = _shape(self._latest if moved > _MOVED and self._latest is not None else hull)
+        shape = _shape(self._latest if moved > _MOVED else hull)
         return Field(shape, float(hull.mean()), outline, moved, _box(hull))
 
     def _moved(self) -> float:
@@ -111,17 +108,13 @@ class FieldWatcher:
                 f"the field of view moves in the picture, by {field.moved:.1%} of its size; runs take all that was "
                 "ever lit for it, less what is black in a frame"
             )
-            if field.moved <= _FAR:
-                yield VideoFinding("info", "field-moves", message)
-            else:
-                advice = (
-                    "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
-                )
-                yield VideoFinding("warning", "field-moves", message, advice)
+            advice = "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
+            far = field.moved > _FAR
+            yield VideoFinding("warning" if far else "info", "field-moves", message, advice if far else "")
 
 
-def _box(mask: np.ndarray) -> Box:
-    """Return left, top, right, bottom of a mask as shares of its width and height."""
+def _box(mask: np.ndarray) -> ShareBox:
+    """Return the box around a mask."""
     height, width = mask.shape
     x, y, across, down = cv2.boundingRect(mask.astype(np.uint8))
     return x / width, y / height, (x + across) / width, (y + down) / height
@@ -140,7 +133,10 @@ def _shape(hull: np.ndarray) -> Shape:
         return "circle"
     x, y, across, down = cv2.boundingRect(hull.astype(np.uint8))
     inside = hull[y : y + down, x : x + across]
-    cut = [is_cut for corner in _corners(inside) if (is_cut := _is_cut(corner)) is not None]
+    # The four quarters, flipped so that the corner comes first.
+    flipped = [inside[::up, ::left] for up in (1, -1) for left in (1, -1)]
+    corners = [_is_cut(one[: down // 2, : across // 2]) for one in flipped]
+    cut = [is_cut for is_cut in corners if is_cut is not None]
     if cut:
         return "cut corners" if 2 * sum(cut) >= len(cut) else "rounded corners"
     left, top, right, bottom = _box(hull)
@@ -149,9 +145,8 @@ def _shape(hull: np.ndarray) -> Shape:
 
 def _is_round(points: np.ndarray, width: int, height: int) -> bool:
     """Return whether the part of the outline (N, 2) that is not the picture's edge is on one circle."""
-    x, y = points.T
-    free = (x > _EDGE_PX) & (x < width - 1 - _EDGE_PX) & (y > _EDGE_PX) & (y < height - 1 - _EDGE_PX)
-    x, y = x[free], y[free]
+    free = ((points > _EDGE_PX) & (points < np.array([width, height]) - 1 - _EDGE_PX)).all(1)
+    x, y = points[free].T
     if len(x) < _LEAST_ARC * len(points) or len(x) < 16:
         return False
     # x^2 + y^2 = 2 a x + 2 b y + c (Kasa's fit).
@@ -160,13 +155,6 @@ def _is_round(points: np.ndarray, width: int, height: int) -> bool:
     off = np.abs(np.hypot(x - a, y - b) - radius)
     # Corners of a rounded rectangle are on circles, too, but not on one.
     return bool(radius < max(width, height) and np.percentile(off, 95) < max(_ROUND_TOLERANCE * radius, 1.0))
-
-
-def _corners(inside: np.ndarray) -> list[np.ndarray]:
-    """Return the four quarters of a mask, flipped so that the corner comes first."""
-    middle, centre = inside.shape[0] // 2, inside.shape[1] // 2
-    upper, lower = inside[:middle], inside[::-1][:middle]
-    return [half[:, ::step][:, :centre] for half in (upper, lower) for step in (1, -1)]
 
 
 def _is_cut(quarter: np.ndarray) -> bool | None:

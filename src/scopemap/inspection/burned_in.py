@@ -10,27 +10,24 @@ import cv2
 import numpy as np
 
 from scopemap.inspection.clip import VideoFinding, segments_of
+from scopemap.inspection.field_shape import ShareBox
 from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.masker import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
 
 _MARGIN_SHARE, _NEAR_PX, _BLACK_PX = 0.02, 3, 9
-_JOIN_SHARE = 0.02
+_JOIN_SHARE, _LEAST_BOX_PX = 0.02, 3
 _LEAST_TIMES, _LEAST_TIMES_SHARE = 12, 0.05
-_LEAST_BOX_PX = 3
-Box = tuple[int, int, int, int]
-ShareBox = tuple[float, float, float, float]
-
 # A static edge is this much stronger, on average, than the image beside it.
 _RIDGE, _RIDGE_LEVELS, _BESIDE_PX = 1.6, 4.0, 9
 _LEAST_SIDE, _LARGEST_SHARE, _COVERED = 0.08, 0.45, 0.85
 _LEAST_CHANGE, _LEAST_PICTURES, _MOST_LINES = 2.0, 12, 12
-_MOVED_PX = 0.004
+_MOVED_SHARE = 0.004
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """One overlay: left, top, right, bottom as shares of width and height; whether it is in the field of view."""
+    """One overlay, and whether it is in the field of view."""
 
     box: ShareBox
     in_field: bool
@@ -48,25 +45,27 @@ class OverlayWatcher:
 
     def add(self, item: InspectedFrame) -> None:
         """Add the next frame."""
+        # Large black areas and what is near them: an inset and a circle make one hull.
+        black = cv2.morphologyEx((~item.lit).astype(np.uint8), cv2.MORPH_OPEN, _square(_BLACK_PX))
+        beside_black = cv2.dilate(black, _square(2 * _BLACK_PX + 1)) > 0
         # A field that moves has its rim inside of all that was ever lit.
-        rim = _rim(item.field) | _rim(hull_of_largest(item.lit)) | (_beside_black(item.lit) & item.field)
+        rim = _rim(item.field) | _rim(hull_of_largest(item.lit)) | (beside_black & item.field)
         found = self._finder(item.small, item.field, ~rim & ~item.field)
         self._times = self._times + (np.zeros_like(rim) if found is None else found & ~rim)
         self._field, self._looked = item.field, self._looked + 1
 
     def overlays(self) -> list[Overlay]:
         """Return the overlays that were there for at least 12 frames and 5 % of them."""
-        height, width = self._times.shape
         there = (self._times >= max(_LEAST_TIMES, _LEAST_TIMES_SHARE * self._looked)).astype(np.uint8)
         # Letters of a word, and words of a line, belong together.
-        side = 2 * round(_JOIN_SHARE * width) + 1
+        side = 2 * round(_JOIN_SHARE * self._times.shape[1]) + 1
         joined = cv2.morphologyEx(there, cv2.MORPH_CLOSE, np.ones((3, side), np.uint8))
         _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-        found = []
-        for label, (x, y, w, h, _) in enumerate(stats[1:].tolist(), start=1):
-            if min(w, h) >= _LEAST_BOX_PX:
-                box = x / width, y / height, (x + w) / width, (y + h) / height
-                found.append(Overlay(box, bool(self._field[labels == label].mean() > 0.5)))
+        found = [
+            Overlay(_shares((x, y, w, h), self._times.shape), bool(self._field[labels == label].mean() > 0.5))
+            for label, (x, y, w, h, _) in enumerate(stats[1:].tolist(), start=1)
+            if min(w, h) >= _LEAST_BOX_PX
+        ]
         return sorted(found, key=lambda one: one.box)
 
     def findings(self) -> Iterator[VideoFinding]:
@@ -85,19 +84,22 @@ class OverlayWatcher:
             yield VideoFinding("info", "overlay-privacy", message)
 
 
+def _square(side_px: int) -> np.ndarray:
+    return np.ones((side_px, side_px), np.uint8)
+
+
+def _shares(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> ShareBox:
+    """Return left, top, width and height, px, as shares."""
+    (height, width), (x, y, w, h) = shape, box
+    return x / width, y / height, (x + w) / width, (y + h) / height
+
+
 def _rim(field: np.ndarray) -> np.ndarray:
     """Return where the rim of a field is, which stays as overlays do: (H, W) bool, most of it outside."""
     margin = round(_MARGIN_SHARE * max(field.shape))
     level = np.pad(field.astype(np.uint8), margin, mode="edge")
-    out = cv2.dilate(level, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))
-    near = cv2.erode(level, np.ones((2 * _NEAR_PX + 1, 2 * _NEAR_PX + 1), np.uint8))
+    out, near = cv2.dilate(level, _square(2 * margin + 1)), cv2.erode(level, _square(2 * _NEAR_PX + 1))
     return ((out > 0) & (near == 0))[margin:-margin, margin:-margin]
-
-
-def _beside_black(lit: np.ndarray) -> np.ndarray:
-    """Return where large black areas are, and near them, (H, W) bool: an inset and a circle make one hull."""
-    large = cv2.morphologyEx((~lit).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_BLACK_PX, _BLACK_PX), np.uint8))
-    return cv2.dilate(large, np.ones((2 * _BLACK_PX + 1, 2 * _BLACK_PX + 1), np.uint8)) > 0
 
 
 def _places(overlays: list[Overlay]) -> str:
@@ -120,7 +122,7 @@ class InsetWatcher:
         grey = cv2.cvtColor(item.small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         if self._last is None:
             self._last = grey
-        if item.measures.blank or item.measures.motion < _MOVED_PX:
+        if item.measures.blank or item.measures.motion < _MOVED_SHARE:
             return
         self._count += 1
         self._across = self._across + np.abs(np.diff(grey, axis=1, prepend=grey[:, :1]))
@@ -129,7 +131,7 @@ class InsetWatcher:
         self._last, self._field = grey, item.field
 
     def boxes(self) -> list[ShareBox]:
-        """Return the insets: left, top, right, bottom as shares of width and height."""
+        """Return the insets."""
         if self._count < _LEAST_PICTURES:
             return []
         height, width = self._across.shape
@@ -140,8 +142,8 @@ class InsetWatcher:
         boxes = [(left, top, right, bottom) for left, right in across for top, bottom in down]
         found = [(a, b, c - a, d - b) for a, b, c, d in boxes if self._is_inset((a, b, c, d), upright, level)]
         # The largest first, and none that overlaps one before it.
-        kept = [found[n] for n in cv2.dnn.NMSBoxes(found, [float(w * h) for _, _, w, h in found], 0.0, 0.0)]
-        return [(x / width, y / height, (x + w) / width, (y + h) / height) for x, y, w, h in kept]
+        kept = cv2.dnn.NMSBoxes(found, [float(w * h) for _, _, w, h in found], 0.0, 0.0)
+        return [_shares(found[number], upright.shape) for number in kept]
 
     def findings(self) -> Iterator[VideoFinding]:
         """Yield a finding where there is an inset."""
@@ -153,7 +155,8 @@ class InsetWatcher:
             )
             yield VideoFinding("warning", "inset", message, advice)
 
-    def _is_inset(self, box: Box, upright: np.ndarray, level: np.ndarray) -> bool:
+    def _is_inset(self, box: tuple[int, int, int, int], upright: np.ndarray, level: np.ndarray) -> bool:
+        """Return whether static edges are around a box (left, top, right, bottom) in which the picture changes."""
         left, top, right, bottom = box
         height, width = upright.shape
         if (right - left) < _LEAST_SIDE * width or (bottom - top) < _LEAST_SIDE * height:
