@@ -12,15 +12,11 @@ from drawn_bags import small_bag, write_bag1
 from drawn_datasets import write_pictures
 from drawn_dicom import dataset, film, native
 from drawn_dicom import save as save_dicom
+from drawn_image_sets import ROOM, at_rest, llff, write_endonerf, write_experiment, write_json, write_oneslam, write_tum
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared_c
 from test_datasets_colmap import NAMES, stored_pose, write_model
 from test_datasets_colmap import write_scene as write_colmap
-from test_datasets_endonerf import at_rest, llff
-from test_datasets_endonerf import write_scene as write_llff
-from test_datasets_oneslam import write_json, write_oneslam
-from test_datasets_servct import write_experiment
-from test_datasets_tum import ROOM, write_tum
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
@@ -30,7 +26,7 @@ from scopemap.io.opening import open_sequence, open_source
 MINE = PinholeCamera(60.0, 60.0, 40.0, 32.0, 80, 64)
 
 
-@pytest.mark.parametrize("write", [write_oneslam, write_colmap, write_llff])
+@pytest.mark.parametrize("write", [write_oneslam, write_colmap, write_endonerf])
 @pytest.mark.parametrize("nesting", ["", "outer"])
 def test_images_can_be_named_where_a_data_set_is(write: Callable[[Path], Path], nesting: str, tmp_path: Path) -> None:
     folder = write(tmp_path / nesting / "proj")
@@ -72,7 +68,7 @@ def unknown_lens(folder: Path) -> Path:
 
 
 def focal_length_of_no_camera(folder: Path) -> Path:
-    return write_llff(folder, llff(at_rest(), focal_px=1e9))
+    return write_endonerf(folder, llff(at_rest(), focal_px=1e9))
 
 
 def calibration_of_larger_images(folder: Path) -> Path:
