@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_climb import frames_of, path_of, submap_text, write_foreign_run, write_reference
-from front_door import refused
 from typer.testing import CliRunner
 
 from scopemap.cli.app import app
@@ -199,10 +198,3 @@ def test_rows_that_cannot_be_scored_are_refused(row: str, message: str, tmp_path
     (tmp_path / "submap.txt").write_text(f"# header\n{row}\n")
     with pytest.raises(InputError, match=message):
         read_submap(tmp_path / "submap.txt")
-
-
-def test_a_run_without_trajectories_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    truth = write_reference(tmp_path, path_of(5))
-    (tmp_path / "run").mkdir()
-    said = refused(capfd, "evaluate", tmp_path / "run", "--kind", "climb", "--truth", truth)
-    assert "looked for camera_trajectory/cam_traj_map_*.txt" in said

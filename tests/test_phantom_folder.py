@@ -60,17 +60,6 @@ def test_pose_file_is_in_the_stored_form(folder: Path) -> None:
     assert np.abs(stored[1:, 3, :3]).max() > 0.1
 
 
-def test_calibration_is_what_opencv_reads(folder: Path) -> None:
-    storage = cv2.FileStorage(str(folder / "camera.yaml"), cv2.FILE_STORAGE_READ)
-    assert (folder / "camera.yaml").read_text().startswith("%YAML:1.0")
-    np.testing.assert_allclose(storage.getNode("camera_matrix").mat(), SPEC.camera.matrix)
-    np.testing.assert_array_equal(storage.getNode("distortion_coefficients").mat().ravel(), np.zeros(5))
-    assert int(storage.getNode("image_width").real()) == 64
-    assert int(storage.getNode("image_height").real()) == 48
-    assert storage.getNode("depth_scale").real() == pytest.approx(100 / 65535)
-    assert SPEC.camera.fx == pytest.approx(32.0)
-
-
 def test_meshes_lie_under_the_depth(folder: Path) -> None:
     phantom = prepare(SPEC)
     rest = trimesh.load(folder / "mesh_truth.ply", process=False)
@@ -79,13 +68,6 @@ def test_meshes_lie_under_the_depth(folder: Path) -> None:
     shift = np.asarray(moved.vertices) - np.asarray(rest.vertices)
     np.testing.assert_allclose(shift, phantom.motion.at(2).at(np.asarray(moved.vertices)), atol=1e-4)
     assert np.linalg.norm(shift, axis=1).max() > 0.5
-
-
-def test_description_repeats_the_spec(folder: Path) -> None:
-    described = json.loads((folder / "phantom.json").read_text())
-    assert described["spec"]["seed"] == 2
-    assert described["spec"]["deform"] is True
-    assert described["frames"] == 3
 
 
 def test_same_spec_writes_the_same_bytes_over_an_earlier_phantom(folder: Path, tmp_path: Path) -> None:
