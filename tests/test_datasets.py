@@ -263,9 +263,3 @@ def test_real_c3vd_video_without_depth(real_data: Path) -> None:
     assert (sequence.count, sequence.camera.width, sequence.camera.height) == (276, 337, 270)
     centres = np.array([sequence.source.pose(number)[:3, 3] for number in range(276)])
     assert np.linalg.norm(np.diff(centres, axis=0), axis=1).sum() == pytest.approx(54.7, abs=0.1)
-
-
-@pytest.mark.real
-def test_real_sevenscenes(real_data: Path) -> None:
-    pairs = list(open_sequence(real_data / "rgbd" / "7scenes_kitchen_100f", frames=slice(0, 11, 10)))
-    assert np.nanmedian(reprojection_error_mm(*pairs)) < 10

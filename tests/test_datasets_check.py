@@ -204,12 +204,6 @@ def test_one_fault_is_not_reported_as_many(folder: Path) -> None:
     assert set(faults(findings(folder.parent / "second"))) == {"poses-inverted"}
 
 
-def test_depth_that_cannot_be_read_leaves_the_pose(folder: Path) -> None:
-    _cut_short("0003_depth.tiff")(folder)
-    figures = survey(open_sequence(folder)).figures
-    assert (figures["with_pose"], figures["with_depth"]) == (COUNT, COUNT - 1)
-
-
 def test_names_of_a_plain_folder(tmp_path: Path) -> None:
     for name in ("a_1.png", "b_1.png", "c_2.png"):
         save(tmp_path / name, picture(len(list(tmp_path.iterdir()))))

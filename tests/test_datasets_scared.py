@@ -42,8 +42,6 @@ from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence
-from scopemap_bench.datasets.scared import ScaredKeyframe
-from scopemap_bench.trajectories.numbered import find_numbered
 
 NUMBERS = [1, 2, 4, 7, 8]
 Edit = Callable[[Path], object]
@@ -121,14 +119,6 @@ def test_poses_and_points_agree_through_the_rectification(downloaded: Path) -> N
     sequence = open_sequence(downloaded)
     assert off_the_plane_mm(sequence, lambda T_world_camera: T_world_camera) < 0.3
     assert off_the_plane_mm(sequence, inverse) > 3
-
-
-@pytest.mark.parametrize("selection", [slice(1, 3), slice(None, None, 2), slice(-1, None), slice(3, 9)])
-def test_selections_are_python_slices(selection: slice, downloaded: Path, corrected: Path) -> None:
-    for source, numbers in ((ScaredKeyframe(downloaded), [*range(4)]), (open_sequence(corrected).source, NUMBERS)):
-        frames = list(source.frames(selection))
-        assert [frame.index for frame in frames] == [red_in(frame.rgb) for frame in frames] == numbers[selection]
-        assert source.stamps(selection) == [(frame.index, frame.time_s) for frame in frames]
 
 
 # ---- copies
@@ -302,20 +292,6 @@ def test_corrected_poses_win_over_scared_in_the_same_folder(corrected: Path) -> 
     write_scared(corrected)
     frame_data(json_files(NUMBERS))(corrected)
     assert open_sequence(corrected).source.name == "scared-c"
-
-
-def test_scared_cs_unpacked_archives_read_the_same(corrected: Path) -> None:
-    for name, prefix, suffix in (
-        *(("rgb_frames", "frame", ".png"), ("frame_data", "frame_data", ".json")),
-        ("scene_points", "scene_points", ".tiff"),
-    ):
-        files = find_numbered(corrected / "data", (name,), prefix, (suffix,))
-        loose = {f"{prefix}{number:06d}{suffix}": files.read(number) for number in files.numbers()}
-        write_loose(corrected / "data" / name, loose)
-        (corrected / "data" / f"{name}.tar.gz").unlink()
-    sequence = open_sequence(corrected)
-    assert [red_in(frame.rgb) for frame, _ in sequence] == NUMBERS
-    assert sequence.source.truth(2).depth_mm is not None
 
 
 def test_frames_that_archive_log_and_poses_do_not_share_are_left_out(corrected: Path) -> None:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scopemap.errors import SettingsError
 from scopemap_bench.evaluation.depth import (
     DEPTH_RANGES_MM,
-    DepthFit,
     depth_scale,
     evaluate_depth,
     evaluate_depth_sequence,
@@ -110,18 +109,6 @@ def test_prediction_without_variation_becomes_the_mean_disparity_of_the_truth() 
     assert report["scale"] == float("inf")
     assert 1 / report["shift_per_mm"] == pytest.approx(15)
     assert report["mae_mm"] == pytest.approx((5 + 15) / 2)
-
-
-def test_disparity_that_a_shift_makes_negative_is_a_kilometre_away() -> None:
-    fit = DepthFit("scale-and-shift", scale=2.0, shift_per_mm=-0.01)
-    assert fit.apply(np.array([10.0, 50.0, 80.0])) == pytest.approx([25.0, 1e6, 1e6])
-    assert np.isnan(fit.apply(np.array([np.nan, 0.0, -1.0]))).all()
-
-
-def test_a_fit_found_elsewhere_is_applied_and_named() -> None:
-    report = evaluate_depth(TRUTH / 3, TRUTH, scaling=DepthFit("sequence-median", 3.3))
-    assert (report["scaling"], report["scale"]) == ("sequence-median", 3.3)
-    assert report["abs_rel"] == pytest.approx(0.1)
 
 
 def test_clipping_follows_scaling_and_leaves_the_choice_of_pixels() -> None:

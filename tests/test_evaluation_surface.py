@@ -79,15 +79,6 @@ def test_concentric_spheres_and_points_against_a_mesh() -> None:
     assert compare_surfaces(on_outer, outer)["accuracy_mean_mm"] == pytest.approx(0, abs=1e-9)
 
 
-def test_sampling_is_dense_even_and_repeatable() -> None:
-    box = trimesh.creation.box(extents=(20, 20, 20))
-    points = surface_points(box)
-    assert len(points) >= box.area / 0.25
-    on_top = np.mean(points[:, 2] > 10 - 1e-6)
-    assert on_top == pytest.approx(1 / 6, abs=0.02)
-    np.testing.assert_array_equal(points, surface_points(box))
-
-
 def test_empty_surfaces_are_refused() -> None:
     with pytest.raises(ValueError, match="no points"):
         surface_points(np.empty((0, 3)))

@@ -156,12 +156,6 @@ def test_log_that_could_point_either_way_asks_for_the_kind(tmp_path: Path) -> No
             read_trajectory(path)
 
 
-def test_log_numbers_its_frames_where_its_numbers_ascend(tmp_path: Path) -> None:
-    for first, expected in ((lambda i: f"{3 * i} {i} {i + 1}", range(0, 60, 3)), (lambda i: f"0 0 {i}", range(20))):
-        (tmp_path / "a.log").write_text(log_text(moving_camera(), first))
-        assert read_trajectory(tmp_path / "a.log", kind="open3d").indices.tolist() == list(expected)
-
-
 @pytest.mark.parametrize(
     ("edit", "message"),
     [

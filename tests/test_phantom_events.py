@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap_bench.phantom.camera_path import turned
 from scopemap_bench.phantom.instrument import Capsules, insert
-from scopemap_bench.phantom.render import Phantom, light, prepare, render_frame
+from scopemap_bench.phantom.render import Phantom, light, prepare
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 
 SMALL = {"width": 64, "height": 48}
@@ -35,12 +33,6 @@ def test_a_turn_is_30_degrees_and_stays() -> None:
     assert turns_deg(slow)[[0, 1, 2, 9, 10]].max() < 1e-4
     np.testing.assert_allclose(turned(cut, 12, 15, back=True)[15:], poses[15:], atol=1e-12)
     np.testing.assert_array_equal(slow[:, :3, 3], 0)
-
-
-def test_every_second_turn_leads_back() -> None:
-    plain, both = phantom("").poses, phantom("turn:5-9,turn:20-20").poses
-    np.testing.assert_allclose(both[[4, 20]], plain[[4, 20]], atol=1e-9)
-    assert np.degrees(rotation_angle_rad((plain[12, :3, :3].T @ both[12, :3, :3])[None]))[0] == pytest.approx(30)
 
 
 def test_contact_comes_to_4_mm_of_the_wall_and_goes_back() -> None:
@@ -100,23 +92,3 @@ def test_pushed_tissue_moves_two_ways_and_stays_so() -> None:
     assert moved[3][0] < -4
     assert moved[3][2] > 4
     assert abs(moved[3][1]) < 1e-9
-
-
-def test_fluid_bends_the_view_and_runs_on() -> None:
-    wet = phantom("fluid:4-20")
-    dry = replace(wet, spec=replace(wet.spec, events=()))
-    levels = {index: render_frame(wet, index)[0].astype(float) for index in (3, 10, 11, 18)}
-    clear = {index: render_frame(dry, index)[0].astype(float) for index in levels}
-    np.testing.assert_array_equal(levels[3], clear[3])
-    changes = {index: levels[index] - clear[index] for index in (10, 11, 18)}
-    assert np.abs(changes[10]).mean() > 4
-    assert np.abs(changes[10] - changes[11]).mean() < np.abs(changes[10] - changes[18]).mean()
-
-
-def test_impossible_phantoms_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="a turn does not go with loop"):
-        PhantomSpec(loop=True, events=parse_events("turn:3-4"))
-    with pytest.raises(SettingsError, match="speed"):
-        PhantomSpec(speed=2, path_file=tmp_path / "path.txt")
-    with pytest.raises(SettingsError, match=r"expected KIND:A-B, KIND one of black, .*, push"):
-        parse_events("flood:1-2")

@@ -105,7 +105,8 @@ def test_bad_events_name_the_culprit(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"frames": 0}, {"width": 3}, {"fov_deg": 170}, {"scene": "moon"}, {"noise": -1}, {"breath_mm": 9}]
+    "settings",
+    [{"frames": 0}, {"fov_deg": 170}, {"scene": "moon"}, {"breath_mm": 9}, {"shutter": 1.5}, {"h264_crf": 52}],
 )
 def test_impossible_specs_are_refused(settings: dict) -> None:
     with pytest.raises(SettingsError, match=next(iter(settings))):

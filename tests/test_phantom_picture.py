@@ -9,8 +9,7 @@ import pytest
 
 from scopemap_bench.phantom.deformation import REST
 from scopemap_bench.phantom.march import march
-from scopemap_bench.phantom.noise import noise_at
-from scopemap_bench.phantom.render import light, prepare, render_frame
+from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.shading import develop, shade
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.volume import Volume
@@ -52,29 +51,6 @@ def test_highlights_sit_where_the_surface_faces_the_lamp(wall: Volume) -> None:
     shiny = shade(surface, zero, zero, np.ones((41, 41), np.float32), camera)[..., 0]
     assert np.unravel_index(shiny.argmax(), shiny.shape) == (20, 20)
     assert shiny[20, 30] < 0.01 * shiny[20, 20]
-
-
-def test_first_frame_is_well_exposed() -> None:
-    for scene in ("colon", "laparoscopy", "tube"):
-        rgb, _ = render_frame(prepare(PhantomSpec(scene=scene, **SMALL)), 0)
-        brightest = rgb.max(-1)
-        assert 100 < np.percentile(brightest, 70) < 235
-        assert (brightest >= 254).mean() < 0.1
-
-
-def test_tube_is_featureless_and_colon_is_not() -> None:
-    def contrast(scene: str) -> float:
-        spec = PhantomSpec(scene=scene, noise=0.0, **SMALL)
-        phantom = prepare(spec)
-        linear, surface = light(phantom, 0)
-        towards = -spec.camera.rays / np.linalg.norm(spec.camera.rays, axis=-1, keepdims=True)
-        lamp = (surface.normal * towards).sum(-1) / surface.distance_mm**2
-        red = linear[..., 0] / lamp / (1 - 0.35 * (spec.camera.rays[..., :2] ** 2).sum(-1) / 1.7)
-        middle = red[6:-6, 6:-6]
-        middle = middle[np.isfinite(middle)]
-        return float(np.std(np.diff(np.log(middle[middle > 0]))))
-
-    assert contrast("colon") > 5 * contrast("tube")
 
 
 def test_texture_sticks_to_moving_tissue() -> None:
@@ -120,15 +96,3 @@ def test_events_are_seen_where_they_were_ordered() -> None:
     assert pictures[4].reshape(-1, 3).std(0).mean() < 0.6 * clear[4].reshape(-1, 3).std(0).mean()
     assert np.abs(pictures[4].mean((0, 1)) - pictures[4].mean()).max() < 15
     np.testing.assert_array_equal(render_frame(bad, 4)[1].depth_mm, render_frame(plain, 4)[1].depth_mm)
-
-
-def test_noise_field_is_smooth_seeded_and_centred() -> None:
-    points = np.random.default_rng(0).uniform(-500, 500, (20_000, 3))
-    values = noise_at(points, 7.0, 1)
-    assert abs(values.mean()) < 0.02
-    assert 0.2 < values.std() < 0.4
-    assert np.abs(values).max() <= 1.0
-    near = noise_at(points + np.array([1e-3, 0, 0]), 7.0, 1)
-    assert np.abs(near - values).max() < 1e-3
-    assert np.abs(np.corrcoef(values, noise_at(points, 7.0, 2))[0, 1]) < 0.05
-    assert noise_at(np.full((1, 3), np.nan), 7.0, 1)[0] == 0

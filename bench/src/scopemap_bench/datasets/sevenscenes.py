@@ -17,7 +17,7 @@ from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import inverse, se3
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
-from scopemap_bench.trajectories.sevenscenes import read_seven_scenes_pose
+from scopemap_bench.trajectories.text import read_seven_scenes_pose
 
 DEPTH_CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
 """As published."""

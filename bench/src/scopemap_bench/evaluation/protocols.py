@@ -254,17 +254,17 @@ _ALL = (
     ),
     Protocol(
         "af",
-        "Snippets of 5 frames from every frame on (shorter at the end), relative motions multiplied without inverting "
-        "them, each snippet scaled by least squares, root of the summed squares divided by the number of positions "
-        "(not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and deviation over "
-        "snippets.",
+        "Snippets of 5 frames from every frame on (shorter at the end), relative motions multiplied without "
+        "inverting them, each snippet scaled by least squares, root of the summed squares divided by the number of "
+        "positions (not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and "
+        "deviation over snippets.",
         "ShuweiShao/AF-SfMLearner: evaluate_pose.py; BeileiCui/EndoDAC: evaluate_pose.py",
         _of_poses(_af),
     ),
     Protocol(
         "endogslam",
-        "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first camera "
-        "(as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
+        "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first "
+        "camera (as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
         "Loping151/EndoGSLAM: utils/eval_helpers.py",
         _of_poses(_endogslam),
     ),
@@ -307,8 +307,8 @@ _ALL = (
     Protocol(
         "climb",
         "Every submap aligned by its own Sim3, frames of an earlier submap left out, submaps with fewer than "
-        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in mm "
-        "and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
+        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in "
+        "mm and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
         "EndoCartoScope/climb-challenge: evaluation/evaluation_utils.py, 79d7435",
         climb_figures,
     ),

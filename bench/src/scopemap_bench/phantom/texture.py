@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap_bench.phantom.cavity import Tint
-from scopemap_bench.phantom.noise import noise_at
+from scopemap_bench.phantom.volume import noise_at
 
 _MOTTLES = ((22.0, 0.22), (8.0, 0.16), (3.0, 0.14), (1.2, 0.14))
 _VESSEL_COLOUR = np.array([0.80, 0.42, 0.50], np.float32)
