@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_climb import frames_of, path_of, submap_text, write_foreign_run, write_reference
+from drawn_climb import frames_of, path_of, write_foreign_run, write_reference
 from typer.testing import CliRunner
 
 from scopemap.cli.app import app
@@ -164,12 +164,6 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     found = read_submap(tmp_path / "submap.txt")
     assert found.indices.tolist() == [3, 4, 6, 7, 8]
     np.testing.assert_allclose(found.T_world_camera, poses[[0, 1, 3, 4, 5]], atol=1e-8)
-
-
-def test_rows_without_a_position_are_left_out_and_more_columns_read(tmp_path: Path) -> None:
-    text = submap_text(path_of(3), [9, 8, 7]) + "0,000010.png,nan,0,0,1,0,0,0\n"
-    (tmp_path / "submap.txt").write_text(text)
-    assert read_submap(tmp_path / "submap.txt").indices.tolist() == [6, 7, 8]
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 from drawn_climb import frames_of, path_of, write_finished_run
+from drawn_video_sets import write_frames
 from front_door import call, refused
-from test_datasets_stereomis import write_frames
 from tiny_phantom import write_tiny
 
 from scopemap.errors import InputError

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from drawn_inputs import SIZE, frames_of, number_in, picture, save, write_c3vd, write_video
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.geometry.se3 import inverse, transform
@@ -44,12 +42,6 @@ def test_grey_deep_and_transparent_images_become_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "2.png"), np.dstack([grey, grey, grey, 255 - grey]))
     for frame in frames_of(open_sequence(tmp_path, settings=InputSettings(skip_duplicates=False))):
         np.testing.assert_array_equal(frame.rgb, np.repeat(grey[..., None], 3, -1))
-
-
-def test_names_without_numbers_are_counted(tmp_path: Path) -> None:
-    for i, name in enumerate(("b.png", "a.png")):
-        save(tmp_path / name, picture(i))
-    assert [(f.index, f.name) for f in frames_of(open_sequence(tmp_path))] == [(0, "a.png"), (1, "b.png")]
 
 
 @pytest.mark.parametrize(
@@ -107,13 +99,6 @@ def test_a_calibration_file_wins_and_is_said(tmp_path: Path) -> None:
     assert sequence.camera_source == "calibration file mine.txt"
     with pytest.raises(CalibrationError, match="is known"):
         sequence.with_focal(100.0, "a guess")
-
-
-def test_a_calibration_for_other_images_is_refused(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    write_calibration(PinholeCamera(900.0, 900.0, 960.0, 540.0, 1920, 1080), tmp_path / "hd.yaml")
-    with pytest.raises(CalibrationError, match=r"1920x1080 px.*135x108 px"):
-        open_sequence(folder, camera=tmp_path / "hd.yaml")
 
 
 def test_the_working_size_is_chosen_or_given(tmp_path: Path) -> None:

@@ -146,10 +146,3 @@ def test_depth_of_a_run_with_another_camera_is_compared_pixel_by_pixel(tmp_path:
     (run / "source_camera.yaml").unlink()  # as older runs left it
     with pytest.raises(InputError, match="another camera"):
         _figures(run, "--truth", folder, "--depth", "median")
-
-
-def test_a_run_on_two_views_is_compared_with_a_data_set_of_one(tmp_path: Path) -> None:
-    folder, run = WRITERS["hamlyn"](tmp_path / "input"), tmp_path / "run"
-    run.mkdir()
-    (run / "config.toml").write_text('input.stereo = "left-right"\n', encoding="utf-8")
-    assert open_truth(run, folder).source.name == "hamlyn"

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from scopemap.errors import InputError, SettingsError
 from scopemap_bench.cli.phantom import phantom as phantom_command
 from scopemap_bench.phantom.render import prepare, render_frame
-from scopemap_bench.phantom.spec import Event, PhantomSpec, parse_events
+from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import encode_depth, write_phantom
 
 SPEC = PhantomSpec(frames=3, width=64, height=48, deform=True, breath_frames=4.0, seed=2)
@@ -91,11 +91,6 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
 def test_depth_codes() -> None:
     depth = np.array([[np.nan, 1e-9, 50.0, 100.0, 250.0]], np.float32)
     np.testing.assert_array_equal(encode_depth(depth, 100 / 65535), [[0, 1, 32768, 65535, 65535]])
-
-
-def test_events_are_parsed() -> None:
-    assert parse_events("black:4-9, smoke:12-12") == (Event("black", 4, 9), Event("smoke", 12, 12))
-    assert parse_events("") == ()
 
 
 @pytest.mark.parametrize("text", ["fog:1-2", "black:1", "black:a-b", "blur:9-3", "smoke:1-2;blur:3-4", "black:-1-2"])

@@ -95,17 +95,6 @@ def test_a_coverage_file_of_another_form_is_refused(tmp_path: Path, content: str
         read_true_surface(tmp_path)
 
 
-def test_a_folder_without_a_true_surface_has_none(tmp_path: Path) -> None:
-    (tmp_path / "frame-000000.pose.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    assert read_true_surface(tmp_path) is None
-
-
-def test_a_damaged_mesh_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mesh_truth.ply").write_bytes(b"ply\nnonsense")
-    with pytest.raises(InputError, match=r"mesh_truth\.ply"):
-        read_true_surface(tmp_path)
-
-
 def test_a_phantoms_surface_was_seen_but_for_its_rim(tiny: Path) -> None:
     truth, sequence = read_true_surface(tiny), open_sequence(tiny)
     assert truth is not None

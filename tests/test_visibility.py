@@ -56,15 +56,6 @@ def test_what_hides_behind_a_curtain_is_not_seen() -> None:
     np.testing.assert_array_equal(seen, wall[:, 0] > 0)
 
 
-def test_behind_the_camera_beside_the_image_and_where_depth_is_unknown_nothing_is_seen() -> None:
-    depth = np.full((128, 160), 50.0, np.float32)
-    depth[64:] = np.nan
-    behind, beside = [0.0, 0.0, -50.0], [60.0, 0.0, 50.0]
-    unknown, known = [0.0, 10.0, 50.0], [0.0, -10.0, 50.0]
-    seen = seen_points(np.array([behind, beside, unknown, known]), EYE, (HERE, depth))
-    assert seen.tolist() == [False, False, False, True]
-
-
 def test_the_tolerance_is_a_share_of_the_depth() -> None:
     depth = np.full((128, 160), 50.0, np.float32)
     points = np.array([[0, 0, z] for z in (48.9, 49.1, 50.9, 51.1)])

@@ -37,8 +37,6 @@ class Place:
 class LayoutFolder(ImageFolder):
     """A folder of pictures in one of the `places` of its layout; a `camera.yaml` beside them replaces its intrinsics.
 
-    Attributes
-    ----------
     needs : groups of files or folders (glob patterns), of each of which one is there where the layout is recognised.
     numbered : whether every picture must have a number of its own; else pictures may be counted.
     intrinsics : calibration files, `{}` the folder's name, each with the number of folders above in which it may be.

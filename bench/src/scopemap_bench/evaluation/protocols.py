@@ -37,8 +37,6 @@ _SURGCUT3R_FRAMES = 16
 class Protocol:
     """A published protocol: call it with estimate and reference.
 
-    Attributes
-    ----------
     name : as in `PROTOCOLS`.
     description : one sentence: alignment, pairs, unit, deviations from evo.
     source : the repository and file that define it.
@@ -75,12 +73,9 @@ def _of_poses(
 def _errors(aligned: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> dict[str, ErrorSummary]:
     """Return APE over the frames and RPE over the pairs, in mm and in deg."""
     rpe_mm, rpe_rad = relative_errors(aligned, reference, pairs)
-    return {
-        "ape_mm": ErrorSummary.of(translation_errors_mm(aligned, reference)),
-        "ape_deg": ErrorSummary.of(np.degrees(rotation_errors_rad(aligned, reference))),
-        "rpe_mm": ErrorSummary.of(rpe_mm),
-        "rpe_deg": ErrorSummary.of(np.degrees(rpe_rad)),
-    }
+    errors = {"ape_mm": translation_errors_mm(aligned, reference), "rpe_mm": rpe_mm}
+    errors |= {"ape_deg": np.degrees(rotation_errors_rad(aligned, reference)), "rpe_deg": np.degrees(rpe_rad)}
+    return {name: ErrorSummary.of(values) for name, values in errors.items()}
 
 
 def _evo(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:

@@ -41,8 +41,6 @@ class Event:
 class PhantomSpec:
     """Parameters of a phantom.
 
-    Attributes
-    ----------
     scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
     frames : number of frames; None: every pose of `path_file`, or 200.
     width, height : image size, px.

@@ -24,8 +24,6 @@ _PUDDLE_MM = 14.0
 class Appearance:
     """Appearance of a scene's tissue.
 
-    Attributes
-    ----------
     base : colour of all tissue, linear RGB (3,), or the colours in space.
     texture, gloss : strength of mottling and vessels, and of highlights; 0 = none. seed : of the pattern.
     """

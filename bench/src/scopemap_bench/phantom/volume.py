@@ -74,8 +74,6 @@ def evaluate(c: np.ndarray, grid: np.ndarray, out: np.ndarray) -> None:
 class Volume:
     """Shape of the free space.
 
-    Attributes
-    ----------
     coefficients : (X, Y, Z) float32, mm: about the distance to the tissue where positive, below 0 in tissue.
     origin_mm : (3,) float64, world position of coefficient (0, 0, 0); the grid's axes are those of the world.
     voxel_mm : grid spacing.
