@@ -35,7 +35,7 @@ class EndoMapperSimFolder(UnityFolder):
     places = (Place("rgb", "image_*", ("depth/aov_image_{}.exr",)),)
     needs = (("depth/aov_image_*.exr",), (_TRAJECTORY,))
     intrinsics = (("calibration.txt", 0),)
-    said = (
+    remarks = (
         f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "
         "the data set does not state which they are, and others use them unconverted",
         "depth: 1 dm / (0.25 + 99.75 v) of channel R, which other readers take in other ways",

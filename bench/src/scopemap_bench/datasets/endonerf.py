@@ -38,7 +38,7 @@ class EndoNerfFolder(LayoutFolder):
     needs = (_POSES, ("depth", _MASKS))
     quality = "stereo"
     depth_code = ((8, 1.0, 255), (16, 1.0, 65535))
-    said = ("depth beside the images: stereo matching, no sensor; files are taken as mm",)
+    remarks = ("depth beside the images: stereo matching, no sensor; files are taken as mm",)
 
     def __init__(self, path: Path) -> None:
         file = next((path / name for name in _POSES if (path / name).is_file()), None)

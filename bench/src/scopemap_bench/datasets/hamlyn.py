@@ -23,7 +23,7 @@ class HamlynFolder(LayoutFolder):
     places = (Place("image01", depths=("depth01/{}.png",)),)
     intrinsics = (("intrinsics.txt", 0), ("calibration/{}/intrinsics.txt", 3), ("intrinsics_{}.txt", 3))
     quality = "stereo"
-    said = ("depth beside the images: stereo matching, no sensor", _NO_POSE)
+    remarks = ("depth beside the images: stereo matching, no sensor", _NO_POSE)
 
 
 class HamlynTrackingFolder(LayoutFolder):
@@ -34,7 +34,7 @@ class HamlynTrackingFolder(LayoutFolder):
     needs = (("intrinsics.txt",),)
     intrinsics = (("intrinsics.txt", 0),)
     quality = "predicted"
-    said = ("depth beside the images: predicted by Endo-Depth, cut at 300 mm", _NO_POSE)
+    remarks = ("depth beside the images: predicted by Endo-Depth, cut at 300 mm", _NO_POSE)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -40,19 +40,19 @@ class LayoutFolder(ImageFolder):
     needs : groups of files or folders (glob patterns), of each of which one is there where the layout is recognised.
     numbered : whether every picture must have a number of its own; else pictures may be counted.
     intrinsics : calibration files, `{}` the folder's name, each with the number of folders above in which it may be.
-    said : notes. Raises `InputError` without pictures; intrinsics that cannot be used are its `camera_fault`.
+    remarks : notes. Raises `InputError` without pictures; intrinsics that cannot be used are its `camera_fault`.
     """
 
     places: ClassVar[tuple[Place, ...]] = ()
     needs: ClassVar[tuple[tuple[str, ...], ...]] = ()
     numbered: ClassVar[bool] = False
     intrinsics: ClassVar[tuple[tuple[str, int], ...]] = ()
-    said: ClassVar[tuple[str, ...]] = ()
+    remarks: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, path: Path) -> None:
         self.place, pictures = _found(self.places, path)
         super().__init__(path, list(by_number(pictures).values()) if self.numbered else list(pictures))
-        self.notes += self.said
+        self.notes += self.remarks
         folders = (at for at in self.place.depths if at.endswith("/"))
         self.depth_files = next((found for at in folders if (found := numbered_images(path / at))), {})
         for number, picture in self.file_of.items():

@@ -40,7 +40,7 @@ class ServCtFolder(LayoutFolder):
     places = (Place("Left_rectified", depths=tuple(f"{truth}/DepthL/{{}}.png" for truth in _TRUTHS)),)
     needs = ((_CALIBRATION, *_TRUTHS),)
     depth_code = ((16, 1 / 256, 65535),)
-    said = ("stereo pictures, no video: the left ones are used, no pose is known, the scenes differ",)
+    remarks = ("stereo pictures, no video: the left ones are used, no pose is known, the scenes differ",)
 
     def __init__(self, path: Path) -> None:
         self._rectifiers: dict[int, Rectifier] = {}
