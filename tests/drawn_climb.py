@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from drawn_inputs import picture
+from drawn_video_sets import SCOPE_SIZE, write_frames, write_geometry
 from foreign_layouts import colmap_text
 from sample_trajectories import as_trajectory, write_run
 from scipy.spatial.transform import Rotation
-from test_datasets_endomapper import SIZE, xml
-from test_datasets_stereomis import write_frames
 
 from scopemap.geometry.se3 import se3_exp
 from scopemap.trajectory.trajectory import Trajectory
@@ -51,13 +50,11 @@ def write_reference(root: Path, poses: np.ndarray, clip: str = "Seq_001_a", scal
 
 def write_clip(root: Path, pictures: list[np.ndarray] | None = None) -> Path:
     """Write a reference with its clip beside it and EndoMapper's calibration; return the folder of the reference."""
-    shown = pictures or [picture(number, SIZE) for number in range(6)]
+    shown = pictures or [picture(number, SCOPE_SIZE) for number in range(6)]
     folder = write_reference(root, path_of(len(shown)))
     write_frames(root / "Seq_001_a.mp4", shown, rate=50)
     (folder / "Seq_001_info.json").write_text(json.dumps({"endoscope_number": 1}))
-    calibration = root / "Calibrations" / "Endoscope_01" / "Endoscope_01_geometrical.xml"
-    calibration.parent.mkdir(parents=True)
-    calibration.write_text(xml())
+    write_geometry(root)
     return folder
 
 

@@ -12,19 +12,23 @@ from drawn_calibrations import CAMERAS, write_forms
 from drawn_climb import write_clip
 from drawn_colmap import write_colmap
 from drawn_dicom import write_dicom_video, write_frames
+from drawn_image_sets import (
+    write_endogslam,
+    write_endonerf,
+    write_experiment,
+    write_oneslam,
+    write_real,
+    write_rectified,
+    write_sim,
+    write_simcol,
+    write_tracking,
+    write_tum,
+    write_unity,
+    write_v2,
+)
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
-from test_datasets_c3vd_layouts import write_endogslam, write_v2
-from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
-from test_datasets_endomapper_sim import write_sim
-from test_datasets_endonerf import write_scene as write_llff
-from test_datasets_endoslam import write_real, write_unity
-from test_datasets_hamlyn import write_images, write_rectified
-from test_datasets_oneslam import write_oneslam
-from test_datasets_servct import write_experiment
-from test_datasets_simcol import write_simcol
-from test_datasets_stereomis import write_stereomis
-from test_datasets_tum import write_tum
+from drawn_video_sets import write_endomapper_with_model, write_stereomis
 
 from scopemap.cameras.formats.writing import write_calibration
 
@@ -34,18 +38,6 @@ def write_pictures(folder: Path) -> Path:
     for number in range(4):
         save(folder / f"{number:03d}.png", picture(number))
     return folder
-
-
-def write_tracking(folder: Path) -> Path:
-    write_images(folder, [0, 1, 2], "color", "depth")
-    (folder / "intrinsics.txt").write_text("60 0 40 0 60 32 0 0 1\n")
-    return folder
-
-
-def write_endomapper_with_model(folder: Path) -> Path:
-    sequence = write_endomapper(folder)
-    write_models(archive_of(sequence), {0: images_bin([1, 2, 3])})
-    return sequence
 
 
 Writer = Callable[[Path], Path]
@@ -62,11 +54,11 @@ WRITERS: dict[str, Writer] = {
     "scared-c": lambda folder: write_scared_c(folder, [2, 3, 5, 9]),
     "hamlyn": write_rectified,
     "hamlyn-tracking": write_tracking,
-    "endonerf": write_llff,
+    "endonerf": write_endonerf,
     "serv-ct": write_experiment,
     "tum": write_tum,
     "oneslam": write_oneslam,
-    "simcol3d": lambda folder: write_simcol(_made(folder)),
+    "simcol3d": write_simcol,
     "endoslam:unity": lambda folder: write_unity(folder / "UnityCam" / "Colon"),
     "endoslam:real": lambda folder: write_real(folder / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1"),
     "stereomis": write_stereomis,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.geometry.se3 import se3, se3_exp, so3_exp
 from scopemap.trajectory.trajectory import Trajectory, write_tum
 
 
@@ -47,3 +49,35 @@ def vector_a() -> tuple[np.ndarray, np.ndarray]:
         estimated.append(se3(A @ Rq @ turn, 0.4 * A @ (q + noise) + [5, -3, 2]))
         reference.append(se3(Rq, q))
     return np.stack(estimated), np.stack(reference)
+
+
+def last_digit(*values: float) -> object:
+    """Figures given to six decimals, to the last of them."""
+    return pytest.approx(values, abs=5.1e-7)
+
+
+def random_pair(seed: int, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Return two paths (count, 4, 4) that have nothing to do with each other."""
+    rng = np.random.default_rng(seed)
+
+    def walk() -> np.ndarray:
+        T, poses = np.eye(4), []
+        for _ in range(count):
+            T = T @ se3_exp(np.concatenate([rng.normal(scale=0.2, size=3), rng.normal(scale=2, size=3)]))
+            poses.append(T)
+        return np.stack(poses)
+
+    return walk(), walk()
+
+
+def evo_pair(estimated: np.ndarray, reference: np.ndarray, mode: str, first: int | None = None) -> tuple:
+    """Return reference and aligned estimate as evo has them."""
+    from evo.core.trajectory import PosePath3D
+
+    theirs, truth = (PosePath3D(poses_se3=list(copy.deepcopy(poses))) for poses in (estimated, reference))
+    if mode == "origin":
+        theirs.align_origin(truth)
+    elif mode != "none":
+        kinds = {"correct_scale": mode == "sim3", "correct_only_scale": mode == "scale"}
+        theirs.align(truth, **kinds, n=-1 if first is None else first)
+    return truth, theirs

@@ -12,10 +12,9 @@ import av
 import cv2
 import numpy as np
 import tifffile
+from drawn_image_sets import write_depth_exr, write_list
 from drawn_scared import write_tar
 from drawn_scene import RATE_HZ, Content
-from test_datasets_endomapper_sim import write_depth as write_exr
-from test_datasets_tum import write_list
 
 Put = Callable[[Path, Content], None]
 
@@ -144,7 +143,7 @@ def depth_buffers(folder: Path, content: Content) -> None:
         v = (100 / np.where(depth_mm > 0, depth_mm, np.nan) - 0.25) / 99.75
         v = np.rint(255 * v) / 255 if number in content.shallow else v
         file = folder / f"depth/aov_image_{number:04d}.exr"
-        write_exr(file, v.astype(np.float32))
+        write_depth_exr(file, v.astype(np.float32))
         file.write_bytes(content.depth_damage.get(number, bytes)(file.read_bytes()))
 
 

@@ -11,8 +11,10 @@ from typing import Literal
 import numpy as np
 from drawn_colmap import CAMERA as COLMAP_CAMERA
 from drawn_colmap import binary_images, text_images, write_model
+from drawn_image_sets import SHEET_COLUMNS, SIM_HEADER, UNITY_HEADER, llff, write_xlsx
 from drawn_scared import frame_json, write_tar
 from drawn_scene import Content, quaternion
+from drawn_video_sets import archive_of, write_models
 from stored_containers import dicom_frames, dicom_video, recording
 from stored_frames import (
     Put,
@@ -26,11 +28,6 @@ from stored_frames import (
     red_depths,
     scene_points,
 )
-from test_datasets_endomapper import archive_of, write_models
-from test_datasets_endomapper_sim import HEADER as SIM_HEADER
-from test_datasets_endonerf import llff
-from test_datasets_endoslam import COLUMNS, write_xlsx
-from test_datasets_endoslam import HEADER as UNITY_HEADER
 
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.geometry.se3 import inverse
@@ -129,7 +126,7 @@ def _unity_tables(folder: Path, content: Content) -> None:
 def _workbook(folder: Path, content: Content) -> None:
     rows = [[None, number, number, *_stamped(T, 1e-3)] for number, T in sorted(content.poses.items())]
     cells = [[None if isinstance(x, float) and np.isnan(x) else x for x in row] for row in rows]
-    _damaged(write_xlsx(folder / "Poses" / "poses.xlsx", [[None, *COLUMNS], *cells]), content)
+    _damaged(write_xlsx(folder / "Poses" / "poses.xlsx", [[None, *SHEET_COLUMNS], *cells]), content)
 
 
 def _world_to_camera(T: np.ndarray) -> tuple[float, ...]:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 from drawn_climb import frames_of, path_of, write_finished_run
+from drawn_video_sets import write_frames
 from front_door import call, refused
-from test_datasets_stereomis import write_frames
 from tiny_phantom import write_tiny
 
 from scopemap.errors import InputError
@@ -69,12 +69,6 @@ def test_it_is_read_back_with_its_submaps(run: Path, tmp_path: Path) -> None:
     for one, other in zip((found, *found.others), (ours, *ours.others), strict=True):
         assert one.indices.tolist() == other.indices.tolist()
         np.testing.assert_allclose(one.T_world_camera, other.T_world_camera, atol=1e-8)
-
-
-def test_submaps_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    submaps = [frames_of(path_of(3), first) for first in range(0, 36, 3)]
-    found = read_trajectory(write_finished_run(tmp_path / "result", *submaps))
-    assert [other.indices[0] for other in found.others] == list(range(3, 36, 3))
 
 
 def test_what_cannot_be_exported_is_refused(run: Path, tmp_path: Path) -> None:
@@ -205,11 +199,3 @@ def test_one_call_of_the_container_writes_every_clip(tmp_path: Path) -> None:
     assert submission_problems(out, videos) == [f"{out / 'Seq_002_a' / number}: missing" for number in "12345"]
     found = read_trajectory(out / "Seq_001_a" / "5")
     assert found.indices.tolist() == list(range(len(pictures) + 1))
-
-
-def test_the_container_copies_files_that_exist() -> None:
-    lines = (ROOT / "containers/climb/Containerfile").read_text().splitlines()
-    copied = [source for line in lines if line.startswith("COPY ") for source in line.split()[1:-1]]
-    assert "containers/climb/entrypoint" in copied
-    assert [source for source in copied if not (ROOT / source).exists()] == []
-    assert os.access(ROOT / "containers/climb/entrypoint", os.X_OK)

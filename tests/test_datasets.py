@@ -1,4 +1,4 @@
-"""Reading inputs: videos, folders, C3VD, 7-Scenes; what is wrong with them; and the real folders."""
+"""Reading inputs: folders of images, videos, their camera and what is wrong with them; and the real folders."""
 
 from __future__ import annotations
 
@@ -8,22 +8,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drawn_inputs import SIZE, frames_of, number_in, picture, poses, save, write_c3vd, write_video
+from drawn_inputs import SIZE, frames_of, number_in, picture, save, write_c3vd, write_video
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.geometry.se3 import inverse, se3_exp, transform
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence
-from scopemap_bench.datasets.c3vd import CAMERA, read_poses
 
 # ---- folders of images
 
 
 def test_images_are_sorted_by_number_and_keep_it(tmp_path: Path) -> None:
-    for number in (9, 10, 2, 100):
-        save(tmp_path / f"img_{number}.png", picture(number % 20))
+    for number, suffix in ((9, "png"), (10, "jpg"), (2, "tif"), (100, "bmp")):
+        save(tmp_path / f"img_{number}.{suffix}", picture(number % 20))
         save(tmp_path / f"img_{number}_mask.png", picture(0))
     (tmp_path / "notes.txt").write_text("not an image")
     sequence = open_sequence(tmp_path)
@@ -31,18 +28,11 @@ def test_images_are_sorted_by_number_and_keep_it(tmp_path: Path) -> None:
     assert [f.index for f in frames] == [2, 9, 10, 100]
     assert [number_in(f.rgb) for f in frames] == [2, 9, 10, 0]
     assert [f.time_s for f in frames] == pytest.approx([2 / 30, 9 / 30, 10 / 30, 100 / 30])
-    assert frames[0].name == "img_2.png"
+    assert frames[0].name == "img_2.tif"
     assert sequence.count == 4
     assert sequence.source.name == "images"
     assert any("time stamps" in note for note in sequence.notes)
     assert all(truth is None for _, truth in sequence)
-
-
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "bmp"])
-def test_kinds_of_images(suffix: str, tmp_path: Path) -> None:
-    for i in range(3):
-        save(tmp_path / f"{i}.{suffix}", picture(i))
-    assert [number_in(f.rgb) for f in frames_of(open_sequence(tmp_path))] == [0, 1, 2]
 
 
 def test_grey_deep_and_transparent_images_become_rgb(tmp_path: Path) -> None:
@@ -52,22 +42,6 @@ def test_grey_deep_and_transparent_images_become_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "2.png"), np.dstack([grey, grey, grey, 255 - grey]))
     for frame in frames_of(open_sequence(tmp_path, settings=InputSettings(skip_duplicates=False))):
         np.testing.assert_array_equal(frame.rgb, np.repeat(grey[..., None], 3, -1))
-
-
-def test_names_without_numbers_are_counted(tmp_path: Path) -> None:
-    for i, name in enumerate(("b.png", "a.png")):
-        save(tmp_path / name, picture(i))
-    assert [(f.index, f.name) for f in frames_of(open_sequence(tmp_path))] == [(0, "a.png"), (1, "b.png")]
-
-
-@pytest.mark.parametrize("nesting", ["video1", "video1/video1", "scene/images"])
-def test_a_nested_folder_is_found(nesting: str, tmp_path: Path) -> None:
-    folder = tmp_path / nesting
-    folder.mkdir(parents=True)
-    (tmp_path / "readme.txt").write_text("hello")
-    for i in range(2):
-        save(folder / f"{i}.png", picture(i))
-    assert open_sequence(tmp_path).path == folder
 
 
 @pytest.mark.parametrize(
@@ -127,13 +101,6 @@ def test_a_calibration_file_wins_and_is_said(tmp_path: Path) -> None:
         sequence.with_focal(100.0, "a guess")
 
 
-def test_a_calibration_for_other_images_is_refused(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    write_calibration(PinholeCamera(900.0, 900.0, 960.0, 540.0, 1920, 1080), tmp_path / "hd.yaml")
-    with pytest.raises(CalibrationError, match=r"1920x1080 px.*135x108 px"):
-        open_sequence(folder, camera=tmp_path / "hd.yaml")
-
-
 def test_the_working_size_is_chosen_or_given(tmp_path: Path) -> None:
     for i in range(2):
         save(tmp_path / f"{i}.png", picture(i, (800, 600)))
@@ -144,77 +111,7 @@ def test_the_working_size_is_chosen_or_given(tmp_path: Path) -> None:
     assert frames_of(given)[0].rgb.shape == (150, 200, 3)
 
 
-# ---- C3VD
-
-
-@pytest.mark.parametrize("transposed", [True, False], ids=["stored", "literal"])
-@pytest.mark.parametrize("name", ["{}_color.png", "{:04d}_color.png"])
-def test_c3vd(transposed: bool, name: str, tmp_path: Path) -> None:
-    sequence = open_sequence(write_c3vd(tmp_path / "c", transposed=transposed, name=name))
-    assert sequence.source.name == "c3vd"
-    assert sequence.rectifier.source == CAMERA.resized(*SIZE)
-    pairs = list(sequence)
-    assert [f.index for f, _ in pairs] == list(range(11))
-    for (frame, truth), T_world_camera in zip(pairs, poses(13), strict=False):
-        assert number_in(frame.rgb) == frame.index == truth.index
-        np.testing.assert_allclose(truth.T_world_camera, T_world_camera, atol=1e-6)
-        assert truth.depth_mm[54, 67] == pytest.approx(32768 / 65535 * 100)
-        assert truth.depth_mm.dtype == np.float32
-        assert truth.quality == "registered"
-    assert np.isnan(sequence.source.truth(0).depth_mm[[0, -1]]).all()
-
-
-def test_poses_without_motion_are_read_as_stored(tmp_path: Path) -> None:
-    rotation = se3_exp(np.array([0.3, -0.2, 0.5, 0, 0, 0]))
-    (tmp_path / "pose.txt").write_text(",".join(str(x) for x in rotation.T.ravel()))
-    np.testing.assert_allclose(read_poses(tmp_path / "pose.txt")[0], rotation)
-
-
-def test_a_calibration_beside_the_frames_wins_with_its_depth_scale(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    write_calibration(PinholeCamera(100.0, 100.0, 67.0, 53.5, *SIZE), folder / "camera.yaml", depth_scale_mm=0.005)
-    sequence = open_sequence(folder)
-    assert sequence.camera.fx == 100
-    assert "camera.yaml" in sequence.camera_source
-    _, truth = next(iter(sequence))
-    assert truth.depth_mm[54, 67] == pytest.approx(32768 * 0.005)
-    assert truth.quality == "exact"
-
-
-def test_c3vd_without_depth_has_poses_only(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    for file in folder.glob("*_depth.tiff"):
-        file.unlink()
-    _, truth = next(iter(open_sequence(folder)))
-    assert truth.depth_mm is None
-    assert truth.T_world_camera is not None
-
-
-def test_an_image_without_a_pose_is_named(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c", count=4)
-    save(folder / "17_color.png", picture(17))
-    with pytest.raises(InputError, match=r"17_color\.png has no line in pose\.txt"):
-        open_sequence(folder)
-
-
-@pytest.mark.parametrize("text", ["1,2,3\n", "", "a b c", ",".join(["1.5"] * 16)])
-def test_poses_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / "pose.txt").write_text(text)
-    with pytest.raises(InputError, match=r"pose\.txt"):
-        read_poses(tmp_path / "pose.txt")
-
-
 # ---- video
-
-
-@pytest.mark.parametrize("suffix", ["mp4", "avi", "mov", "mkv"])
-def test_videos(suffix: str, tmp_path: Path) -> None:
-    sequence = open_sequence(write_video(tmp_path / f"scope.{suffix}", 8))
-    frames = frames_of(sequence)
-    assert [number_in(f.rgb) for f in frames] == list(range(8))
-    np.testing.assert_allclose(np.diff([f.time_s for f in frames]), 0.04, atol=2e-3)
-    assert (sequence.name, sequence.count, sequence.warnings) == ("scope", 8, [])
-    assert len(frames_of(sequence)) == 8  # a second walk starts again
 
 
 @pytest.mark.parametrize(("suffix", "options"), [("avi", {}), ("mkv", {}), ("mp4", {"movflags": "faststart"})])
@@ -321,16 +218,6 @@ def test_options_that_cannot_be_are_refused(tmp_path: Path) -> None:
         open_sequence(video, fov_deg=0)
 
 
-def test_a_named_data_set_is_believed(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    sequence = open_sequence(folder, dataset="images")
-    assert sequence.source.name == "images"
-    assert not sequence.calibrated
-    (folder / "pose.txt").unlink()
-    with pytest.raises(InputError, match=r"pose\.txt"):
-        open_sequence(folder, dataset="c3vd")
-
-
 # ---- the real folders
 
 
@@ -361,9 +248,3 @@ def test_real_c3vd_video_without_depth(real_data: Path) -> None:
     assert (sequence.count, sequence.camera.width, sequence.camera.height) == (276, 337, 270)
     centres = np.array([sequence.source.pose(number)[:3, 3] for number in range(276)])
     assert np.linalg.norm(np.diff(centres, axis=0), axis=1).sum() == pytest.approx(54.7, abs=0.1)
-
-
-@pytest.mark.real
-def test_real_sevenscenes(real_data: Path) -> None:
-    pairs = list(open_sequence(real_data / "rgbd" / "7scenes_kitchen_100f", frames=slice(0, 11, 10)))
-    assert np.nanmedian(reprojection_error_mm(*pairs)) < 10

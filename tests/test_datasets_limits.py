@@ -7,12 +7,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from drawn_image_sets import ROOM, STAMPS, TUM_SIZE, buffer, replace_line, write_exr, write_tum, write_xlsx
 from drawn_inputs import picture, save
-from test_datasets_endomapper import archive_of, images_bin, write_endomapper, write_models
-from test_datasets_endomapper_sim import buffer, write_exr
-from test_datasets_endoslam import write_xlsx
-from test_datasets_stereomis import FRAMES, write_stereomis
-from test_datasets_tum import ROOM, SIZE, STAMPS, replace_line, write_tum
+from drawn_video_sets import FRAMES, archive_of, images_bin, write_endomapper, write_models, write_stereomis
 
 from scopemap.cameras.formats.colmap_model import read_largest_model
 from scopemap.errors import InputError
@@ -103,7 +100,7 @@ def test_a_count_of_frames_beyond_the_file_is_not_believed(
 def test_names_that_lead_out_of_a_tum_folder_are_not_there(way: str, tmp_path: Path) -> None:
     folder = write_tum(tmp_path / ROOM)
     outside = tmp_path / "outside.png"
-    save(outside, picture(1, SIZE))
+    save(outside, picture(1, TUM_SIZE))
     name = {"absolute": str(outside), "above": "rgb/../../outside.png"}[way]
     for file in ("rgb.txt", "depth.txt"):
         replace_line(folder / file, 4, f"{STAMPS[1]:.6f} {name}")

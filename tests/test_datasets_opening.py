@@ -12,16 +12,14 @@ from drawn_colmap import NAMES, stored_pose, write_colmap, write_model
 from drawn_datasets import write_pictures
 from drawn_dicom import dataset, film, native
 from drawn_dicom import save as save_dicom
+from drawn_image_sets import at_rest, llff, write_endonerf, write_json, write_oneslam
 from drawn_inputs import picture, save, write_c3vd, write_video
-from test_datasets_endonerf import at_rest, llff
-from test_datasets_endonerf import write_scene as write_llff
-from test_datasets_oneslam import write_json, write_oneslam
 
 from scopemap.errors import CalibrationError, InputError, ScopemapError
 from scopemap.io.opening import open_sequence, open_source
 
 
-@pytest.mark.parametrize("write", [write_oneslam, write_colmap, write_llff])
+@pytest.mark.parametrize("write", [write_oneslam, write_colmap, write_endonerf])
 @pytest.mark.parametrize("nesting", ["", "outer"])
 def test_images_can_be_named_where_a_data_set_is(write: Callable[[Path], Path], nesting: str, tmp_path: Path) -> None:
     folder = write(tmp_path / nesting / "proj")
@@ -63,7 +61,7 @@ def unknown_lens(folder: Path) -> Path:
 
 
 def focal_length_of_no_camera(folder: Path) -> Path:
-    return write_llff(folder, llff(at_rest(), focal_px=1e9))
+    return write_endonerf(folder, llff(at_rest(), focal_px=1e9))
 
 
 def calibration_of_larger_images(folder: Path) -> Path:

@@ -20,7 +20,6 @@ from scopemap.io.reference import read_reference, reference_trajectory
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.trajectory import write_tum
 from scopemap_bench.cli.evaluate import evaluate
-from scopemap_bench.plan import MethodPlan
 from scopemap_bench.scoring import default_protocol
 
 KNOWS_POSES = sorted(
@@ -62,7 +61,7 @@ def test_true_poses_of_any_data_set_can_be_named(name: str, tmp_path: Path) -> N
     assert figures["ate_max_mm"] == pytest.approx(0.25, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["images", *KNOWS_DEPTH_ONLY])
+@pytest.mark.parametrize("name", ["images", "hamlyn"])
 def test_depth_alone_can_be_compared(name: str, tmp_path: Path) -> None:
     folder, run = WRITERS[name](tmp_path / "input"), tmp_path / "run"
     settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
@@ -147,16 +146,3 @@ def test_depth_of_a_run_with_another_camera_is_compared_pixel_by_pixel(tmp_path:
     (run / "source_camera.yaml").unlink()  # as older runs left it
     with pytest.raises(InputError, match="another camera"):
         _figures(run, "--truth", folder, "--depth", "median")
-
-
-def test_frames_are_the_same_for_all_methods_of_a_plan() -> None:
-    with pytest.raises(ValueError, match="all methods see the same frames"):
-        MethodPlan(name="thin", settings={"input.fps": 5})
-    assert MethodPlan(name="assumed", settings={"input.focal": "assume"}).settings
-
-
-def test_a_run_on_two_views_is_compared_with_a_data_set_of_one(tmp_path: Path) -> None:
-    folder, run = WRITERS["hamlyn"](tmp_path / "input"), tmp_path / "run"
-    run.mkdir()
-    (run / "config.toml").write_text('input.stereo = "left-right"\n', encoding="utf-8")
-    assert open_truth(run, folder).source.name == "hamlyn"

@@ -30,6 +30,7 @@ from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import se3_exp
 from scopemap.trajectory.formats.opening import read_trajectory, trajectory_kinds
 from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.trajectories import splatam
 
 # ---- SCARED
 
@@ -75,33 +76,13 @@ def test_scared_c_counts_from_one_with_gaps_and_names_its_calibration(tmp_path: 
     assert_is(found, poses, indices)
 
 
-@pytest.mark.parametrize(("per_second", "frames_per_s"), [(1.0, 30), (1e3, 25), (1e6, 60), (1e9, 30), (1e9, 12.5)])
-def test_scared_time_stamps_of_any_unit_are_seconds(tmp_path: Path, per_second: float, frames_per_s: float) -> None:
-    # Most frames are missing, and the first is not frame 0, which is where time starts.
-    indices = [2, 5, 8, 12, 13]
-    found = read_trajectory(
-        write_files(tmp_path, scared_documents(moving_camera(5), indices, per_second / frames_per_s))
-    )
-    np.testing.assert_allclose(found.times_s, np.array(indices) / frames_per_s, rtol=1e-9)
-
-
-@pytest.mark.parametrize("step", [None, 0.0, -5.0])
-def test_scared_without_ascending_stamps_counts_30_frames_per_s(tmp_path: Path, step: float | None) -> None:
-    found = read_trajectory(write_files(tmp_path, scared_documents(moving_camera(5), [1, 2, 3, 5, 6], step)))
-    np.testing.assert_allclose(found.times_s, np.array([1, 2, 3, 5, 6]) / 30)
-    assert "30 frames per s (assumed)" in found.source
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("{", r"frame_data000003\.json: expected a JSON object with a 4x4 'camera-pose'"),
-        ("[1, 2]", r"frame_data000003\.json: expected a JSON object"),
-        ("{}", r"frame_data000003\.json: expected a JSON object.*camera-pose"),
         (json.dumps({"camera-pose": np.eye(3).tolist()}), r"frame_data000003\.json: .*shape \(3, 3\)"),
         (json.dumps({"camera-pose": [[float("nan")] * 4] * 4}), r"frame_data000003\.json: a pose holds NaN"),
         (json.dumps({"camera-pose": (2 * np.eye(4)).tolist()}), r"frame_data000003\.json: not a rigid motion"),
-        (json.dumps({"camera-pose": moving_camera()[3].T.tolist()}), r"frame_data000003\.json: not a rigid motion"),
     ],
 )
 def test_bad_scared_files_are_named(tmp_path: Path, text: str, message: str) -> None:
@@ -109,19 +90,6 @@ def test_bad_scared_files_are_named(tmp_path: Path, text: str, message: str) -> 
     for path in (write_files(tmp_path / "a", documents), write_tar(tmp_path / "b" / "frame_data.tar.gz", documents)):
         with pytest.raises(InputError, match=message):
             read_trajectory(path)
-
-
-def test_damaged_and_empty_scared_archives_are_refused(tmp_path: Path) -> None:
-    documents = scared_documents(moving_camera(50), list(range(50)))
-    good = write_tar(tmp_path / "frame_data.tar.gz", documents).read_bytes()
-    for damaged in (b"no tar", good[: len(good) // 2]):
-        (tmp_path / "frame_data.tar.gz").write_bytes(damaged)
-        with pytest.raises(InputError, match=r"frame_data\.tar\.gz: the archive is damaged"):
-            read_trajectory(tmp_path)
-    with pytest.raises(InputError, match="holds no frame_data"):
-        read_trajectory(write_tar(tmp_path / "other.tar.gz", {"readme.txt": "hello"}))
-    with pytest.raises(InputError, match="looked for frame_data"):
-        read_trajectory(write_files(tmp_path / "empty", {}), kind="scared")
 
 
 # ---- OneSLAM, BodySLAM
@@ -187,12 +155,6 @@ def test_log_that_could_point_either_way_asks_for_the_kind(tmp_path: Path) -> No
     for path in (tmp_path, tmp_path / "trajectory.log"):
         with pytest.raises(InputError, match=r"name the kind, 'open3d' .* or 'endo-depth'"):
             read_trajectory(path)
-
-
-def test_log_numbers_its_frames_where_its_numbers_ascend(tmp_path: Path) -> None:
-    for first, expected in ((lambda i: f"{3 * i} {i} {i + 1}", range(0, 60, 3)), (lambda i: f"0 0 {i}", range(20))):
-        (tmp_path / "a.log").write_text(log_text(moving_camera(), first))
-        assert read_trajectory(tmp_path / "a.log", kind="open3d").indices.tolist() == list(expected)
 
 
 @pytest.mark.parametrize(
@@ -320,3 +282,117 @@ def test_any_path_is_the_same_in_every_form(
         # Eight decimals of a metre, and float32, are what some forms keep.
         np.testing.assert_allclose(found.T_world_camera, poses[: len(found)], atol=2e-3)
         assert found.indices.tolist() == frames[: len(found)]
+
+
+# ---- SplaTAM's family
+
+
+HELD_OUT = [frame for frame in range(100) if frame % 8 != 7]
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+@pytest.mark.parametrize(
+    ("kind", "config", "frames"),
+    [
+        ("endogslam", None, HELD_OUT),
+        ("splatam", None, list(range(100))),
+        ("auto", 'start=0, stride=1, train_or_test="train"', HELD_OUT),
+        ("auto", "start=0, stride=1", list(range(100))),
+        ("auto", "start=3, stride=2, train_or_test='all'", list(range(3, 100, 2))),
+        ("auto", "start=3, stride=2, train_or_test='train'", [f for f in range(3, 100) if (f - 3) % 8 != 7][::2]),
+        ("splatam", 'train_or_test="train"', list(range(100))),
+    ],
+)
+def test_gaussian_slam_is_inverted_and_numbered_by_its_split(
+    tmp_path: Path, unit: str, kind: str, config: str | None, frames: list[int]
+) -> None:
+    poses = moving_camera(30)
+    folder = write_splatam(tmp_path, splatam_arrays(poses, unit), config)
+    for path in (folder, folder / "params.npz"):
+        found = read_trajectory(path, kind=kind, unit=unit)
+        assert_is(found, poses, frames[:30], atol=1e-4)
+        assert f"world-to-camera inverted, {unit} (assumed)" in found.source
+        assert str(frames[2]) in found.source
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        None,
+        "stride=int(os.environ['STRIDE'])",
+        "stride=0",
+        "train_or_test='test'",
+        "stride=1))) #",
+    ],
+)
+def test_gaussian_slam_of_an_unknown_split_asks_for_the_kind(tmp_path: Path, config: str | None) -> None:
+    folder = write_splatam(tmp_path, splatam_arrays(moving_camera()), config)
+    with pytest.raises(InputError, match=r"name the kind: 'endogslam' .* or 'splatam'"):
+        read_trajectory(folder)
+
+
+def test_config_of_a_run_is_read_but_never_run(tmp_path: Path) -> None:
+    trap = f"stride=1, trap=open({str(tmp_path / 'sprung')!r}, 'w')"
+    assert len(read_trajectory(write_splatam(tmp_path / "run", splatam_arrays(moving_camera()), trap))) == 20
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_untracked_tail_of_a_checkpoint_is_left_out(tmp_path: Path) -> None:
+    arrays = splatam_arrays(moving_camera(), seed=1)
+    arrays["cam_unnorm_rots"][..., 12:] = np.array([1, 0, 0, 0])[:, None]
+    arrays["cam_trans"][..., 12:] = 0
+    np.savez(tmp_path / "params11.npz", **arrays)
+    found = read_trajectory(tmp_path / "params11.npz", kind="endogslam")
+    assert_is(found, moving_camera()[:12], HELD_OUT[:12], atol=1e-4)
+
+
+class Trap:
+    """Unpickling it leaves a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str, str]]:
+        return open, (str(self.path), "w")
+
+
+def test_pickles_are_never_loaded(tmp_path: Path) -> None:
+    sprung = tmp_path / "sprung"
+    trap = np.array([Trap(sprung)], dtype=object)
+    arrays = splatam_arrays(moving_camera())
+    # Exposure settings, pickled beside the poses, do no harm; pickled poses are refused.
+    np.savez(tmp_path / "params.npz", **arrays, exp_list=trap)
+    assert len(read_trajectory(tmp_path / "params.npz", kind="splatam")) == 20
+    np.savez(tmp_path / "params.npz", **(arrays | {"cam_trans": trap}))
+    with pytest.raises(InputError, match="no pickled objects"):
+        read_trajectory(tmp_path / "params.npz", kind="splatam")
+    for name, protocol in (("test1.pkl", 4), ("odometry", 2), ("old.pickle", 0)):
+        (tmp_path / name).write_bytes(pickle.dumps(Trap(sprung), protocol=protocol))
+        for kind in ("auto", "endo-depth"):
+            with pytest.raises(InputError, match=r"cannot read|expected numbers"):
+                read_trajectory(tmp_path / name, kind=kind)
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"cam_trans": np.zeros((1, 3, 4))}, r"found \(1, 4, 20\) and \(1, 3, 4\)"),
+        ({"cam_unnorm_rots": np.zeros((4, 20))}, r"found \(4, 20\)"),
+        ({"cam_unnorm_rots": np.ones((1, 4, 20)) * (np.arange(20) != 5)}, "column 5: the quaternion has length nan"),
+        ({"cam_trans": np.where(np.arange(20) == 6, np.nan, 1.0) * np.ones((1, 3, 1))}, "column 6: a pose holds NaN"),
+    ],
+)
+def test_bad_gaussian_slam_files_are_refused(tmp_path: Path, changed: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_trajectory(write_splatam(tmp_path, splatam_arrays(moving_camera()) | changed), kind="splatam")
+
+
+def test_poses_that_grow_are_refused_and_gaussians_stay_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(splatam, "_MOST_BYTES", 1 << 20)
+    arrays = splatam_arrays(moving_camera())
+    np.savez_compressed(tmp_path / "params.npz", **(arrays | {"means3D": np.zeros((200_000, 3))}))
+    assert len(read_trajectory(tmp_path / "params.npz", kind="splatam")) == 20
+    np.savez_compressed(tmp_path / "params.npz", **(arrays | {"cam_trans": np.zeros((1, 3, 200_000))}))
+    with pytest.raises(InputError, match=r"cam_trans\.npy: it holds 4 MB, expected 1 MB at most"):
+        read_trajectory(tmp_path / "params.npz", kind="splatam")

@@ -23,12 +23,12 @@ import av
 import numpy as np
 import pytest
 from drawn_datasets import WRITERS
+from drawn_image_sets import write_real
 from drawn_inputs import picture, save, write_c3vd
 from drawn_scared import json_files, point_files
 from drawn_trajectories import write_trajectories
+from drawn_video_sets import XML, archive_of, images_bin, write_endomapper
 from front_door import refused
-from test_datasets_endomapper import XML, archive_of, images_bin, write_endomapper
-from test_datasets_endoslam import write_real
 
 from scopemap.errors import InputError, ScopemapError
 from scopemap.io.opening import open_sequence

@@ -6,7 +6,6 @@ import gzip
 import io
 import tarfile
 import tracemalloc
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -52,11 +51,6 @@ def test_folder_and_archives_read_alike(form: str, tmp_path: Path) -> None:
     assert all(found.read(number) == noise(number, 1000) for number in range(12))
 
 
-def test_nothing_is_found_where_nothing_is(tmp_path: Path) -> None:
-    write_loose(tmp_path / "points", {"other.bin": b""})
-    assert find_numbered(tmp_path, ("points", "elsewhere"), "point", (".bin",)) is None
-
-
 def test_an_archive_in_any_order_is_read_by_number(tmp_path: Path) -> None:
     files = members(9)
     order = [3, 0, 8, 1, 7, 2, 6, 5, 4]
@@ -66,14 +60,6 @@ def test_an_archive_in_any_order_is_read_by_number(tmp_path: Path) -> None:
     assert found.numbers() == list(range(9))
     # Read in its own order, an archive is decompressed once.
     assert find(tmp_path).stored() == order
-
-
-def test_going_back_reads_the_same(tmp_path: Path) -> None:
-    write_tar(tmp_path / "points.tar.gz", members(8, MB // 4))
-    found = find(tmp_path)
-    assert found.numbers() == list(range(8))
-    for number in (6, 1, 7, 0):
-        assert found.read(number) == noise(number, MB // 4)
 
 
 def test_reading_keeps_nothing_in_memory_and_writes_nothing(tmp_path: Path) -> None:
@@ -121,7 +107,7 @@ def test_links_and_paths_that_lead_outside_do_no_harm(tmp_path: Path) -> None:
     assert sorted(tmp_path.parent.rglob("*")) == before
 
 
-@pytest.mark.parametrize("kept", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("kept", [0.02, 0.9])
 def test_an_archive_that_breaks_off_is_reported(kept: float, tmp_path: Path) -> None:
     file = write_tar(tmp_path / "points.tar.gz", members(100))
     data = file.read_bytes()
@@ -151,25 +137,6 @@ def test_headers_that_lead_back_are_not_read_for_ever(tmp_path: Path) -> None:
     file.write_bytes(data)
     with pytest.raises(InputError, match="damaged or incomplete"):
         find(tmp_path).numbers()
-
-
-def test_any_damage_ends_in_one_kind_of_error(tmp_path: Path) -> None:
-    """100 mutated archives: bytes changed in the tar or in the gzip around it."""
-    plain = write_tar(tmp_path / "source.tar", members(4, 200)).read_bytes()
-    rng = np.random.default_rng(0)
-    file = tmp_path / "points.tar.gz"
-    refused = 0
-    for trial in range(100):
-        data = bytearray(plain if trial % 2 else gzip.compress(plain, 1, mtime=0))
-        for position in rng.integers(0, len(data), rng.integers(1, 5)):
-            data[position] = rng.integers(256)
-        file.write_bytes(zlib.compress(data, 1, 31) if trial % 2 else bytes(data))
-        try:
-            found = find(tmp_path)
-            assert len([found.read(number) for number in found.numbers()]) <= 4
-        except InputError:
-            refused += 1
-    assert 10 < refused < 100
 
 
 # ---- headers without limit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from chosen_settings import chosen
@@ -12,7 +11,6 @@ from drawn_inputs import number_in, poses, write_sevenscenes
 
 from scopemap.config import DepthSettings
 from scopemap.depth.create import create_depth
-from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 
 
@@ -50,26 +48,3 @@ def test_sevenscenes_with_other_intrinsics_count_as_registered(tmp_path: Path) -
     np.testing.assert_allclose(truths[2].T_world_camera, poses(3)[2], atol=1e-6)
     assert np.isnan(truths[0].depth_mm[:4]).all()
     np.testing.assert_allclose(truths[0].depth_mm[6:], 1500)
-
-
-def edge_contrast(frame: Frame, depth_mm: np.ndarray) -> float:
-    """Colour gradient on the near side of depth's jumps over its mean: large where colour and depth are registered."""
-    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
-    known = np.isfinite(depth_mm)
-    square = np.ones((3, 3))
-    far_mm = cv2.dilate(np.where(known, depth_mm, 0).astype(np.float32), square)
-    near_mm = cv2.erode(np.where(known, depth_mm, 1e6).astype(np.float32), square)
-    jump = known & (far_mm > 1.08 * near_mm) & (depth_mm < 1.02 * near_mm)
-    return float(gradient[jump].mean() / gradient[known].mean())
-
-
-@pytest.mark.real
-def test_real_colour_and_depth_are_registered(real_data: Path) -> None:
-    sequence = open_sequence(real_data / "rgbd" / "7scenes_kitchen_100f", frames=slice(0, 100, 20))
-    as_read, as_stored = [], []
-    for frame, truth in sequence:
-        stored = sequence.source.truth(frame.index)
-        as_read.append(edge_contrast(frame, truth.depth_mm))
-        as_stored.append(edge_contrast(frame, stored.depth_mm[::2, ::2]))
-    assert np.mean(as_read) > 1.5 * np.mean(as_stored)

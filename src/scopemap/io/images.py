@@ -122,11 +122,6 @@ class ImageFolder(Source):
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
         raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
 
-    def _check_numbers(self) -> None:
-        """Raise `InputError` where frames had to be counted, as their names do not number them."""
-        if self.numbers != [frame_number(file) for file in self.files]:
-            raise InputError(f"reading {self.path}: several images have the same number, or one has none")
-
     @contextmanager
     def _making_camera(self) -> Iterator[None]:
         """Keep an error about the data set's camera as `camera_fault`: another camera may have been given."""

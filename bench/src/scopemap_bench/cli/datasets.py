@@ -27,12 +27,12 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the data sets that are read, in the order in which they are recognised."""
     from scopemap.io.opening import readers
 
-    # The docstrings of a reader's module and of its `recognises` are the only description of a data set.
+    # A reader's docstrings and its layout's table are the only description of a data set.
     rows = [
         {
             "name": name,
             "what": _first_line(sys.modules[kind.__module__]),
-            "recognised": _first_line(kind.recognises).removeprefix("Whether "),
+            "recognised": _first_line(getattr(kind, "recognised", kind.recognises)).removeprefix("Whether "),
         }
         for name, kind in readers().items()
     ]

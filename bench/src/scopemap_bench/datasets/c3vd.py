@@ -16,8 +16,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.lenses import OmnidirectionalCamera
 from scopemap.errors import InputError
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import ImageFolder, image_files
 from scopemap.trajectory.formats.text import read_poses
+from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 CAMERA = OmnidirectionalCamera(
     polynomial=(769.243600037458, 0.0, -0.000812770624150226, 6.25674244578925e-07, -1.19662182144280e-09),
@@ -34,59 +34,42 @@ UNDISTORTED_CAMERA = PinholeCamera(802.319, 801.885, 668.286, 547.733, 1350, 108
 a quarter of a pixel off what halving the images does)."""
 
 DEPTH_RANGE_MM = 100.0
-_DEPTH_SUFFIXES = (".tiff", ".tif", ".png")
+_FLAT = ("{}_depth.tiff", "{}_depth.tif", "{}_depth.png")
+_SORTED = tuple(f"depth/{name}" for name in (*_FLAT, "{}.tiff", "{}.tif", "{}.png"))
 
 
-class C3vdFolder(ImageFolder):
+class C3vdFolder(LayoutFolder):
     """One C3VD video, or a folder in its layout; `camera.yaml` beside the frames replaces the published constants."""
 
     name = "c3vd"
+    needs = (("pose.txt",),)
+    places = (
+        *(Place("", "*_color", _FLAT), Place("color", "*_color", _SORTED, needs="depth")),
+        *(Place("color", "*", _SORTED, needs="depth"), Place("rgb", "*", _SORTED)),
+    )
     # 0 is outside the lens circle, the largest level was clipped.
     depth_code = ((8, DEPTH_RANGE_MM / 255, 254), (16, DEPTH_RANGE_MM / 65535, 65534))
 
     def __init__(self, path: Path) -> None:
-        files, depths, folder = _layout(path)
-        super().__init__(path, files)
+        super().__init__(path)
         self.poses = dict(enumerate(read_poses(path / "pose.txt")))
         missing = next((file.name for number, file in self.file_of.items() if number not in self.poses), None)
         if missing is not None:
             held = f"which holds {len(self.poses)} poses (line = image number, from 0)"
             raise InputError(f"reading {path}: {missing} has no line in pose.txt, {held}")
-        for number, file in self.file_of.items():
-            stem = file.stem.removesuffix("_color")
-            stems = [f"{stem}_depth"] if depths == file.parent else [f"{stem}_depth", stem]
-            found = (depths / f"{name}{suffix}" for name in stems for suffix in _DEPTH_SUFFIXES)
-            depth = next((file for file in found if file.is_file()), None)
-            if depth is not None:
-                self.depth_files[number] = depth
-        # A calibration of its own marks a rendering; C3VD proper was registered to real video.
-        self.quality = "registered" if self.camera is None else "exact"
-        if self.camera is None and folder == "color" and self._is_reduced():
+        if self.camera is not None:
+            # A calibration of its own marks a rendering; C3VD proper was registered to real video.
+            self.quality = "exact"
+        elif self.place.images == "color" and self._is_reduced():
             self._set_camera(
                 UNDISTORTED_CAMERA, "EndoGSLAM's calibration of undistorted C3VD (pinhole)", "shipped for C3VD"
             )
             self.notes.append("depth of 8 bit, in steps of 0.39 mm: images undistorted and reduced by EndoGSLAM")
-        elif self.camera is None:
+        else:
             self._set_camera(CAMERA, "published C3VD calibration (Scaramuzza polynomial)", "shipped for C3VD")
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `pose.txt` and images in one of the layouts."""
-        return (path / "pose.txt").is_file() and bool(_layout(path)[0])
 
     def _is_reduced(self) -> bool:
         """Return whether depth is of 8 bit, as in EndoGSLAM's copy; 16 bit are C3VD's, only sorted into folders."""
         first = next(iter(self.depth_files.values()), None)
         levels = None if first is None else read_decoded(first)
         return levels is None or levels.dtype == np.uint8
-
-
-def _layout(path: Path) -> tuple[list[Path], Path, str]:
-    """Return the colour images, the folder of the depth files, and the folder that holds the images, "" for flat."""
-    flat = [file for file in image_files(path) if file.stem.endswith("_color")]
-    if flat:
-        return flat, path, ""
-    for name, needs_depth in (("color", True), ("rgb", False)):
-        if (path / name).is_dir() and ((path / "depth").is_dir() or not needs_depth):
-            return image_files(path / name), path / "depth", name
-    return [], path, ""

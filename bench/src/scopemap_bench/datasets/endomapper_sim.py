@@ -14,54 +14,44 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError, reporting
 from scopemap.io.decoding import check_pixels
-from scopemap.io.images import by_number
+from scopemap_bench.datasets.layouts import Place
 from scopemap_bench.datasets.unity import UnityFolder
 
 CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)
 """As published with the simulated sequences."""
 
-_TRAJECTORY, _CALIBRATION = "trajectory.csv", "calibration.txt"
+_TRAJECTORY = "trajectory.csv"
 _MM_PER_DM = 100.0
 _NEAR_DM, _FAR_DM = 0.01, 4.0
 _ASPECT_TOLERANCE = 0.01
 
 
 class EndoMapperSimFolder(UnityFolder):
-    """One simulated sequence; `camera.yaml` beside it is preferred, its `depth_scale` is the mm of a unit (dm)."""
+    """One simulated sequence; the `depth_scale` of a `camera.yaml` beside it is the mm of a unit (dm)."""
 
     name = "endomapper-sim"
-    quality = "exact"
+    places = (Place("rgb", "image_*", ("depth/aov_image_{}.exr",)),)
+    needs = (("depth/aov_image_*.exr",), (_TRAJECTORY,))
+    intrinsics = (("calibration.txt", 0),)
+    remarks = (
+        f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "
+        "the data set does not state which they are, and others use them unconverted",
+        "depth: 1 dm / (0.25 + 99.75 v) of channel R, which other readers take in other ways",
+    )
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, list(by_number((path / "rgb").glob("image_*.png")).values()))
-        self.depth_files = by_number((path / "depth").glob("aov_image_*.exr"))
+        super().__init__(path)
         self._read_table(path / _TRAJECTORY, _MM_PER_DM)
-        self.notes += [
-            f"poses: {_TRAJECTORY}, row = image number, decimetres, taken as Unity's left-handed axes and converted; "
-            "the data set does not state which they are, and others use them unconverted",
-            "depth: 1 dm / (0.25 + 99.75 v) of channel R, which other readers take in other ways",
-        ]
         without = sum(number not in self.poses for number in self.numbers)
         if without:
             self._warn(f"{path / _TRAJECTORY}: {without} of {self.count} images have no pose in it")
         if self.depth_files and find_spec("OpenEXR") is None:
             self.depth_files = {}
             self._warn(f"{path}: depth (OpenEXR) is left out; install its reader: pip install -e bench")
-        file = path / _CALIBRATION
-        if self.camera is None and file.is_file():
-            camera = stated_calibration(file, (self.width, self.height)).camera
-            self._set_camera(camera, _CALIBRATION, str(file))
-        elif self.camera is None:
+        if self.camera is None:
             self._set_camera(CAMERA, "published calibration of the simulated sequences", "shipped for it")
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `rgb/image_*.png`, `depth/aov_image_*.exr` and `trajectory.csv`."""
-        folders = any((path / "rgb").glob("image_*.png")) and any((path / "depth").glob("aov_image_*.exr"))
-        return folders and (path / _TRAJECTORY).is_file()
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         file = self.depth_files.get(index)

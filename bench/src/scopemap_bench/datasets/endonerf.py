@@ -14,52 +14,48 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.images import ImageFolder, image_files, numbered_images
+from scopemap.io.images import numbered_images
 from scopemap.notices import Notice
 from scopemap.trajectory.formats.poses import rigid
+from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
-_DEPTHS, _MASKS, _MASKS_WITH_HOLES = "depth", "gt_masks", "masks"
+_MASKS, _MASKS_WITH_HOLES = "gt_masks", "masks"
 _COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
 _IDENTITY_TOLERANCE = 1e-2
 _REST_TOLERANCE = 1e-6
 
 
-class EndoNerfFolder(ImageFolder):
-    """One EndoNeRF scene, or a folder in its layout; a `camera.yaml` beside `images` replaces `poses_bounds.npy`.
+class EndoNerfFolder(LayoutFolder):
+    """One EndoNeRF scene, or a folder in its layout.
 
     Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
     camera in it that cannot be is its `camera_fault`.
     """
 
     name = "endonerf"
+    places = (Place("images", depths=("depth/",)),)
+    needs = (_POSES, ("depth", _MASKS))
     quality = "stereo"
     depth_code = ((8, 1.0, 255), (16, 1.0, 65535))
+    remarks = ("depth beside the images: stereo matching, no sensor; files are taken as mm",)
 
     def __init__(self, path: Path) -> None:
-        file = _poses_file(path)
+        file = next((path / name for name in _POSES if (path / name).is_file()), None)
         if file is None:
             raise InputError(f"reading {path}: no EndoNeRF scene, looked for {' and '.join(_POSES)}")
-        super().__init__(path, image_files(path / "images"))
+        super().__init__(path)
         rows = _read_rows(file)
         if self.camera is None:
             with self._making_camera():
                 known = f"focal length in {file.name}, principal point at the centre"
                 self._set_camera(_camera(rows, file), known, str(file))
         self.poses = self._read_poses(rows, file)
-        self.depth_files = numbered_images(path / _DEPTHS)
-        self.notes.append("depth beside the images: stereo matching, no sensor; files are taken as mm")
         if numbered_images(path / _MASKS):
             self.masks = path / _MASKS
             self.notes.append(f"masks of instruments are used, from {_MASKS} beside the images")
         elif numbered_images(path / _MASKS_WITH_HOLES):
             self.notes.append(f"{_MASKS_WITH_HOLES} (instruments and holes of the depth) is not used by default")
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds poses, `images` with images, and `depth` or `gt_masks`."""
-        known = any((path / name).is_dir() for name in (_DEPTHS, _MASKS))
-        return known and _poses_file(path) is not None and bool(image_files(path / "images"))
 
     def _read_poses(self, rows: np.ndarray, file: Path) -> dict[int, np.ndarray]:
         """Return the poses by frame number, and note by which convention they were read."""
@@ -79,14 +75,9 @@ class EndoNerfFolder(ImageFolder):
         if np.abs(poses - poses[0]).max() < _REST_TOLERANCE:
             self.notes.append(Notice("camera-at-rest"))
         if len(rows) != len(self.numbers):
-            raise InputError(
-                f"reading {file}: it holds {len(rows)} rows for {len(self.numbers)} images, in their order"
-            )
+            found = f"{len(rows)} rows for {len(self.numbers)} images"
+            raise InputError(f"reading {file}: it holds {found}, in their order")
         return dict(zip(np.array(self.numbers)[known].tolist(), poses, strict=True))
-
-
-def _poses_file(path: Path) -> Path | None:
-    return next((path / name for name in _POSES if (path / name).is_file()), None)
 
 
 def _read_rows(file: Path) -> np.ndarray:

@@ -20,12 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import InputError, check_bytes, reporting
-from scopemap.frame import TruthQuality
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import image_files, numbered_images
 from scopemap.trajectory.formats.poses import poses_by_row
+from scopemap_bench.datasets.layouts import Place
 from scopemap_bench.datasets.unity import UnityFolder
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
@@ -37,10 +35,8 @@ RATES_HZ = {"HighCam": 20.0, "LowCam": 20.0, "MiroCam": 3.0, "UnityCam": 30.0, "
 DEPTH_UNIT_MM = 10.0
 """Rendered depth read as cm, as most do; its unit is not documented."""
 
-_FRAMES = ("Frames", "Frames/Frames")
-_POSES = ("Poses", "Poses/Poses")
-_DEPTHS = ("Pixelwise Depths", "Depths/Pixelwise Depths", "Pixelwise Depths/Pixelwise Depths")
-_POSE_FILES = ("*position_rotation.csv", "*.xlsx")
+_DEPTHS = ("Pixelwise Depths/", "Depths/Pixelwise Depths/", "Pixelwise Depths/Pixelwise Depths/")
+_POSES, _POSE_FILES = ("Poses", "Poses/Poses"), ("*position_rotation.csv", "*.xlsx")
 _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
 _COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
 _MM_PER_METRE = 1000.0
@@ -50,19 +46,16 @@ _MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
 
 
 class EndoSlamFolder(UnityFolder):
-    """The frames of one trajectory; `camera.yaml` beside `Frames` replaces `cam.txt`.
-
-    Raises `InputError` where images and poses do not fit together.
-    """
+    """The frames of one trajectory. Raises `InputError` where images and poses do not fit together."""
 
     name = "endoslam"
-    quality: TruthQuality = "exact"
+    places = (Place("Frames", depths=_DEPTHS), Place("Frames/Frames", depths=_DEPTHS))
+    needs = (("Poses", *_DEPTHS),)
+    intrinsics = (("Calibration/cam.txt", 3),)
     depth_code = ((8, DEPTH_UNIT_MM, 254),)  # 255 was clipped
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, _frame_files(path))
-        self._check_numbers()
-        self.depth_files = next((depths for name in _DEPTHS if (depths := numbered_images(path / name))), {})
+        super().__init__(path)
         found = (file for name in _POSES for pattern in _POSE_FILES for file in sorted((path / name).glob(pattern)))
         # Excel leaves "~$" locks behind, zips made on a Mac "._" files.
         file = next((file for file in found if file.is_file() and not file.name.startswith((".", "~"))), None)
@@ -71,7 +64,7 @@ class EndoSlamFolder(UnityFolder):
         camera = next((part for part in reversed(path.absolute().parts) if part in RATES_HZ), usual)
         self.rate_hz = RATES_HZ.get(camera, self.rate_hz)
         rate_source = f"published rate of {camera}" if camera else "assumed"
-        self.notes = [f"time stamps: image number / {self.rate_hz:g} s ({rate_source})"]
+        self.notes[0] = f"time stamps: image number / {self.rate_hz:g} s ({rate_source})"
         if self.depth_files:
             self.notes.append("depth: 8 bit, unit not documented, read as cm; compare after aligning scale")
         if file is None:
@@ -80,15 +73,14 @@ class EndoSlamFolder(UnityFolder):
             self._check_poses(file, self._read_rendered(file))
         else:
             self._check_poses(file, self._read_robot(file))
-        if self.camera is None:
-            self._set_published(rendered)
+        if self.camera is None and rendered and (self.width, self.height) == (UNITY_CAMERA.width, UNITY_CAMERA.height):
+            self.camera, self.camera_source = UNITY_CAMERA, "published UnityCam intrinsics"
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `Frames` with images, and `Poses` or depth beside it or a trajectory's name."""
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Return whether `path` is of the layout, or holds pictures of it under the name of a trajectory."""
         named = _TRAJECTORY.fullmatch(path.absolute().name) is not None
-        known = named or any((path / name).is_dir() for name in (_POSES[0], *_DEPTHS))
-        return known and bool(_frame_files(path))
+        return super().recognises(path) or (named and any(place.pictures(path) for place in cls.places))
 
     def _read_rendered(self, file: Path) -> int:
         """Read Unity's table and return the number of its rows."""
@@ -130,25 +122,10 @@ class EndoSlamFolder(UnityFolder):
                 f"{file.name} holds {count} rows for {len(self.numbers)} images; {without} images have no pose"
             )
 
-    def _set_published(self, rendered: bool) -> None:
-        size = (self.width, self.height)
-        around = (self.path.absolute(), *self.path.absolute().parents[:3])
-        file = next((f for folder in around if (f := folder / "Calibration" / "cam.txt").is_file()), None)
-        if file is not None:
-            self.camera = read_calibration(file, size).camera
-            self.camera_source = f"intrinsics of the data set ({file})"
-            self.notes.append("cam.txt is taken for pixel centres that count from 0, and no distortion")
-        elif rendered and size == (UNITY_CAMERA.width, UNITY_CAMERA.height):
-            self.camera, self.camera_source = UNITY_CAMERA, "published UnityCam intrinsics"
-
     def _depth_levels(self, file: Path) -> np.ndarray | None:
         levels = read_decoded(file)
         # Depth is the red channel, the last in OpenCV's order.
         return levels[..., 2] if levels is not None and levels.ndim == 3 else levels
-
-
-def _frame_files(path: Path) -> list[Path]:
-    return next((files for name in _FRAMES if (files := image_files(path / name))), [])
 
 
 def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:

@@ -21,9 +21,10 @@ from scopemap.cameras.formats.parsing import calibration_bytes
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.io.decoding import read_decoded
-from scopemap.io.images import ImageFolder, by_number, image_files
+from scopemap.io.images import by_number, image_files
 from scopemap.trajectory.formats.poses import are_frame_numbers
 from scopemap.trajectory.formats.text import tum_poses
+from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped
 
 _CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
@@ -31,32 +32,30 @@ _DEPTHS_PER_UNIT = 1000.0
 _TISSUE = 255
 
 
-class OneSlamFolder(ImageFolder):
-    """A folder in OneSLAM's layout; `camera.yaml` beside `images` replaces calibration.json.
+class OneSlamFolder(LayoutFolder):
+    """A folder in OneSLAM's layout.
 
     Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read;
     a calibration that cannot be or does not fit is its `camera_fault`.
     """
 
     name = "oneslam"
+    places = (Place("images"),)
+    needs = ((_CALIBRATION,),)
+    numbered = True
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, list(by_number(image_files(path / "images")).values()))
-        stated: dict[str, Any] = {}
-        with self._making_camera():
-            stated = _read_json(path / _CALIBRATION)
-            if self.camera is None:
-                self.camera = read_calibration(path / _CALIBRATION, (self.width, self.height)).camera
-                straight = ", taken as of images without distortion" * isinstance(self.camera, PinholeCamera)
-                self.camera_source = f"{_CALIBRATION} beside the frames{straight}"
-        if stated.get("FPS") is not None:
-            found = f"found {stated['FPS']!r:.80}"
-            with reporting(f"reading {path / _CALIBRATION}: FPS must be a positive number, {found}"):
-                self.rate_hz = float(stated["FPS"])
+        self._stated: dict[str, Any] = {}
+        super().__init__(path)
+        rate = self._stated.get("FPS")
+        if rate is not None:
+            fault = f"reading {path / _CALIBRATION}: FPS must be a positive number, found {rate!r:.80}"
+            with reporting(fault):
+                self.rate_hz = float(rate)
                 if not 0 < self.rate_hz < float("inf"):
                     raise ValueError("out of range")
-        given = "FPS of calibration.json" if stated.get("FPS") is not None else "assumed: calibration.json has no FPS"
-        self.notes = [f"time stamps: frame number / {self.rate_hz:g} s ({given})"]
+        given = "assumed: calibration.json has no FPS" if rate is None else "FPS of calibration.json"
+        self.notes[0] = f"time stamps: frame number / {self.rate_hz:g} s ({given})"
         self._tissue = self._read_mask()
         mm_per_unit = self._read_poses()
         self.depth_files = by_number(image_files(path / "depths"))
@@ -67,14 +66,18 @@ class OneSlamFolder(ImageFolder):
         if self.depth_files or self.poses:
             self.notes.append("the layout does not state how poses and depth came about: taken as registered")
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `images` with images, and calibration.json with `intrinsics`."""
-        if not ((path / _CALIBRATION).is_file() and image_files(path / "images")):
-            return False
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Return whether `path` is of the layout, and its calibration.json holds `intrinsics`."""
         with suppress(CalibrationError):
-            return "intrinsics" in _read_json(path / _CALIBRATION)
+            return super().recognises(path) and "intrinsics" in _read_json(path / _CALIBRATION)
         return False
+
+    def _use_intrinsics(self) -> None:
+        self._stated = _read_json(self.path / _CALIBRATION)
+        self.camera = read_calibration(self.path / _CALIBRATION, (self.width, self.height)).camera
+        straight = ", taken as of images without distortion" * isinstance(self.camera, PinholeCamera)
+        self.camera_source = f"{_CALIBRATION} beside the frames{straight}"
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         depth_mm = super()._depth_mm(index)

@@ -59,8 +59,6 @@ OTHERS = (
 class Agreement:
     """How well depth fits depth through the poses, over pairs of frames that are about `lag` apart.
 
-    Attributes
-    ----------
     lag : number of frames in between, of those with pose and depth; pairs at the beginning are closer.
     pairs : number of pairs of frames that were compared.
     given : median over pairs of the median relative error with the poses as given; infinite where they see no surface

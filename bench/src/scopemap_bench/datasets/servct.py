@@ -19,45 +19,35 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.calibration import check_plausible
 from scopemap.cameras.rectification import Rectifier
 from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.images import ImageFolder, image_files, read_image
+from scopemap.io.images import read_image
 from scopemap.io.source import SourceFrame
+from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
-_LEFT = "Left_rectified"
 _CALIBRATION = "Rectified_calibration"
 _TRUTHS = ("Ground_truth_CT", "Reference_CT", "Ground_truth_RGB", "Reference_RGB")
 _SAME_CAMERA_PX = 0.01
 _BLUE = (0, 0, 255)
 
 
-class ServCtFolder(ImageFolder):
-    """The left pictures of one experiment; a `camera.yaml` beside `Left_rectified` replaces the calibration files.
+class ServCtFolder(LayoutFolder):
+    """The left pictures of one experiment.
 
     Each picture has a calibration of its own. Where these differ, pictures and depth are brought to the camera of the
     first. Raises `InputError` for pictures that cannot be used; a calibration that cannot is its `camera_fault`.
     """
 
     name = "serv-ct"
+    places = (Place("Left_rectified", depths=tuple(f"{truth}/DepthL/{{}}.png" for truth in _TRUTHS)),)
+    needs = ((_CALIBRATION, *_TRUTHS),)
     depth_code = ((16, 1 / 256, 65535),)
+    remarks = ("stereo pictures, no video: the left ones are used, no pose is known, the scenes differ",)
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, image_files(path / _LEFT))
-        truth = next((path / name for name in _TRUTHS if (path / name / "DepthL").is_dir()), None)
         self._rectifiers: dict[int, Rectifier] = {}
-        if self.camera is None:
-            with self._making_camera():
-                self._calibrate()
-        self.notes.append("stereo pictures, no video: the left ones are used, no pose is known, the scenes differ")
-        if truth is not None:
-            depths = {number: truth / "DepthL" / f"{file.stem}.png" for number, file in self.file_of.items()}
-            self.depth_files = {number: file for number, file in depths.items() if file.is_file()}
-            scan = "the CT scan" if truth.name.endswith("_CT") else "a scanner with structured light"
-            self.notes.append(f"depth beside the images: {scan}, registered to them ({truth.name})")
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `Left_rectified` with images, and calibration or truth of SERV-CT beside it."""
-        known = any((path / name).is_dir() for name in (_CALIBRATION, *_TRUTHS))
-        return known and bool(image_files(path / _LEFT))
+        super().__init__(path)
+        for truth in sorted({file.parents[1].name for file in self.depth_files.values()}):
+            scan = "the CT scan" if truth.endswith("_CT") else "a scanner with structured light"
+            self.notes.append(f"depth beside the images: {scan}, registered to them ({truth})")
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected left pictures, all as the camera of the first sees them."""
@@ -79,7 +69,7 @@ class ServCtFolder(ImageFolder):
         rectifier = self._rectifiers.get(index)
         return depth_mm if rectifier is None else rectifier.nearest(depth_mm)
 
-    def _calibrate(self) -> None:
+    def _use_intrinsics(self) -> None:
         files = {n: self.path / _CALIBRATION / f"{file.stem}.json" for n, file in self.file_of.items()}
         cameras = {n: _read_camera(f, (self.width, self.height)) for n, f in files.items() if f.is_file()}
         if not cameras:

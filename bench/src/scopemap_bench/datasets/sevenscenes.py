@@ -9,8 +9,6 @@ jumps in "redkitchen", the gradient of colour is then 2.3 times its mean; in the
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
@@ -18,8 +16,8 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import inverse, se3
-from scopemap.io.images import ImageFolder, image_files
-from scopemap_bench.trajectories.sevenscenes import read_seven_scenes_pose
+from scopemap_bench.datasets.layouts import LayoutFolder, Place
+from scopemap_bench.trajectories.text import read_seven_scenes_pose
 
 DEPTH_CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, 640, 480)
 """As published."""
@@ -31,37 +29,24 @@ T_COLOUR_DEPTH = se3(np.eye(3), np.array([-25.0, 0.0, 0.0]))
 """mm; nominal of a Kinect."""
 
 
-class SevenScenesFolder(ImageFolder):
+class SevenScenesFolder(LayoutFolder):
     """One 7-Scenes sequence, or a folder in its layout."""
 
     name = "7-scenes"
+    places = (Place("", "frame-*.color", ("frame-{}.depth.png",)),)
+    needs = (("frame-*.pose.txt",),)
     depth_code = ((16, 1.0, 65534),)
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, [file for file in image_files(path) if file.stem.endswith(".color")])
-        stems = {number: file.name.split(".color.")[0] for number, file in self.file_of.items()}
-        depths = {number: path / f"{stem}.depth.png" for number, stem in stems.items()}
-        poses = {number: path / f"{stem}.pose.txt" for number, stem in stems.items()}
-        self.depth_files = {number: file for number, file in depths.items() if file.is_file()}
-        self._pose_files = {number: file for number, file in poses.items() if file.is_file()}
-        if self.camera is None:
-            with self._making_camera():
-                self._use_kinect()
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Return whether `path` holds `frame-*.color.*` and poses beside them."""
-        return any(path.glob("frame-*.color.*")) and any(path.glob("frame-*.pose.txt"))
 
     def pose(self, index: int) -> np.ndarray | None:
         """Return the pose in the frame's file; None where tracking lost it (not finite) or there is no file."""
-        file = self._pose_files.get(index)
-        T_world_camera = None if file is None else read_seven_scenes_pose(file)
+        picture = self.file_of.get(index)
+        file = None if picture is None else picture.with_name(f"{picture.stem.removesuffix('.color')}.pose.txt")
+        T_world_camera = None if file is None or not file.is_file() else read_seven_scenes_pose(file)
         if T_world_camera is None or self.depth_sensor is None:
             return T_world_camera
         return T_world_camera @ inverse(self.depth_sensor.T_colour_depth)
 
-    def _use_kinect(self) -> None:
+    def _use_intrinsics(self) -> None:
         file = self.path / "camera-intrinsics.txt"
         stated = read_calibration(file, (self.width, self.height)).camera if file.is_file() else None
         if stated is not None and stated != DEPTH_CAMERA.resized(self.width, self.height):

@@ -64,8 +64,6 @@ class FrameFigures:
 class Survey:
     """Result of one pass over a data set.
 
-    Attributes
-    ----------
     sequence : what was read.
     frames : what could be read.
     agreements : of poses and depth, by growing lag; empty where there are no two frames with both.
@@ -102,9 +100,9 @@ class Survey:
         if numbers:
             found |= {"first_number": min(numbers), "last_number": max(numbers), "span_s": max(times_s) - min(times_s)}
         found |= {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        found |= {"camera": self.sequence.camera_source}
-        found |= {"with_pose": sum(frame.T_world_camera is not None for frame in self.frames)}
-        found |= {"with_depth": sum(frame.depth is not None for frame in self.frames)}
+        found["camera"] = self.sequence.camera_source
+        found["with_pose"] = sum(frame.T_world_camera is not None for frame in self.frames)
+        found["with_depth"] = sum(frame.depth is not None for frame in self.frames)
         if self.rigid:
             positions_mm = positions_of(self.rigid)
             found |= {"path_mm": path_length_mm(positions_mm), "extent_mm": extent_mm(positions_mm)}

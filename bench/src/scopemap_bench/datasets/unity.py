@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.errors import InputError
-from scopemap.io.images import ImageFolder
+from scopemap.frame import TruthQuality
 from scopemap.trajectory.formats.poses import poses_by_row
 from scopemap.trajectory.formats.text import fields_of, text_lines
+from scopemap_bench.datasets.layouts import LayoutFolder
 
 _HEADER = ["tx", "ty", "tz", "rx", "ry", "rz", "rw", "time(s)"]
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -20,8 +21,11 @@ def mirrored(T: np.ndarray) -> np.ndarray:
     return _MIRROR @ T @ _MIRROR
 
 
-class UnityFolder(ImageFolder):
+class UnityFolder(LayoutFolder):
     """A folder of images rendered with Unity, numbered as the rows of a table of poses."""
+
+    numbered = True
+    quality: TruthQuality = "exact"
 
     def _read_table(self, file: Path, mm_per_unit: float) -> int:
         """Read the poses and time stamps of a table, its columns between commas or semicolons; return its rows' number.

@@ -1,10 +1,4 @@
-"""Temporal consistency of depth, frame by frame, with the same flow and matches for every method.
-
-    matcher, meters = FrameMatcher(camera), {name: ConsistencyMeter(camera) for name in methods}
-    for each frame:
-        found = matcher.match(rgb, valid, to_previous, consistent)
-        for name, meter in meters.items():
-            meter.add(depth_mm[name], valid, found, T_world_camera=..., T_reference_camera=...)
+"""Temporal consistency of depth, frame by frame: a `ConsistencyMeter` per method, one `FrameMatcher` for all.
 
 - OPW and rTC: Khan et al., "Temporally consistent online depth estimation in dynamic scenes", WACV 2023, in the form of
     facebookresearch/TemporallyConsistentDepth, `eval/metrics.py`.
@@ -47,14 +41,9 @@ def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarr
     if not both.any():
         return {"pairs": 0, **dict.fromkeys(_CHANGE, float("nan"))}
     a, b = other_mm[both].astype(np.float64), current_mm[both].astype(np.float64)
-    apart = np.abs(a - b)
-    near = np.maximum(a, b) < _RTC_RATIO * np.minimum(a, b)
-    return {
-        "pairs": 1,
-        "mean_mm": float(np.mean(apart)),
-        "relative": float(np.mean(apart / b)),
-        "rtc": float(np.mean(near)),
-    }
+    apart, near = np.abs(a - b), np.maximum(a, b) < _RTC_RATIO * np.minimum(a, b)
+    figures = [float(np.mean(values)) for values in (apart, apart / b, near)]
+    return {"pairs": 1, **dict(zip(_CHANGE, figures, strict=True))}
 
 
 def mean_change(changes: Sequence[dict[str, float]]) -> dict[str, float]:

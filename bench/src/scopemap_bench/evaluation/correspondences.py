@@ -49,8 +49,6 @@ class Matches:
 class FrameCorrespondences:
     """Correspondences of a frame and the one before it; the same for every method.
 
-    Attributes
-    ----------
     matches : ORB matches.
     to_previous : (H, W, 2) px, pixel p of this frame is seen at p + to_previous(p) in the previous one; None: no flow.
     consistent : (H, W) bool, where that flow is trusted; same_colour : where moreover both images have the same colour.

@@ -47,8 +47,6 @@ _LOG_LOW, _LOG_HIGH, _LOG_STEP = float(np.log(1e-4)), float(np.log(1e6)), 2e-5
 class DepthFit:
     """Scale and shift of a prediction d (mm): 1 / d' = 1 / (scale d) + shift. The default changes nothing.
 
-    Attributes
-    ----------
     scaling : how it was found.
     scale : factor on the depth; infinite where least squares found no correlation with the truth.
     shift_per_mm : added to the disparity, 1/mm; not 0 under scale-and-shift only.
@@ -83,8 +81,6 @@ def evaluate_depth(
     rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
     delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
 
-    Parameters
-    ----------
     scaling : `median`: by the ratio of the medians of the compared pixels; `scale-and-shift`: least squares in
         disparity; or a fit found elsewhere. Raises `SettingsError` for another name.
     truth_range_mm : true depth counts strictly inside; see `DEPTH_RANGES_MM`.
@@ -100,14 +96,9 @@ def evaluate_depth(
     if clip_prediction:
         d = np.clip(d, *truth_range_mm)
     difference, ratio = d - g, np.maximum(d / g, g / d)
-    errors = [
-        np.mean(np.abs(difference) / g),
-        np.mean(difference**2 / g),
-        np.sqrt(np.mean(difference**2)),
-        np.sqrt(np.mean(np.log(d / g) ** 2)),
-        np.mean(np.abs(difference)),
-        *(np.mean(ratio < 1.25**k) for k in (1, 2, 3)),
-    ]
+    errors = [np.mean(np.abs(difference) / g), np.mean(difference**2 / g), np.sqrt(np.mean(difference**2))]
+    errors += [np.sqrt(np.mean(np.log(d / g) ** 2)), np.mean(np.abs(difference))]
+    errors += [np.mean(ratio < 1.25**k) for k in (1, 2, 3)]
     return _report(fit.scaling, [counted, coverage, fit.scale, fit.shift_per_mm, *errors])
 
 

@@ -37,8 +37,6 @@ _SURGCUT3R_FRAMES = 16
 class Protocol:
     """A published protocol: call it with estimate and reference.
 
-    Attributes
-    ----------
     name : as in `PROTOCOLS`.
     description : one sentence: alignment, pairs, unit, deviations from evo.
     source : the repository and file that define it.
@@ -75,12 +73,9 @@ def _of_poses(
 def _errors(aligned: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> dict[str, ErrorSummary]:
     """Return APE over the frames and RPE over the pairs, in mm and in deg."""
     rpe_mm, rpe_rad = relative_errors(aligned, reference, pairs)
-    return {
-        "ape_mm": ErrorSummary.of(translation_errors_mm(aligned, reference)),
-        "ape_deg": ErrorSummary.of(np.degrees(rotation_errors_rad(aligned, reference))),
-        "rpe_mm": ErrorSummary.of(rpe_mm),
-        "rpe_deg": ErrorSummary.of(np.degrees(rpe_rad)),
-    }
+    errors = {"ape_mm": translation_errors_mm(aligned, reference), "rpe_mm": rpe_mm}
+    errors |= {"ape_deg": np.degrees(rotation_errors_rad(aligned, reference)), "rpe_deg": np.degrees(rpe_rad)}
+    return {name: ErrorSummary.of(values) for name, values in errors.items()}
 
 
 def _evo(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
@@ -254,17 +249,17 @@ _ALL = (
     ),
     Protocol(
         "af",
-        "Snippets of 5 frames from every frame on (shorter at the end), relative motions multiplied without inverting "
-        "them, each snippet scaled by least squares, root of the summed squares divided by the number of positions "
-        "(not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and deviation over "
-        "snippets.",
+        "Snippets of 5 frames from every frame on (shorter at the end), relative motions multiplied without "
+        "inverting them, each snippet scaled by least squares, root of the summed squares divided by the number of "
+        "positions (not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and "
+        "deviation over snippets.",
         "ShuweiShao/AF-SfMLearner: evaluate_pose.py; BeileiCui/EndoDAC: evaluate_pose.py",
         _of_poses(_af),
     ),
     Protocol(
         "endogslam",
-        "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first camera "
-        "(as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
+        "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first "
+        "camera (as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
         "Loping151/EndoGSLAM: utils/eval_helpers.py",
         _of_poses(_endogslam),
     ),
@@ -307,8 +302,8 @@ _ALL = (
     Protocol(
         "climb",
         "Every submap aligned by its own Sim3, frames of an earlier submap left out, submaps with fewer than "
-        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in mm "
-        "and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
+        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in "
+        "mm and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
         "EndoCartoScope/climb-challenge: evaluation/evaluation_utils.py, 79d7435",
         climb_figures,
     ),

@@ -40,8 +40,6 @@ _OBSERVED, _MISSED = 1, 2
 class TrueSurface:
     """A true surface in the true world, mm.
 
-    Attributes
-    ----------
     surface : a mesh, or points (N, 3).
     seen : (F,) bool, the faces of the mesh that the camera saw; None: not known.
     frames : where the tissue moves, the mesh file of every frame, with the faces of `surface`; empty: it is at rest.

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from scopemap_bench.phantom.noise import noise_at
-from scopemap_bench.phantom.volume import Volume
+from scopemap_bench.phantom.volume import Volume, noise_at
 
 _WALL_MM = 95.0
 _FLOOR_MM = 62.0

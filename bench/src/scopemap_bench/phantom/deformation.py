@@ -48,6 +48,11 @@ class Displacement:
             points = rest_mm + self.at(points)
         return points
 
+    def scaled(self, strength: float) -> Displacement:
+        """Return the displacement with all amplitudes times `strength`."""
+        factors = [1, 1, 1, strength, strength, strength, 1]
+        return Displacement(self.waves * factors, self.bumps * factors)
+
     def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the waves (M, 7) and the bumps (B, 7) for coordinates in voxels from `origin_mm`."""
         k, amplitude, phase = self.waves[:, :3], self.waves[:, 3:6], self.waves[:, 6:]
@@ -61,29 +66,28 @@ REST = Displacement(np.zeros((0, 7)))
 
 @dataclass(frozen=True)
 class Breathing:
-    """Waves (M, 7) as in `Displacement`, at full breath; frame 0 and every `period_frames` frames are at rest."""
+    """A displacement at full breath; frame 0 and every `period_frames` frames are at rest."""
 
-    waves: np.ndarray
+    full: Displacement
     period_frames: float
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
-        return _scaled(self.waves, 0.5 - 0.5 * np.cos(2 * np.pi * time / self.period_frames))
+        return self.full.scaled(0.5 - 0.5 * np.cos(2 * np.pi * time / self.period_frames))
 
 
 @dataclass(frozen=True)
 class Push:
-    """Waves (M, 7) and bumps (B, 7) as in `Displacement`, at rest until the frame `first`, in full from `last` on."""
+    """A displacement that is 0 until the frame `first`, in full from `last` on."""
 
-    waves: np.ndarray
+    full: Displacement
     first: int
     last: int
-    bumps: np.ndarray = field(default_factory=lambda: REST.bumps)
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
         share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
-        return _scaled(self.waves, 0.5 - 0.5 * np.cos(np.pi * share), self.bumps)
+        return self.full.scaled(0.5 - 0.5 * np.cos(np.pi * share))
 
 
 @dataclass(frozen=True)
@@ -98,31 +102,26 @@ class TissueMotion:
         return Displacement(np.concatenate([p.waves for p in parts]), np.concatenate([p.bumps for p in parts]))
 
 
-def _scaled(waves: np.ndarray, strength: float, bumps: np.ndarray = REST.bumps) -> Displacement:
-    factors = [1, 1, 1, strength, strength, strength, 1]
-    return Displacement(waves * factors, bumps * factors)
-
-
 def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) -> Push:
     """Return a push of the tissue `distance_mm` ahead of a camera: up on the left of its view, down on the right."""
     right, down, ahead = T_world_camera[:3, :3].T
     along = 2 * np.pi / _PUSH_LENGTH_MM * right
     middle = T_world_camera[:3, 3] + distance_mm * ahead
     wave = np.concatenate([along, _PUSH_MM * (0.8 * down - 0.6 * ahead), [-along @ middle]])
-    return Push(wave[None], first, last)
+    return Push(Displacement(wave[None]), first, last)
 
 
 def poke(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Push:
     """Return a push of the tissue around a point (3,), seen from so far, along a unit vector (3,); the rest stays."""
     radius_mm = max(_POKED_SHARE * distance_mm, 2 * _POKE_MM)
     bump = np.concatenate([point_mm, _POKE_MM * direction, [0.5 / radius_mm**2]])
-    return Push(REST.waves, first, last, bump[None])
+    return Push(Displacement(REST.waves, bump[None]), first, last)
 
 
 def breathing(amplitude_mm: float, period_frames: float, seed: int) -> Breathing:
     """Return breathing of about `amplitude_mm` with wavelengths of 80 to 160 mm; `amplitude_mm` 0 is tissue at rest."""
     if amplitude_mm == 0:
-        return Breathing(REST.waves, period_frames)
+        return Breathing(REST, period_frames)
     rng = np.random.default_rng((seed, 7))
     n = 3
     directions, amplitudes = rng.normal(size=(2, n, 3))
@@ -130,4 +129,5 @@ def breathing(amplitude_mm: float, period_frames: float, seed: int) -> Breathing
     amplitudes *= amplitude_mm / np.sqrt(n) / np.linalg.norm(amplitudes, axis=1, keepdims=True)
     wavelengths_mm = rng.uniform(80.0, 160.0, size=(n, 1))
     phases = rng.uniform(0, 2 * np.pi, size=(n, 1))
-    return Breathing(np.hstack([2 * np.pi / wavelengths_mm * directions, amplitudes, phases]), period_frames)
+    waves = np.hstack([2 * np.pi / wavelengths_mm * directions, amplitudes, phases])
+    return Breathing(Displacement(waves), period_frames)

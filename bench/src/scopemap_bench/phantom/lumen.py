@@ -10,8 +10,7 @@ from numba import njit, prange
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.distance import cdist
 
-from scopemap_bench.phantom.noise import noise_at
-from scopemap_bench.phantom.volume import Volume
+from scopemap_bench.phantom.volume import Volume, noise_at
 
 _SPACING_MM = 4.0
 _AHEAD_MM = 84.0

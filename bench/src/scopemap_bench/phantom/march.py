@@ -30,8 +30,6 @@ Moved = tuple[np.ndarray, np.ndarray]
 class SurfaceBuffers:
     """The visible surface in each pixel, before any shading.
 
-    Attributes
-    ----------
     depth_mm : (H, W) float32 along the optical axis, NaN where the ray hits nothing.
     distance_mm : (H, W) float32 along the ray, NaN likewise.
     normal : (H, W, 3) float32 unit vectors in camera axes, towards the camera, NaN likewise.

@@ -33,8 +33,6 @@ _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 class Phantom:
     """A scene with the path through it, ready to be rendered frame by frame.
 
-    Attributes
-    ----------
     volume, appearance : shape and appearance of the tissue at rest. motion : how it moves.
     poses : (N, 4, 4) float64, camera to world, mm.
     exposure : gain of every frame, or of each (N,); None: each frame has its own.

@@ -10,8 +10,8 @@ import numpy as np
 
 from scopemap.cameras.camera import CameraModel
 from scopemap_bench.phantom.march import SurfaceBuffers, rays_of
-from scopemap_bench.phantom.noise import noise_at
 from scopemap_bench.phantom.spec import EventName
+from scopemap_bench.phantom.volume import noise_at
 
 _FILM_TILT = 0.3
 _HIGHLIGHT_SHARPNESS = 350.0

@@ -41,8 +41,6 @@ class Event:
 class PhantomSpec:
     """Parameters of a phantom.
 
-    Attributes
-    ----------
     scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
     frames : number of frames; None: every pose of `path_file`, or 200.
     width, height : image size, px.
@@ -61,7 +59,7 @@ class PhantomSpec:
     exposure_lag_frames : time constant with which automatic exposure follows the scene, 0: at once.
     shutter : share of the time between two frames during which light is gathered, 0: no motion blur.
     indirect : light that the tissue scatters onto itself, share of the lamp's; it lights far walls too much.
-    h264_crf : rate factor of the video coding, 0 to 51, that frames go through (`coding.VideoCoding`); None: none.
+    h264_crf : rate factor of the video coding, 0 to 51, that frames go through (`exposing.VideoCoding`); None: none.
     depth_scale_mm : mm per unit of the depth files; the default is C3VD's, 100 mm at most.
     fps : frames per second as written to `camera.yaml`.
     """

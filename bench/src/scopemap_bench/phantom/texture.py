@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap_bench.phantom.cavity import Tint
-from scopemap_bench.phantom.noise import noise_at
+from scopemap_bench.phantom.volume import noise_at
 
 _MOTTLES = ((22.0, 0.22), (8.0, 0.16), (3.0, 0.14), (1.2, 0.14))
 _VESSEL_COLOUR = np.array([0.80, 0.42, 0.50], np.float32)
@@ -24,8 +24,6 @@ _PUDDLE_MM = 14.0
 class Appearance:
     """Appearance of a scene's tissue.
 
-    Attributes
-    ----------
     base : colour of all tissue, linear RGB (3,), or the colours in space.
     texture, gloss : strength of mottling and vessels, and of highlights; 0 = none. seed : of the pattern.
     """

@@ -20,7 +20,7 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import marching_cubes
 from scopemap.io.decoding import write_encoded
-from scopemap_bench.phantom.coding import VideoCoding
+from scopemap_bench.phantom.exposing import VideoCoding
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.volume import Volume

@@ -5,13 +5,13 @@ from functools import partial
 
 from scopemap.trajectory.formats.opening import TrajectoryFormat
 from scopemap.trajectory.formats.text import read_kitti
-from scopemap_bench.trajectories import climb, scared, sevenscenes, splatam, text
+from scopemap_bench.trajectories import climb, scared, splatam, text
 
 FORMATS = (
     TrajectoryFormat(
         "endogslam, splatam", splatam.read_params, (splatam.PARAMS_FILE,), zipfile.is_zipfile, can_be_named=False
     ),
-    TrajectoryFormat("7-scenes", sevenscenes.read_seven_scenes, ("frame-*.pose.txt",)),
+    TrajectoryFormat("7-scenes", text.read_seven_scenes, ("frame-*.pose.txt",)),
     TrajectoryFormat(
         "scared", scared.read_scared, scared.SCARED_FILES, lambda path: scared.find_frame_data(path) is not None
     ),

@@ -1,4 +1,4 @@
-"""Text files of poses that OneSLAM, Open3D and Endo-Depth-and-Motion write.
+"""Text files of poses that OneSLAM, Open3D and Endo-Depth-and-Motion write, and those of 7-Scenes.
 
 OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes alone to `poses_pred.txt`, as TUM rows
 camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same form.
@@ -7,10 +7,13 @@ A `.log` has a line of three integers per pose, then four lines of its 4x4 matri
 (redwood-data.org/indoor/fileformat.html); Open3D (io/file_format/FileLOG.cpp) writes `i i i+1` and the camera-to-world
 matrix. Endo-Depth-and-Motion (UZ-SLAMLab) writes `trajectory.log` with Open3D, but puts its world-to-camera matrices,
 in metres, there. The two look alike, so a `.log` is read only when its kind is named.
+
+7-Scenes (Shotton et al., CVPR 2013) has a file of 4 lines per frame, camera-to-world, metres.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -76,3 +79,29 @@ def _read_log(path: Path, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     indices = np.array([numbers[0] for _, numbers in heads])
     ascend = are_frame_numbers(indices) and bool(np.all(np.diff(indices) > 0))
     return rigid(T, [f"{path}, line {line}" for line, _ in heads]), indices if ascend else np.arange(len(T))
+
+
+def read_seven_scenes(folder: Path, unit: Unit) -> Trajectory:
+    """Read `frame-NNNNNN.pose.txt` files, always metres; the number in the name is the frame's."""
+    numbered = sorted((int(re.sub(r"\D", "", path.name)), path) for path in folder.glob("frame-*.pose.txt"))
+    if not numbered:
+        raise InputError(f"cannot read a trajectory from {folder}: looked for frame-*.pose.txt")
+    poses = []
+    for _, path in numbered:
+        pose = read_seven_scenes_pose(path)
+        if pose is None:
+            raise InputError(f"{path}: a pose holds NaN or infinity; leave out frames without a pose")
+        poses.append(pose)
+    return stamped(np.stack(poses), np.array([number for number, _ in numbered]), None, "7-Scenes, camera-to-world, m")
+
+
+def read_seven_scenes_pose(file: Path) -> np.ndarray | None:
+    """Return the camera-to-world pose (4, 4), mm, of one file; None where tracking lost it (NaN or infinity)."""
+    table = read_numbers(file, missing=True)
+    if table.values.size != 16:
+        raise InputError(f"reading {file}: expected 4x4 numbers, found {table.values.shape}")
+    if not np.isfinite(table.values).all():
+        return None
+    T = table.values.reshape(4, 4).copy()
+    T[:3, 3] *= MM_PER_UNIT["m"]
+    return rigid(T[None], [str(file)])[0]

@@ -1,0 +1,96 @@
+"""Layouts of folders of pictures, as a table: where pictures, depth and intrinsics are, and how depth is coded."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from scopemap.cameras.formats.reading import stated_calibration
+from scopemap.io.images import ImageFolder, by_number, image_files, numbered_images
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a layout has its pictures, and the depth of each.
+
+    images : folder of the pictures. names : of the pictures without ending; what the `*` stands for is a picture's key.
+    depths : files with the depth of a picture, `{}` its key, of which the first that exists is used; one that ends in
+    "/" is a folder whose images belong to the pictures with the same number. needs : folder beside it, or "".
+    """
+
+    images: str = ""
+    names: str = "*"
+    depths: tuple[str, ...] = ()
+    needs: str = ""
+
+    def pictures(self, path: Path) -> dict[Path, str]:
+        """Return the pictures of the data set in `path` with their keys, in numeric order."""
+        if self.needs and not (path / self.needs).is_dir():
+            return {}
+        form = re.compile(re.escape(self.names).replace(r"\*", "(.*)"))
+        found = ((file, form.fullmatch(file.stem)) for file in image_files(path / self.images))
+        return {file: match[1] for file, match in found if match}
+
+
+class LayoutFolder(ImageFolder):
+    """A folder of pictures in one of the `places` of its layout; a `camera.yaml` beside them replaces its intrinsics.
+
+    needs : groups of files or folders (glob patterns), of each of which one is there where the layout is recognised.
+    numbered : whether every picture must have a number of its own; else pictures may be counted.
+    intrinsics : calibration files, `{}` the folder's name, each with the number of folders above in which it may be.
+    remarks : notes. Raises `InputError` without pictures; intrinsics that cannot be used are its `camera_fault`.
+    """
+
+    places: ClassVar[tuple[Place, ...]] = ()
+    needs: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    numbered: ClassVar[bool] = False
+    intrinsics: ClassVar[tuple[tuple[str, int], ...]] = ()
+    remarks: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.place, pictures = _found(self.places, path)
+        super().__init__(path, list(by_number(pictures).values()) if self.numbered else list(pictures))
+        self.notes += self.remarks
+        folders = (at for at in self.place.depths if at.endswith("/"))
+        self.depth_files = next((found for at in folders if (found := numbered_images(path / at))), {})
+        for number, picture in self.file_of.items():
+            files = (path / at.format(pictures[picture]) for at in self.place.depths)
+            depth = next((file for file in files if file.is_file()), None)
+            if depth is not None:
+                self.depth_files[number] = depth
+        if self.camera is None:
+            with self._making_camera():
+                self._use_intrinsics()
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Return whether `path` holds pictures in one of the places, and all that the layout needs."""
+        there = all(any(any(path.glob(name)) for name in group) for group in cls.needs)
+        return there and bool(_found(cls.places, path)[1])
+
+    @classmethod
+    def recognised(cls) -> str:
+        """Return in words what the folder holds where the layout is recognised."""
+        pictures = " or ".join(f"`{Path(place.images) / place.names}`" for place in cls.places)
+        return ", ".join([f"pictures {pictures}", *(" or ".join(f"`{n}`" for n in group) for group in cls.needs)])
+
+    def _use_intrinsics(self) -> None:
+        own = self.path.absolute()
+        files = (at / name.format(own.name) for name, up in self.intrinsics for at in (own, *own.parents[:up]))
+        file = next((file for file in files if file.is_file()), None)
+        if file is not None:
+            camera = stated_calibration(file, (self.width, self.height)).camera
+            self._set_camera(camera, f"intrinsics of the data set ({file})", str(file))
+            self.notes.append(f"{file.name} is taken for pixel centres that count from 0, and no distortion")
+
+
+def _found(places: tuple[Place, ...], path: Path) -> tuple[Place, dict[Path, str]]:
+    """Return the first place that holds pictures, with these; the last one, empty, where none does."""
+    place, pictures = places[-1], dict[Path, str]()
+    for place in places:
+        pictures = place.pictures(path)
+        if pictures:
+            break
+    return place, pictures
