@@ -24,7 +24,7 @@ from scopemap.runner.forecast import Forecast
 
 # They hold times, or what holds times.
 NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
-QUICK = ["--set", "mapping.triangulate_depth=false"]
+QUICK = ["--set", "mapping.method=no-triangulation"]
 
 
 def _files(folder: Path) -> dict[str, bytes]:

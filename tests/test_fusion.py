@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
@@ -27,7 +28,7 @@ GREY = (120, 110, 100)
 
 
 def _lenient(**advanced: float) -> FusionSettings:
-    return LENIENT.model_copy(update={"advanced": LENIENT.advanced.model_copy(update=advanced)})
+    return chosen(LENIENT, **advanced)
 
 
 def rays_of(camera: PinholeCamera, T: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: i
 def test_the_gate_can_be_opened() -> None:
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]
     frames[4] = _smoked(frames[4])
-    opened = SETTINGS.model_copy(update={"min_sharpness": 0.0})
+    opened = chosen(SETTINGS, min_sharpness=0.0)
     assert not [track for track in _tracked(frames, opened) if "sharpness" in track.reason]
 
 
@@ -77,7 +77,7 @@ def test_the_gate_can_be_opened() -> None:
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
     dark = replace(_frame(8, NEAR[-1]), valid=np.zeros_like(plane_scene.EVERYWHERE))
     frames = [*(_frame(n, T) for n, T in enumerate(NEAR)), dark, *(_frame(9 + n, T) for n, T in enumerate(FAR))]
-    tracks = _tracked(frames, SETTINGS.model_copy(update={"relocalisation_keyframes": remembered}))
+    tracks = _tracked(frames, chosen(SETTINGS, relocalisation_keyframes=remembered))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
     if remembered:
@@ -130,7 +130,7 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(9)]
     back = [_frame(17 + n, T) for n, T in enumerate(NEAR[:3])]
-    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
+    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=3))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
     assert tracks[11].reason == "new map"
     assert [track.map for track in tracks] == [0] * 11 + [1] * 6 + [0] * 3
@@ -149,7 +149,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
     frames = [_frame(n, T) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
     back = [_frame(20 + n, T) for n, T in enumerate(NEAR[:4])]
-    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 0, "search_every": 3}))
+    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=0, search_every=3))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
     assert searched == [True] * 6 + [True, False, False] * 2
@@ -166,7 +166,7 @@ def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
     last = frames[-1]
     nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
     spoilt = [replace(nothing, index=8 + n) for n in range(12)]
-    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], SETTINGS.model_copy(update={"new_map_after": 2}))
+    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], chosen(SETTINGS, new_map_after=2))
     assert {track.map for track in tracks} == {0}
     assert tracks[-1].status == "ok"
 
@@ -205,9 +205,7 @@ def test_a_map_is_still_known_after_many_that_came_to_nothing() -> None:
         )
         for n, grey in enumerate(soft)
     ]
-    tracks = _tracked(
-        [*frames, *nothing, replace(frames[4], index=78)], SETTINGS.model_copy(update={"new_map_after": 1})
-    )
+    tracks = _tracked([*frames, *nothing, replace(frames[4], index=78)], chosen(SETTINGS, new_map_after=1))
     assert max(track.map for track in tracks) > 20
     assert (tracks[-1].status, tracks[-1].reason, tracks[-1].map) == ("ok", "relocalised", 0)
     turn, way_mm = _off(tracks[-1], NEAR[4])

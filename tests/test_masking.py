@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MaskSettings
-from scopemap.config.input import MaskAdvanced
 from scopemap.frame import Frame, is_constant
 from scopemap.io.opening import open_sequence
 from scopemap.masking.masker import Masker
@@ -99,7 +99,7 @@ def test_highlights_are_found_and_widened_but_bright_tissue_is_not_one() -> None
     assert not valid[spot].any()
     assert valid[red].all()
     assert (~valid).sum() < 2.5 * spot.sum()
-    kept = Masker(SETTINGS.model_copy(update={"highlights": False}))(frame(image)).valid
+    kept = Masker(chosen(SETTINGS, highlights=False))(frame(image)).valid
     assert kept.all()
 
 
@@ -113,7 +113,7 @@ def test_clipped_pixels_go_but_red_alone_may_clip() -> None:
 
 
 def test_each_part_can_be_switched_off() -> None:
-    settings = MaskSettings(field_of_view=False, highlights=False, advanced=MaskAdvanced(dark_level=0))
+    settings = chosen(MaskSettings, field_of_view=False, highlights=False, dark_level=0)
     image = np.maximum(in_circle(), 1)
     assert Masker(settings)(frame(image)).valid.all()
 
@@ -133,7 +133,7 @@ def test_the_noise_of_a_black_image_is_not_tissue(sigma: float) -> None:
     assert Masker(MaskSettings())(frame(dark)).valid.mean() < 0.01
     noisy = np.clip(tissue() + rng.normal(0, sigma, dark.shape), 0, 255).astype(np.uint8)
     assert not is_constant(noisy)
-    assert Masker(MaskSettings(highlights=False))(frame(noisy)).valid.all()
+    assert Masker(chosen(MaskSettings, highlights=False))(frame(noisy)).valid.all()
 
 
 def test_constant_images_are_told_from_dark_ones() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from plane_scene import CAMERA, EVERYWHERE, pose, see
 from small_networks import saved, small_depth_anything, small_depth_pro
 from tiny_phantom import FRAMES, only_images, write_tiny
@@ -195,9 +196,7 @@ def test_no_frame_is_called_lost_for_fitting_badly(fault: str) -> None:
 
 def test_a_jump_is_accepted() -> None:
     """The picture has moved by 12 px."""
-    settings = STRICT.tracking.model_copy(
-        update={"advanced": STRICT.tracking.advanced.model_copy(update={"max_step": 0.005})}
-    )
+    settings = chosen(STRICT.tracking, max_step=0.005)
     rgb = see(pose(at_mm=(4.0, 0.0, 0.0))).rgb
     cautious = STRICT.model_copy(update={"tracking": settings})
     tracks = [_second(config, rgb) for config in (cautious, STRICT)]
@@ -282,10 +281,10 @@ def test_the_far_wall_is_fused() -> None:
     assert faces[0] == 0 < faces[1]
 
 
-@pytest.mark.parametrize(("blend", "expected_mm"), [("linear", 50.0), ("none", 100.0)])
-def test_without_flow_the_previous_depth_is_blended_where_it_was(blend: str, expected_mm: float) -> None:
-    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.paper.blend = none`."""
-    settings = Config.load("paper", settings={"mapis.paper.blend": blend}).mapis
+@pytest.mark.parametrize(("method", "expected_mm"), [("paper", 50.0), ("paper+no-blend", 100.0)])
+def test_without_flow_the_previous_depth_is_blended_where_it_was(method: str, expected_mm: float) -> None:
+    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.method = paper+no-blend`."""
+    settings = Config.load("paper", settings={"mapis.method": method}).mapis
     matcher, mapis, rgb = DenseMatcher(settings, create_flow("none", "cpu"), _Alike()), Mapis(settings), see(pose()).rgb
     for raw_mm in (50.0, 100.0):
         link = matcher.match(rgb, EVERYWHERE)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from chosen_settings import configured
 from scipy.spatial import KDTree
 from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
@@ -113,7 +114,7 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
     spies, found = spied(monkeypatch), {}
     for downscale in (1, 2):
         steps: list[Step] = []
-        config = Config.load(settings={"depth.backend": "shading", "depth.downscale": downscale})
+        config = configured({"depth.backend": "shading", "depth.downscale": downscale})
         result = reconstruct(open_sequence(folder), config, observers=(steps.append,))
         assert {frame.valid.shape for frame in spies.pop().seen} == {(SIZE[1] // downscale, SIZE[0] // downscale)}
         assert result.lost == []
@@ -142,11 +143,11 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
 def test_scopenet_sees_images_of_about_its_training_size(
     settings: dict[str, Any], longest_px: int, expected: int
 ) -> None:
-    assert depth_downscale(Config.load(settings=settings).depth, longest_px) == expected
+    assert depth_downscale(configured(settings).depth, longest_px) == expected
 
 
 def test_depth_is_not_estimated_on_next_to_nothing() -> None:
-    settings = Config.load(settings={"depth.downscale": 6}).depth
+    settings = configured({"depth.downscale": 6}).depth
     assert depth_downscale(settings, 192) == 6
     with pytest.raises(SettingsError, match=r"depth\.downscale=6: .* at most 5 here"):
         depth_downscale(settings, 191)

@@ -98,7 +98,7 @@ def test_nothing_of_an_inputs_metadata_is_in_the_result(
     write(tmp_path / "in")
     assert PATIENT in _texts(tmp_path / "in")
     (source,) = [tmp_path / "in"] if write is _write_pictures else (tmp_path / "in").iterdir()
-    settings = ("--set", "tracking.min_sharpness=0", "--set", "input.skip_duplicates=false")
+    settings = ("--set", "tracking.method=paper", "--set", "input.skip_duplicates=false")
     code, said = call("run", source, "--out", tmp_path / "out", *settings), capfd.readouterr()
     assert code == 0, said.err
     for text in (_texts(tmp_path / "out"), said.out, said.err):

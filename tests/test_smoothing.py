@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,14 +16,14 @@ ALPHA, BETA, GAMMA = 0.5, 0.3, 0.2
 
 
 def _wema(dynamic: bool = True, omega: float = 0.1) -> SmoothingSettings:
-    return SmoothingSettings(method="wema", alpha=ALPHA, beta=BETA, gamma=GAMMA, omega=omega, dynamic=dynamic)
+    return chosen(SmoothingSettings, method="wema", alpha=ALPHA, beta=BETA, gamma=GAMMA, omega=omega, dynamic=dynamic)
 
 
 def _at(position_mm: np.ndarray) -> np.ndarray:
     return se3(np.eye(3), np.asarray(position_mm, dtype=float))
 
 
-def _smoothed(poses: list[np.ndarray], chosen: SmoothingSettings) -> list[np.ndarray]:
+def _smoothed(poses: list[np.ndarray], settings: SmoothingSettings) -> list[np.ndarray]:
     smoother = create_smoother(chosen)
     return [smoother(pose) for pose in poses]
 

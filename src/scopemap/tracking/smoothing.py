@@ -66,4 +66,4 @@ class Wema:
 
 def create_smoother(settings: SmoothingSettings) -> Smoother:
     """Return the smoother that `settings.method` names."""
-    return Wema(settings) if settings.method == "wema" else NoSmoothing()
+    return Wema(settings) if settings.method != "none" else NoSmoothing()
