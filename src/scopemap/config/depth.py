@@ -28,11 +28,11 @@ class DepthAdvanced:
     factor: float = 30.0  # anchor = factor: the nearest tissue of frame 1 is at 1000 mm / factor
 
 
-_PAPER_DEPTH: dict[str, Any] = {"fit_shift": False}
 DEPTH: dict[str, dict[str, Any]] = {
     "scopemap": {},
-    "paper": _PAPER_DEPTH,
-    "paper-strict": _PAPER_DEPTH | {"disparity_floor": 0.0, "depth_pro_focal": "network"},
+    "paper": {"fit_shift": False},
+    "no-disparity-floor": {"disparity_floor": 0.0},
+    "network-focal": {"depth_pro_focal": "network"},
     "factor-100": {"factor": 100.0},
     "factor-1000": {"factor": 1000.0},
     "reanchored": {"reanchor_every": 10},
@@ -97,14 +97,13 @@ class MapisAdvanced:
     perceptual_score: bool = False  # one perceptual score per pair instead of a map (the paper)
 
 
-_PAPER_MAPIS: dict[str, Any] = {
-    **{"frame_scale": "none", "order": "refine-first", "blend": "linear"},
-    **{"recursive": False, "compare_warped": False, "perceptual_score": True},
-}
 MAPIS: dict[str, dict[str, Any]] = {
     "scopemap": {},
-    "paper": _PAPER_MAPIS,
-    "paper-strict": _PAPER_MAPIS | {"consistency_px": 1e6},
+    "paper": {
+        **{"frame_scale": "none", "order": "refine-first", "blend": "linear"},
+        **{"recursive": False, "compare_warped": False, "perceptual_score": True},
+    },
+    "no-flow-check": {"consistency_px": 1e6},
     "no-frame-scale": {"frame_scale": "none"},
     "no-blend": {"blend": "none"},
     "exponential-blend": {"blend": "exponential"},

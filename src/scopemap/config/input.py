@@ -64,8 +64,6 @@ class MaskAdvanced:
 
 MASK: dict[str, dict[str, Any]] = {
     "scopemap": {},
-    "paper": {"overlays": False},
-    "paper-strict": {"overlays": False, "field_of_view": False, "highlights": False, "exposure": False},
     "no-overlays": {"overlays": False},
     "no-field-of-view": {"field_of_view": False},
     "no-highlights": {"highlights": False},

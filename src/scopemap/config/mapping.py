@@ -70,10 +70,8 @@ class FusionAdvanced:
 
 FUSION: dict[str, dict[str, Any]] = {
     "scopemap": {},
-    "paper-strict": {
-        **{"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
-        "min_component_share": 0.0,
-    },
+    "unweighted": {"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
+    "all-components": {"min_component_share": 0.0},
     "well-seen": {"min_weight": 0.5},
 }
 

@@ -6,7 +6,7 @@ from typing import Any
 
 _PAPER: dict[str, Any] = {
     "input.skip_duplicates": False,
-    "mask.method": "paper",
+    "mask.method": "no-overlays",
     "depth.method": "paper",
     "depth.backend": "depth-anything",
     "depth.anchor": "depth-pro",
@@ -26,15 +26,15 @@ _PAPER: dict[str, Any] = {
 # What the text does not have and can be turned off (docs/method.md lists both): `paper` with these values.
 _BEYOND_PAPER: dict[str, Any] = {
     "input.longest_side_px": 0,
-    "mask.method": "paper-strict",
+    "mask.method": "no-overlays+no-field-of-view+no-highlights+no-exposure",
     "mask.files": "none",
     "mask.instruments": "off",
-    "depth.method": "paper-strict",
+    "depth.method": "paper+no-disparity-floor+network-focal",
     "depth.model": "LiheYoung/depth-anything-small-hf",
     "depth.max_depth_mm": 10000.0,
-    "mapis.method": "paper-strict",
-    "tracking.method": "paper-strict",
-    "fusion.method": "paper-strict",
+    "mapis.method": "paper+no-flow-check",
+    "tracking.method": "paper+least-squares+no-verdicts",
+    "fusion.method": "unweighted+all-components",
     "fusion.max_depth_mm": 300.0,
 }
 

@@ -40,15 +40,15 @@ class TrackingAdvanced:
     gain_bias: bool = True  # estimate gain and bias of each frame pair
 
 
-_PAPER: dict[str, Any] = {
-    **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "new_map_after": 0, "corner_depth_sigma": 0.0},
-    **{"min_keyframe_agreement": 0.0, "finest_level": 0, "depth_weight": 0.0, "min_correlation": -1.0},
-    **{"start": "identity", "channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
-}
 TRACKING: dict[str, dict[str, Any]] = {
     "scopemap": {},
-    "paper": _PAPER,
-    "paper-strict": _PAPER | {"min_valid_share": 0.001, "huber": 1e6, "min_inlier_share": 0.0, "max_step": 1e6},
+    "paper": {
+        **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "new_map_after": 0, "corner_depth_sigma": 0.0},
+        **{"min_keyframe_agreement": 0.0, "finest_level": 0, "depth_weight": 0.0, "min_correlation": -1.0},
+        **{"start": "identity", "channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
+    },
+    "least-squares": {"huber": 1e6},
+    "no-verdicts": {"min_valid_share": 0.001, "min_inlier_share": 0.0, "max_step": 1e6},
     "realtime": {"search_every": 3, "max_iterations": 15},
     "no-corners": {"corner_depth_sigma": 0.0},
     "no-early-keyframes": {"min_keyframe_agreement": 0.0},

@@ -43,7 +43,7 @@ class DepthPro:
     ) -> None:
         if not (use_known_focal or network.config.use_fov_model):
             raise WeightsError(
-                "this Depth Pro model finds no focal length: name another, or set depth.paper.depth_pro_focal=camera"
+                "this Depth Pro model finds no focal length: name another, or leave depth.method=network-focal out"
             )
         self.use_known_focal = use_known_focal
         self._device = choose_device(device)
