@@ -118,11 +118,6 @@ def test_observations_that_share_their_errors_count_as_one() -> None:
     assert np.abs(trusted.T_camera_world - wanted.T_camera_world).max() > 0.02
 
 
-def test_less_than_one_observation_is_refused() -> None:
-    with pytest.raises(ValueError, match="correlated_observations"):
-        MappingAdvanced(correlated_observations=0.5)
-
-
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
     for number in range(4):

@@ -47,6 +47,8 @@ def test_the_document_lists_every_setting_of_the_preset() -> None:
     text = (Path(__file__).parents[1] / "docs" / "method.md").read_text()
     section = text.split("## Beyond the paper, in the `paper` preset")[1].split("\n## ")[0]
     assert set(re.findall(r"`([a-z]+\.[a-z_.]+) = ", section)) >= set(BEYOND)
+    methods = {part for key, value in BEYOND.items() if key.endswith(".method") for part in value.split("+")}
+    assert all(method in section for method in methods - {"no-overlays"})
 
 
 def _run(preset: str, folder: Path, model: Path, **more: Any) -> tuple[Any, list[Step]]:

@@ -23,8 +23,8 @@ def _at(position_mm: np.ndarray) -> np.ndarray:
     return se3(np.eye(3), np.asarray(position_mm, dtype=float))
 
 
-def _smoothed(poses: list[np.ndarray], settings: SmoothingSettings) -> list[np.ndarray]:
-    smoother = create_smoother(chosen)
+def _smoothed(poses: list[np.ndarray], used: SmoothingSettings) -> list[np.ndarray]:
+    smoother = create_smoother(used)
     return [smoother(pose) for pose in poses]
 
 
