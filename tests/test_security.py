@@ -93,14 +93,15 @@ def _write_pictures(folder: Path) -> None:
 
 @pytest.mark.parametrize("write", [write_dicom_video, _write_video, _write_pictures])
 def test_nothing_of_an_inputs_metadata_is_in_the_result(
-    write: Callable[[Path], object], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    write: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Nor the folders around the input; its own name is."""
     around = tmp_path / PATIENT
     around.mkdir()
     write(around / "in")
     assert PATIENT in _texts(around / "in")
-    (source,) = [around / "in"] if write is _write_pictures else (around / "in").iterdir()
+    monkeypatch.chdir(around)
+    source = Path("in") if write is _write_pictures else next(Path("in").iterdir())
     settings = ("--set", "tracking.method=paper", "--set", "input.skip_duplicates=false")
     code, said = call("run", source, "--out", tmp_path / "out", *settings), capfd.readouterr()
     assert code == 0, said.err

@@ -187,7 +187,7 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) 
     of_cluster = ("worker-cores", "worker-memory", "worker-gpus")
     takes = {"processes": (), "ray": ("address", *of_cluster), "slurm": of_cluster}
     for option in (option for option, value in given.items() if value is not None and option not in takes[name]):
-        engines = " or ".join(engine for engine, options in takes.items() if option in options)
+        engines = " or ".join(engine for engine, known in takes.items() if option in known)
         raise SettingsError(f"--{option} is an option of --engine {engines}")
     from scopemap.runner.engines import WorkerNeeds
     from scopemap.runner.processes import run_in_processes

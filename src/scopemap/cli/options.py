@@ -49,7 +49,7 @@ FieldOfView = Annotated[
     typer.Option(
         min=5.0,
         max=170.0,
-        help="Horizontal field of view, degrees, of an unknown camera; default: estimated from the motion, or 70 (live: 70).",
+        help="Horizontal field of view, degrees, of an unknown camera; default: from the motion, or 70 (live: 70).",
     ),
 ]
 NearFar = Annotated[
