@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from scopemap.config import PRESETS, Config, Settings
+from scopemap.config.settings import StageSettings
 
 _HEAD = """# Settings
 
@@ -15,47 +15,41 @@ a preset. The order is defaults < preset < file < command line. A result's `conf
 valid file. A cell "presets" names what presets change; `paper-strict` changes what `paper` does, too.
 `python docs/settings_page.py` writes this page.
 """
-_SECTIONS = (
-    ("", "User settings", "What one may want to choose."),
-    (
-        "advanced",
-        "Advanced settings",
-        "Values found by trial; the defaults are used in every preset that does not name them.",
-    ),
-    ("paper", "Settings of the paper", "What only the preset `paper` and the ablations need."),
-)
+_METHODS = """
+## Methods
+
+A stage's `method` names its constants (`src/scopemap/config/` states what each constant is). Methods can be joined, the
+later one wins: `--set tracking.method=paper+gauss-newton`.
+
+| setting | method | constants that it changes |
+|---|---|---|
+"""
 
 
 def settings_page() -> str:
-    """Return docs/settings.md: a table per stage, first the user settings, then `advanced`, then `paper`."""
+    """Return docs/settings.md: a table per stage, then the methods of all stages."""
     parts = [_HEAD]
-    for group, title, meaning in _SECTIONS:
-        parts.append(f"\n## {title}\n\n{meaning}\n")
-        for stage, model in _nested(Config).items():
-            owner = model if not group else _nested(model).get(group)
-            rows = [] if owner is None else list(_rows(owner, f"{stage}.{group}." if group else f"{stage}."))
-            if rows:
-                parts.append(f"\n### {stage}\n\n{_summary(model)}\n\n" if not group else f"\n### {stage}\n\n")
-                parts.append("| setting | default | meaning | presets |\n|---|---|---|---|\n" + "".join(rows))
+    stages = {name: part for name, part in Config() if isinstance(part, Settings)}
+    for stage, part in stages.items():
+        meaning = " ".join((type(part).__doc__ or "").split())
+        parts.append(f"\n## {stage}\n\n{meaning}\n\n| setting | default | meaning | presets |\n|---|---|---|---|\n")
+        parts += [_row(f"{stage}.{name}", value, type(part)) for name, value in part.model_dump().items()]
+    parts.append(_METHODS)
+    for stage, part in stages.items():
+        for method, changes in part.METHODS.items() if isinstance(part, StageSettings) else ():
+            changed = ", ".join(f"{name} = {_text(value)}" for name, value in changes.items())
+            parts.append(f"| `{stage}.method` | {method} | {changed} |\n")
     return "".join(parts)
 
 
-def _nested(model: type[Settings]) -> dict[str, type[Settings]]:
-    """Return the groups of settings in a class by their names."""
-    found = {name: field.annotation for name, field in model.model_fields.items()}
-    return {name: kind for name, kind in found.items() if isinstance(kind, type) and issubclass(kind, Settings)}
-
-
-def _rows(model: type[Settings], prefix: str) -> Iterator[str]:
-    nested = _nested(model)
-    for name, field in model.model_fields.items():
-        if name not in nested:
-            changed = {preset: values[prefix + name] for preset, values in PRESETS.items() if prefix + name in values}
-            if "paper-strict" in changed and changed["paper-strict"] == changed.get("paper"):
-                del changed["paper-strict"]
-            changes = "; ".join(f"{preset}: {_text(value)}" for preset, value in changed.items())
-            cells = (f"`{prefix}{name}`", _text(field.default), field.description or "", changes)
-            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+def _row(name: str, default: Any, stage: type[Settings]) -> str:
+    meaning = stage.model_fields[name.rpartition(".")[2]].description or ""
+    changed = {preset: values[name] for preset, values in PRESETS.items() if name in values}
+    if "paper-strict" in changed and changed["paper-strict"] == changed.get("paper"):
+        del changed["paper-strict"]
+    changes = "; ".join(f"{preset}: {_text(value)}" for preset, value in changed.items())
+    cells = (f"`{name}`", _text(default), meaning, changes)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
 def _text(value: Any) -> str:
@@ -71,10 +65,6 @@ def _text(value: Any) -> str:
         case float():
             return f"{value:g}"
     return str(value)
-
-
-def _summary(model: type[Settings]) -> str:
-    return " ".join((model.__doc__ or "").split("\n\n")[0].split())
 
 
 if __name__ == "__main__":

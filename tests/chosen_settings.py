@@ -1,22 +1,30 @@
-"""Settings of a stage from flat names, whatever group of the stage they are in."""
+"""Settings in which constants of the stages are replaced, too."""
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import Any, TypeVar
 
-from scopemap.config import Settings
+from scopemap.config import Config, Preset, setting_names
+from scopemap.config.settings import StageSettings
 
-Chosen = TypeVar("Chosen", bound=Settings)
-
-
-def chosen(kind: type[Chosen], **values: Any) -> Chosen:
-    """Return settings of `kind` with the values given, each in the nested group (`advanced`, `paper`) that has it."""
-    tree: dict[str, Any] = {}
-    for name, value in values.items():
-        groups = [field for field, info in kind.model_fields.items() if _has(info.annotation, name)]
-        (tree if name in kind.model_fields else tree.setdefault(groups[0], {}))[name] = value
-    return kind.model_validate(tree)
+Stage = TypeVar("Stage", bound=StageSettings)
 
 
-def _has(annotation: Any, name: str) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, Settings) and name in annotation.model_fields
+def chosen(stage: type[Stage] | Stage, **values: Any) -> Stage:
+    """Return settings of a stage, the default ones of a class, with the settings and constants that `values` names."""
+    before = stage.model_validate({}) if isinstance(stage, type) else stage
+    constants = {name: values.pop(name) for name in [field.name for field in fields(before.advanced)] if name in values}
+    changed = type(before).model_validate(before.model_dump() | values)
+    base = before.advanced if "method" not in values else changed.advanced
+    return changed.model_copy(update={"advanced": replace(base, **constants)})
+
+
+def configured(settings: dict[str, Any], preset: Preset | None = None) -> Config:
+    """Return `Config.load(preset, settings=settings)`; "tracking.huber" names the constant of a stage."""
+    names = setting_names()
+    config = Config.load(preset, settings={key: value for key, value in settings.items() if key in names})
+    for key in settings.keys() - set(names):
+        stage, *_, name = key.split(".")
+        config = config.model_copy(update={stage: chosen(getattr(config, stage), **{name: settings[key]})})
+    return config

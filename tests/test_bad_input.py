@@ -54,23 +54,17 @@ def _read_all(path: Path) -> None:
 # ---- files that are not what their names say
 
 
-def test_names_do_not_matter_where_the_content_is_sound(tmp_path: Path) -> None:
-    """A PNG named JPG among others, and a video named PNG."""
-    for number in range(3):
+def test_content_decides_not_names(tmp_path: Path) -> None:
+    """A PNG named JPG among others is read, a video named PNG too; among pictures that video is left out."""
+    for number in range(4):
         save(tmp_path / f"{number}.png", picture(number))
     (tmp_path / "1.png").rename(tmp_path / "1.jpg")
-    assert [frame.index for frame in open_sequence(tmp_path).frames()] == [0, 1, 2]
-    video = write_video(tmp_path / "clip.mp4", 5).rename(tmp_path / "clip.png")
+    assert [frame.index for frame in open_sequence(tmp_path).frames()] == [0, 1, 2, 3]
+    video = write_video(tmp_path / "clip.mp4", 5).rename(tmp_path / "2.png")
     assert len(list(open_sequence(video).frames())) == 5
-
-
-def test_a_video_named_as_a_picture_among_pictures_is_left_out(tmp_path: Path) -> None:
-    for number in (0, 2, 3):
-        save(tmp_path / f"{number}.png", picture(number))
-    write_video(tmp_path / "clip.mp4", 5).rename(tmp_path / "1.png")
     sequence = open_sequence(tmp_path)
-    assert [frame.index for frame in sequence.frames()] == [0, 2, 3]
-    assert "1.png cannot be read and was left out" in sequence.warnings[0]
+    assert [frame.index for frame in sequence.frames()] == [0, 1, 3]
+    assert "2.png cannot be read and was left out" in sequence.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -109,8 +103,7 @@ def test_a_video_that_changes_its_size_is_refused_with_both(tmp_path: Path) -> N
 # ---- poses
 
 
-_ROW = "{0} 1 2 3 0 0 0 1"
-_SOUND = [_ROW.format(number) for number in range(5)]
+_SOUND = [f"{number} 1 2 3 0 0 0 1" for number in range(5)]
 
 
 def _tum(row: str) -> str:
@@ -122,41 +115,29 @@ def _kitti(matrix: np.ndarray) -> str:
     return "\n".join(" ".join(f"{x:g}" for x in row.ravel()) for row in rows) + "\n"
 
 
-def _with(value: float, place: tuple[int, int]) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[place] = value
-    return matrix
-
-
-@pytest.mark.parametrize("side", ["estimate", "truth"])
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         (_tum("2 nan 2 3 0 0 0 1"), "line 3"),
-        (_tum("2 1 inf 3 0 0 0 1"), "line 3"),
         (_tum("2 1 2 3 0 0 0 0"), "line 3"),
-        (_tum("2 1 2 3 0 0 nan 1"), "line 3"),
         (_tum("2 1 2 3 9 9 9 9"), "line 3"),
         (_tum("1 1 2 3 0 0 0 1"), "line"),
         (_tum("two 1 2 3 0 0 0 1"), "line 3"),
         (_tum("2 1 2 3 0 0 0"), "line 3"),
-        (_kitti(np.zeros((4, 4))), "line 3"),
         (_kitti(np.diag([-1.0, 1, 1, 1])), "line 3"),
         (_kitti(np.diag([2.0, 2, 2, 1])), "line 3"),
-        (_kitti(np.ones((4, 4))), "line 3"),
-        (_kitti(_with(np.nan, (0, 0))), "line 3"),
-        (_kitti(_with(np.inf, (1, 3))), "line 3"),
+        (_kitti(np.full((4, 4), np.nan)), "line 3"),
         ("", "it holds no pose"),
         ("\0\1\2" * 99, "line 1"),
     ],
 )
-def test_evaluate_refuses_poses_that_are_none(text: str, said: str, side: str, capfd: Capture, tmp_path: Path) -> None:
+def test_evaluate_refuses_poses_that_are_none(text: str, said: str, capfd: Capture, tmp_path: Path) -> None:
     (tmp_path / "bad.txt").write_text(text)
     (tmp_path / "sound.txt").write_text("\n".join(_SOUND) + "\n")
-    files = ["bad.txt", "sound.txt"] if side == "estimate" else ["sound.txt", "bad.txt"]
-    found = refused(capfd, "evaluate", tmp_path / files[0], "--truth", tmp_path / files[1])
-    assert "bad.txt" in found
-    assert said in found
+    for files in (("bad.txt", "sound.txt"), ("sound.txt", "bad.txt")):
+        found = refused(capfd, "evaluate", tmp_path / files[0], "--truth", tmp_path / files[1])
+        assert "bad.txt" in found
+        assert said in found
 
 
 # ---- folders that may not be read, and that lead in circles
@@ -213,25 +194,6 @@ def test_no_permission_is_a_sentence(name: str, open_folder: Path) -> None:
             path.chmod(before)
             assert "\n" not in outcome
             assert outcome or path.is_file(), f"{path.name} without permission ({mode:o}) went unnoticed"
-
-
-@pytest.mark.skipif(not hasattr(os, "setresuid"), reason="permissions are taken away as on Linux")
-def test_folders_that_are_not_needed_may_be_closed(open_folder: Path) -> None:
-    """A disk's `lost+found`, a hidden folder, and one beside the pictures or the data set."""
-    for write in (WRITERS["images"], WRITERS["c3vd"]):
-        entry = write(open_folder / "input")
-        _read_all(entry)
-        for name in ("lost+found", ".trash"):
-            (entry / name).mkdir(mode=0o000)
-        assert _as_nobody(lambda at=entry: " ".join(open_sequence(at).warnings)) == ""  # type: ignore[misc]
-        closed = entry / "private" if write is WRITERS["images"] else entry.parent / "private"
-        closed.mkdir(mode=0o000)
-        told = _as_nobody(lambda at=closed.parent: " ".join(open_sequence(at).warnings))  # type: ignore[misc]
-        assert told == f"left out: no permission to look into {closed}"
-        for inner in open_folder.rglob("*"):
-            if inner.is_dir():
-                inner.chmod(0o755)
-        shutil.rmtree(open_folder / "input")
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
@@ -328,13 +290,12 @@ def test_an_output_folder_that_holds_something_else_is_kept(phantom: Path, tmp_p
     assert kept["thesis.txt"] == kept["depth/thesis.png"] == b"mine"
 
 
-@pytest.mark.parametrize("place", [".", "..", "./"])
 def test_the_input_is_never_the_output(
-    place: str, phantom: Path, tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch
+    phantom: Path, tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = Path(shutil.copytree(phantom, tmp_path / "sets" / "in"))
     before = _tree(tmp_path)
     monkeypatch.chdir(source)
-    for extra in ((), ("--overwrite",)):
+    for place, *extra in ((".",), (".", "--overwrite"), ("..", "--overwrite")):
         refused(capfd, "run", source, "--out", place, "--depth", f"files:{source}", "--quiet", *extra)
     assert _tree(tmp_path) == before

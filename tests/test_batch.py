@@ -22,7 +22,7 @@ from scopemap.runner.batch import folder_names
 
 # They hold times, or what holds times.
 NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
-QUICK = ["--set", "mapping.triangulate_depth=false"]
+QUICK = ["--set", "mapping.method=no-triangulation"]
 
 
 def _files(folder: Path) -> dict[str, bytes]:

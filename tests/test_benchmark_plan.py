@@ -135,8 +135,8 @@ def test_what_is_not_there_is_said_and_nothing_at_all_is_an_error(tmp_path: Path
     [
         (
             'name = "ours"',
-            'name = "ours"\nsettings = { "tracking.hubber" = 2 }',
-            "did you mean 'tracking.advanced.huber'",
+            'name = "ours"\nsettings = { "tracking.keyframes_every" = 2 }',
+            "did you mean 'tracking.keyframe_every'",
         ),
         ('name = "ours"', 'name = "theirs"', "two methods have the name 'theirs'"),
         ('name = "ours"', 'name = "ours"\nuse = "import"', "belong together"),

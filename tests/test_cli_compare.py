@@ -106,7 +106,7 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
         "networks.flow": "dis",
         "networks.perceptual": "structure",
         "fusion.voxel_mm": 2.0,
-        "fusion.advanced.min_weight": 0,
+        "fusion.method": "unweighted",
     }
     reconstruct(open_sequence(truth), Config.load(settings=light), out=tmp_path / "one")
     shutil.copytree(tmp_path / "one", tmp_path / "two")

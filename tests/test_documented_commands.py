@@ -107,13 +107,9 @@ def test_commands_about_the_demonstration_run(small_demo: Path, monkeypatch: pyt
 def test_python_about_the_demonstration_runs(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_demo)
     blocks = [block for one in DOCUMENTS for block in _blocks(one.read_text(encoding="utf-8"), "python")]
+    for block in blocks:
+        compile(block, "document", "exec")
     about = [block for block in blocks if ABOUT_THE_DEMO.search(block)]
     assert about
     for block in about:
         exec(compile(block, "document", "exec"), {})
-
-
-def test_python_in_blocks_is_python() -> None:
-    for document in DOCUMENTS:
-        for block in _blocks(document.read_text(encoding="utf-8"), "python"):
-            compile(block, document.name, "exec")

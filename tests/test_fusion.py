@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from chosen_settings import chosen
 from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, plane_frame, sphere_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +21,7 @@ from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
 
 
 def _lenient(**advanced: float) -> FusionSettings:
-    return LENIENT.model_copy(update={"advanced": LENIENT.advanced.model_copy(update=advanced)})
+    return chosen(LENIENT, **advanced)
 
 
 def sphere_volume(radius_mm: float, centre_mm: np.ndarray | None = None) -> TsdfVolume:

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import plane_scene
 import pytest
+from chosen_settings import chosen
 
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingAdvanced
@@ -138,7 +139,7 @@ def test_one_false_loop_is_an_outlier() -> None:
 @pytest.mark.parametrize("closing", [True, False])
 def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()
-    settings = SETTINGS if closing else SETTINGS.model_copy(update={"min_loop_inliers": 0})
+    settings = SETTINGS if closing else chosen(SETTINGS, min_loop_inliers=0)
     correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     _, before = _off(tracked[-1], POSES[-1])
     _, after = _off(correction.pose(10 * (COUNT - 1), tracked[-1]), POSES[-1])

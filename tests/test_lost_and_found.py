@@ -68,7 +68,7 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
         dark,
         *(plane_scene.frame(T, 9 + n) for n, T in enumerate(FAR)),
     ]
-    tracks = _tracked(frames, SETTINGS.model_copy(update={"relocalisation_keyframes": remembered}))
+    tracks = _tracked(frames, chosen(SETTINGS, relocalisation_keyframes=remembered))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
     if remembered:
@@ -91,7 +91,7 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(9)]
     back = [plane_scene.frame(T, 17 + n) for n, T in enumerate(NEAR[:3])]
-    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 3}))
+    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=3))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
     assert tracks[11].reason == "new map"
     assert [track.map for track in tracks] == [0] * 11 + [1] * 6 + [0] * 3
@@ -110,7 +110,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
     back = [plane_scene.frame(T, 20 + n) for n, T in enumerate(NEAR[:4])]
-    tracks = _tracked([*frames, *there, *back], SETTINGS.model_copy(update={"new_map_after": 0, "search_every": 3}))
+    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=0, search_every=3))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
     assert searched == [True] * 6 + [True, False, False] * 2
@@ -127,7 +127,7 @@ def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
     last = frames[-1]
     nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
     spoilt = [replace(nothing, index=8 + n) for n in range(12)]
-    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], SETTINGS.model_copy(update={"new_map_after": 2}))
+    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], chosen(SETTINGS, new_map_after=2))
     assert {track.map for track in tracks} == {0}
     assert tracks[-1].status == "ok"
 

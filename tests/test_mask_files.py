@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from chosen_settings import chosen
+from chosen_settings import chosen, configured
 from drawn_inputs import frames_of, picture, save
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
-from scopemap.config import Config, MaskSettings
+from scopemap.config import MaskSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.frame import Frame
@@ -118,9 +118,7 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     for i in range(3):
         save(images / f"{i}.png", picture(i, (640, 480)))
     masks = write_masks(tmp_path / "masks", {f"{i}.png": left_half() for i in range(3)})
-    config = Config.load(
-        settings={"mask.files": str(masks), "mask.advanced.files_grow_px": 0, "depth.backend": "shading"}
-    )
+    config = configured({"mask.files": str(masks), "mask.files_grow_px": 0, "depth.backend": "shading"})
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
     assert estimators_provenance(estimators)["masks"].startswith("3 files")

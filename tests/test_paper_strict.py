@@ -33,6 +33,8 @@ def test_the_document_lists_every_setting_of_the_preset() -> None:
     text = (Path(__file__).parents[1] / "docs" / "method.md").read_text()
     section = text.split("## Beyond the paper, in the `paper` preset")[1].split("\n## ")[0]
     assert set(re.findall(r"`([a-z]+\.[a-z_.]+) = ", section)) >= set(BEYOND)
+    methods = {part for key, value in BEYOND.items() if key.endswith(".method") for part in value.split("+")}
+    assert all(method in section for method in methods - {"no-overlays"})
 
 
 def _run(preset: str, folder: Path, model: Path, **more: Any) -> tuple[Any, list[Step]]:
@@ -103,10 +105,10 @@ def test_no_frame_is_called_lost_for_fitting_badly(fault: str) -> None:
     assert [_second(config, *shown).status for config in (PAPER, STRICT)] == ["lost", "ok"]
 
 
-@pytest.mark.parametrize(("blend", "expected_mm"), [("linear", 50.0), ("none", 100.0)])
-def test_without_flow_the_previous_depth_is_blended_where_it_was(blend: str, expected_mm: float) -> None:
-    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.paper.blend = none`."""
-    settings = Config.load("paper", settings={"mapis.paper.blend": blend}).mapis
+@pytest.mark.parametrize(("method", "expected_mm"), [("paper", 50.0), ("paper+no-blend", 100.0)])
+def test_without_flow_the_previous_depth_is_blended_where_it_was(method: str, expected_mm: float) -> None:
+    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.method = paper+no-blend`."""
+    settings = Config.load("paper", settings={"mapis.method": method}).mapis
     matcher, mapis, rgb = DenseMatcher(settings, create_flow("none", "cpu"), _Alike()), Mapis(settings), see(pose()).rgb
     for raw_mm in (50.0, 100.0):
         link = matcher.match(rgb, EVERYWHERE)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from chosen_settings import configured
 from scipy.spatial import KDTree
 from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
@@ -83,7 +84,7 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spies, steps = spied(monkeypatch), list[Step]()
-    config = Config.load(settings={"depth.backend": "shading", "depth.downscale": 2})
+    config = configured({"depth.backend": "shading", "depth.downscale": 2})
     reconstruct(open_sequence(folder), config, observers=(steps.append,))
     assert {frame.valid.shape for frame in spies.pop().seen} == {(SIZE[1] // 2, SIZE[0] // 2)}
     depths = [(step.raw_mm, step.frame.depth_mm, step.frame.depth_sigma_mm) for step in steps]
@@ -101,9 +102,9 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
 def test_scopenet_sees_images_of_about_its_training_size(
     settings: dict[str, Any], longest_px: int, expected: int
 ) -> None:
-    assert depth_downscale(Config.load(settings=settings).depth, longest_px) == expected
+    assert depth_downscale(configured(settings).depth, longest_px) == expected
     with pytest.raises(SettingsError, match=r"depth\.downscale=6: .* at most 5 here"):
-        depth_downscale(Config.load(settings={"depth.downscale": 6}).depth, 191)
+        depth_downscale(configured({"depth.downscale": 6}).depth, 191)
 
 
 def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:

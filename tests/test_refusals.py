@@ -7,26 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from front_door import call, refused
-from tiny_phantom import FRAMES, with_true_depth
+from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.mapis import Mapis
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError
 from scopemap.estimators import create_estimators, estimators_provenance
 from scopemap.io.opening import open_sequence
 from scopemap.pipeline import Pipeline
 from scopemap.runner.run import reconstruct
-from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.writer import write_phantom
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    target = tmp_path_factory.mktemp("refusals") / "phantom"
-    write_phantom(PhantomSpec(scene="colon", frames=FRAMES, width=160, height=128, seed=2), target)
-    return target
+    return write_tiny(tmp_path_factory.mktemp("refusals") / "phantom")
 
 
 def _depth_files(folder: Path, values_mm: list[float]) -> Path:
@@ -104,49 +99,3 @@ def test_frames_are_read_without_their_truth(folder: Path, monkeypatch: pytest.M
 def test_a_stated_farthest_tissue_is_believed() -> None:
     assert max_depth_mm(Config.load().depth) == 300.0
     assert max_depth_mm(Config.load(settings={"depth.near_far_mm": (50, 400)}).depth) == 400.0
-
-
-@pytest.mark.parametrize("voxel_mm", [1e-5, 1e308])
-def test_a_voxel_too_small_or_too_large_to_store_is_refused(voxel_mm: float) -> None:
-    with pytest.raises(SettingsError, match="voxel_mm"):
-        Config.load(settings={"fusion.voxel_mm": voxel_mm})
-
-
-@pytest.mark.parametrize("size", ["100000x100000", "40000x100", "20000x20000", "999999x32"])
-def test_a_working_size_that_no_memory_holds_is_refused(
-    size: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    said = refused(capfd, "run", folder, "--out", tmp_path / "out", "--size", size)
-    assert f"the working size {size} px is too large: 32000 px a side and 64 million pixels at most" in said
-
-
-@pytest.mark.parametrize("lens", [(1e10, 0, 0, 0), (-1e10, 0, 0, 0), (0, 0, 1e10, 0), (1e300, 0, 0, 0)])
-def test_the_distortion_of_no_lens_is_named(
-    lens: tuple[float, ...], folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    numbers = " ".join(map(str, (120, 120, 80, 64, *lens)))
-    said = refused(capfd, "run", folder, "--out", tmp_path / "out", "--camera", numbers)
-    assert "check the distortion coefficients" in said
-
-
-def test_a_folder_of_videos_lists_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name in ("b.mp4", "a.AVI", "notes.txt"):
-        (tmp_path / name).write_bytes(b"")
-    for command in (("run", tmp_path, "--out", tmp_path / "out"), ("inspect", tmp_path, "--out", tmp_path / "a.png")):
-        said = refused(capfd, *command)
-        assert "it holds 2 video(s) (a.AVI, b.mp4) and no images; give one of them, such as" in said
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("command", ["", "run", "inspect", "evaluate", "models", "datasets check"])
-def test_h_is_help(command: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert call(*command.split(), "-h") == 0
-    assert "Usage" in capfd.readouterr().out
-
-
-def test_a_picture_in_a_folder_without_permission_is_refused_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("scopemap.cli.options.os.access", lambda *_: False)
-    said = refused(capfd, "inspect", tmp_path / "none.mp4", "--out", tmp_path / "new" / "a.png")
-    assert f"no permission to write in {tmp_path}" in said

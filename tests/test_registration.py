@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from scopemap.errors import AlignmentError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp, transform
@@ -61,18 +60,6 @@ def test_it_finds_what_another_icp_finds_on_bare_points() -> None:
     assert turned_rad < 1e-3
 
 
-def test_the_motion_does_not_depend_on_where_the_world_begins() -> None:
-    truth, T = landscape(), small_motion(np.random.default_rng(8))
-    W = se3(Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix(), np.array([300.0, -200, 100]))
-    moved = truth.copy().apply_transform(T)
-    here = refine(moved, truth)
-    there = refine(moved.copy().apply_transform(W), truth.copy().apply_transform(W))
-    assert there[2] == pytest.approx(here[2], abs=1e-3)
-    expected = W @ se3(here[0].R, here[0].t) @ inverse(W)
-    middle = transform(W, np.array([22.0, 22.0, 0.0]))
-    np.testing.assert_allclose(there[0].transform_points(middle), transform(expected, middle), atol=5e-3)
-
-
 def test_outliers_and_a_missing_half_do_not_pull() -> None:
     rng, truth = np.random.default_rng(2), landscape()
     T = small_motion(rng)
@@ -101,17 +88,13 @@ def test_a_plane_is_lifted_and_tilted_but_not_slid() -> None:
     assert result[2] < 1e-3
 
 
-def test_a_perfect_prediction_stays_and_the_same_input_gives_the_same_answer() -> None:
+def test_a_perfect_prediction_stays() -> None:
     truth = landscape()
     # Other samples of the same surface: what their spacing suggests would only take it away from the truth.
     still = refine(trimesh.sample.sample_surface(truth, 8_000, seed=7)[0], truth)
     assert still[2] <= still[1] < 1e-9
     np.testing.assert_array_equal(still[0].R, np.eye(3))
     np.testing.assert_array_equal(still[0].t, np.zeros(3))
-    moved = truth.copy().apply_transform(small_motion(np.random.default_rng(1)))
-    first, second = refine(moved, truth), refine(moved, truth)
-    np.testing.assert_array_equal(first[0].t, second[0].t)
-    assert first[2] == second[2]
 
 
 def test_what_cannot_be_fitted_is_refused() -> None:

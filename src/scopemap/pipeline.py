@@ -51,7 +51,7 @@ class Pipeline:
         mapping = config.mapping.model_copy(update=at_rest)
         mapper = Mapper(mapping, estimators.keyframe_flow, store.table, estimators.features)
         self.odometry = Odometry(config, tracker, mapper)
-        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method == "full")
+        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method != "none")
 
     @property
     def stages(self) -> dict[str, Preprocessing | Matching | Odometry]:

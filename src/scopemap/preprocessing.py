@@ -42,7 +42,7 @@ class Estimators:
 class PreprocessedFrame:
     """Results that need no motion: `frame` is masked, with raw depth of `kind`; `anchored`: fixed the scale.
 
-    small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth.downscale`.
+    small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth_downscale`.
     depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
     """
 

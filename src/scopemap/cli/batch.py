@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -13,18 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from scopemap.cli import options
 from scopemap.cli.figures import print_json
-from scopemap.cli.options import (
-    AsJson,
-    CameraFile,
-    Dataset,
-    Quiet,
-    SetPairs,
-    parse_memory,
-    parse_settings,
-    parse_size,
-    parse_slice,
-)
 from scopemap.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -49,51 +38,51 @@ def batch(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results, one folder per video.")],
-    preset: Annotated[
-        Literal["default", "paper", "paper-strict", "realtime"] | None, typer.Option(help="As for `scopemap run`.")
-    ] = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings as TOML.")] = None,
-    dataset: Dataset = None,
-    camera: CameraFile = None,
-    fov: Annotated[float | None, typer.Option(help="Horizontal field of view, degrees.")] = None,
+    preset: options.PresetName = None,
+    config: options.ConfigFile = None,
+    dataset: options.Dataset = None,
+    camera: options.CameraFile = None,
+    fov: options.FieldOfView = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B:S", help="Which frames of each, a Python slice.")] = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Working size, px.")] = None,
-    settings: SetPairs = None,
+    size: options.Size = None,
+    settings: options.SetPairs = None,
     workers: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Videos at once; default: half as many as there are cores.")
     ] = None,
     time_limit: Annotated[
-        float | None, typer.Option(min=0.1, metavar="SECONDS", help="End a video that takes longer; it has failed.")
+        float | None, options.advanced(min=0.1, metavar="SECONDS", help="End a video that takes longer; it has failed.")
     ] = None,
     retries: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Further attempts where the process of a video dies.")
+        int, options.advanced(min=0, metavar="N", help="Further attempts where the process of a video dies.")
     ] = 1,
     engine: Annotated[
         Literal["processes", "ray", "slurm"],
-        typer.Option(help="What runs the videos: processes of this machine; actors on Ray; jobs of Slurm."),
+        options.advanced(help="What runs the videos: processes here; actors on Ray; jobs of Slurm."),
     ] = "processes",
     address: Annotated[
-        str | None, typer.Option(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
+        str | None, options.advanced(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
     ] = None,
     worker_cores: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Ray, Slurm: cores of each worker (2).")
+        int | None, options.advanced(min=1, metavar="N", help="Ray, Slurm: cores of each worker (2).")
     ] = None,
     worker_memory: Annotated[
-        str | None, typer.Option(metavar="SIZE", help="Ray, Slurm: memory that each worker is given (4GB).")
+        str | None, options.advanced(metavar="SIZE", help="Ray, Slurm: memory that each worker is given (4GB).")
     ] = None,
     worker_gpus: Annotated[
         float | None,
-        typer.Option(min=0, help="Ray, Slurm: GPUs of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
+        options.advanced(min=0, help="Ray, Slurm: GPUs of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
     ] = None,
-    part: Annotated[str | None, typer.Option(metavar="K/N", help="Only the K-th of N parts, for job arrays.")] = None,
+    part: Annotated[
+        str | None, options.advanced(metavar="K/N", help="Only the K-th of N parts, for job arrays.")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Run a second of each video, and print what all of them will take.")
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace results of other settings or inputs; finished ones stay.")
     ] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Reconstruct many videos: look at index.html, or batch.csv, in the folder of the results.
 
@@ -103,11 +92,11 @@ def batch(
     chosen = {"preset": preset, "config": config, "dataset": dataset, "camera": camera, "fov": fov}
     chosen |= {"frames": frames, "size": size}
     shared = {key: str(value) for key, value in chosen.items() if value is not None}
-    of_part = parse_part(part) if part else (1, 1)
+    of_part = options.parse_part(part) if part else (1, 1)
     from scopemap.io.inputs import named_inputs
     from scopemap.runner.processes import ProcessLimits, usable_cores
 
-    videos = videos_of(named_inputs(inputs), shared, parse_settings(settings or []))
+    videos = videos_of(named_inputs(inputs), shared, options.parse_settings(settings or []))
     if workers is None and (engine == "slurm" or address):
         raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
@@ -134,14 +123,6 @@ def batch(
         typer.echo(f"look at {out / INDEX} in a browser; {out / TABLE} has the same as a table")
     if any(row.status != "done" for row in rows):
         raise typer.Exit(1)
-
-
-def parse_part(text: str) -> tuple[int, int]:
-    """Return (k, n) of "K/N", 1 <= k <= n. Raises `SettingsError`."""
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
-    if not match or not 1 <= int(match[1]) <= int(match[2]):
-        raise SettingsError(f"cannot read the part '{text[:80]}': expected K/N with K from 1 to N, such as 3/10")
-    return int(match[1]), int(match[2])
 
 
 def videos_of(inputs: list[NamedInput], shared: dict[str, str], settings: dict[str, Any]) -> list[Video]:
@@ -175,7 +156,7 @@ def _video(
         sources = (columns.get("preset"), columns.get("config"), tuple(sorted(own.items())))
         if (text := repr(sources)) not in configs:
             file = Path(columns["config"]) if "config" in columns else None
-            given = settings | parse_settings([f"{key}={value}" for key, value in own.items()])
+            given = settings | options.parse_settings([f"{key}={value}" for key, value in own.items()])
             configs[text] = Config.load(cast("Preset | None", columns.get("preset")), file, given)
         return Video(
             one.path,
@@ -184,8 +165,8 @@ def _video(
             dataset=columns.get("dataset"),
             camera=columns.get("camera"),
             fov_deg=_number(columns["fov"]) if "fov" in columns else None,
-            size=parse_size(columns["size"]) if "size" in columns else None,
-            frames=parse_slice(columns["frames"]) if "frames" in columns else None,
+            size=options.parse_size(columns["size"]) if "size" in columns else None,
+            frames=options.parse_slice(columns["frames"]) if "frames" in columns else None,
         )
     except SettingsError as error:
         raise SettingsError(f"{error}; for the input {one.path}") from None
@@ -206,7 +187,7 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) 
     of_cluster = ("worker-cores", "worker-memory", "worker-gpus")
     takes = {"processes": (), "ray": ("address", *of_cluster), "slurm": of_cluster}
     for option in (option for option, value in given.items() if value is not None and option not in takes[name]):
-        engines = " or ".join(engine for engine, options in takes.items() if option in options)
+        engines = " or ".join(engine for engine, known in takes.items() if option in known)
         raise SettingsError(f"--{option} is an option of --engine {engines}")
     from scopemap.runner.engines import WorkerNeeds
     from scopemap.runner.processes import run_in_processes
@@ -216,7 +197,7 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) 
     by_default, gpus, memory = WorkerNeeds(), given["worker-gpus"], given["worker-memory"]
     if gpus is None:
         gpus = float(any(video.config.networks.device.startswith("cuda") for video in videos))
-    memory_gb = parse_memory(memory) / 1000 if memory else by_default.memory_gb
+    memory_gb = options.parse_memory(memory) / 1000 if memory else by_default.memory_gb
     needs = WorkerNeeds(given["worker-cores"] or by_default.cores, memory_gb, gpus)
     if name == "ray":
         from scopemap.runner.ray_engine import RayEngine

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from scopemap.cli import options
 from scopemap.cli.figures import print_json, print_table
-from scopemap.cli.options import AsJson, Dataset, Frames, Quiet, check_output, parse_settings
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, SettingsError
 
@@ -33,9 +32,9 @@ def calibrate(
     charuco: Annotated[bool, typer.Option("--charuco", help="A ChArUco board: markers in its white squares.")] = False,
     marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker, mm.")] = None,
     dictionary: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Its set of markers, by OpenCV's name; else DICT_4X4_50.")
+        str | None, options.advanced(metavar="NAME", help="Its set of markers, by OpenCV's name; else DICT_4X4_50.")
     ] = None,
-    legacy: Annotated[bool, typer.Option("--legacy", help="It was laid out by OpenCV before 4.6.")] = False,
+    legacy: Annotated[bool, options.advanced("--legacy", help="It was laid out by OpenCV before 4.6.")] = False,
     model: Annotated[
         Literal["auto", "pinhole", "fisheye"],
         typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen."),
@@ -43,25 +42,25 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Calibration to write; its picture is written to the same folder.")
     ] = Path("calibration.yaml"),
-    frames: Frames = None,
+    frames: options.Frames = None,
     every: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Look at every N-th of them; else at about 300 in all.")
+        int | None, options.advanced(min=1, metavar="N", help="Look at every N-th of them; else at about 300 in all.")
     ] = None,
-    dataset: Dataset = None,
+    dataset: options.Dataset = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set", metavar="KEY=VALUE", help=f"How pictures are read: {_SETTINGS[0]}=..., {_SETTINGS[1]}=true."
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier calibration.")] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Calibrate the camera from images of a board; the file is for --camera of every command."""
     picture = out.with_suffix(".png")
-    check_output(out, (".yaml", ".yml"), overwrite)
-    check_output(picture, (".png",), overwrite)
+    options.check_output(out, (".yaml", ".yml"), overwrite)
+    options.check_output(picture, (".png",), overwrite)
     if not os.access(out.parent, os.W_OK):
         raise InputError(f"writing the calibration: the folder {out.parent} is not there or not writable")
     target = _board(board, square_mm, charuco=charuco, marker_mm=marker_mm, dictionary=dictionary, legacy=legacy)
@@ -97,7 +96,7 @@ def calibrate(
 def _reading(pairs: list[str]) -> InputSettings:
     from scopemap.config import Config
 
-    chosen = parse_settings(pairs)
+    chosen = options.parse_settings(pairs)
     other = [key for key in chosen if key not in _SETTINGS]
     if other:
         raise SettingsError(f"the setting '{other[0]}' has no part in a calibration: only {' and '.join(_SETTINGS)} do")
@@ -109,10 +108,7 @@ def _board(
 ) -> Target:
     from scopemap.calibration.targets import CharucoBoard, Checkerboard
 
-    match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", text)
-    if not match:
-        raise SettingsError(f"cannot read the board '{text}': expected COLUMNSxROWS such as 9x6")
-    columns, rows = int(match[1]), int(match[2])
+    columns, rows = options.parse_board(text)
     if charuco and marker_mm is None:
         raise SettingsError("a ChArUco board needs the side of its markers: give --marker-mm")
     if charuco and marker_mm is not None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from scopemap.cli.figures import print_json
-from scopemap.cli.options import AsJson, Quiet, SetPairs, parse_settings
+from scopemap.cli.options import AsJson, Overwrite, Quiet, SetPairs, parse_settings
 from scopemap.cli.progress import run_progress
 
 
@@ -18,7 +18,7 @@ def demo(
         "scopemap-demo"
     ),
     settings: SetPairs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier demo's run.")] = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:

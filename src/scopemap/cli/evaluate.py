@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from scopemap.cli.figures import show
-from scopemap.cli.options import Align, AsJson, Unit
+from scopemap.cli.options import Align, AsJson, Unit, advanced
 from scopemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,11 +32,11 @@ AgainstVideo = Annotated[
 AlignBy = Annotated[
     Align, typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone.")
 ]
-AlignFirst = Annotated[int | None, typer.Option(min=3, metavar="N", help="Fit on the first N tracked frames only.")]
-OfUnit = Annotated[Unit, typer.Option(help="Unit of a trajectory file that does not state one.")]
-TruthUnit = Annotated[Unit | None, typer.Option(help="The same for the truth; as --unit if left out.")]
-OfKind = Annotated[str, typer.Option(help="Form of the trajectory file where its content fits two.")]
-TruthKind = Annotated[str, typer.Option(help="The same for the truth, or the name of a data set.")]
+AlignFirst = Annotated[int | None, advanced(min=3, metavar="N", help="Fit on the first N tracked frames only.")]
+OfUnit = Annotated[Unit, advanced(help="Unit of a trajectory file that does not state one.")]
+TruthUnit = Annotated[Unit | None, advanced(help="The same for the truth; as --unit if left out.")]
+OfKind = Annotated[str, advanced(help="Form of the trajectory file where its content fits two.")]
+TruthKind = Annotated[str, advanced(help="The same for the truth, or the name of a data set.")]
 AsCsv = Annotated[bool, typer.Option("--csv", help="Print CSV.")]
 OneLine = Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")]
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from scopemap.cli import options
 from scopemap.cli.figures import print_findings, print_json, print_values
-from scopemap.cli.options import AsJson, CameraFile, Dataset, Frames, Quiet, check_output
 from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError
 
@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 
 def inspect(
-    source: Annotated[
-        Path,
-        typer.Argument(metavar="VIDEO", help="A video file, a folder of images, the folder of a data set's sequence."),
-    ],
+    source: options.Input,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The picture, a PNG; by default NAME_inspection.png in this folder."),
@@ -32,12 +29,12 @@ def inspect(
             help="Write one mask of overlays and of pictures in the picture, for mask.files.",
         ),
     ] = None,
-    dataset: Dataset = None,
-    camera: CameraFile = None,
-    frames: Frames = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier picture and masks.")] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    dataset: options.Dataset = None,
+    camera: options.CameraFile = None,
+    frames: options.Frames = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Read a video once and show what was found in it: format, timing, field of view, overlays, bad segments.
 
@@ -69,7 +66,7 @@ def inspect(
 def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
     from scopemap.inspection.inspection_sheet import MASK_NAME
 
-    check_output(file, (".png",), overwrite)
+    options.check_output(file, (".png",), overwrite)
     if masks is None or not masks.exists():
         return
     if not masks.is_dir():

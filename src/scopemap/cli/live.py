@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scopemap.cli import options
 from scopemap.cli.figures import print_json, print_warnings
 from scopemap.cli.interruption import Interruption
-from scopemap.cli.options import AsJson, CameraFile, Quiet, SetPairs, parse_near_far, parse_settings, parse_size
 from scopemap.cli.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
@@ -48,22 +48,14 @@ def live(
         ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
-    camera: CameraFile = None,
-    fov: Annotated[
-        float | None,
-        typer.Option(min=5.0, max=170.0, help="Horizontal field of view, degrees, of an unknown camera; else 70."),
-    ] = None,
-    near_far: Annotated[
-        str | None, typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm.")
-    ] = None,
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
-    ] = None,
-    settings: SetPairs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    camera: options.CameraFile = None,
+    fov: options.FieldOfView = None,
+    near_far: options.NearFar = None,
+    size: options.Size = None,
+    settings: options.SetPairs = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Reconstruct a live picture; frames are dropped rather than late.
 
@@ -72,14 +64,17 @@ def live(
     """
     from scopemap.config import Config
 
-    chosen: dict[str, Any] = {"depth.near_far_mm": parse_near_far(near_far)} if near_far else {}
-    config = Config.load("realtime", settings=chosen | {"input.focal": "assume"} | parse_settings(settings or []))
+    chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
+    config = Config.load(
+        "realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings or [])
+    )
 
     from scopemap.io.checksums import write_checksums
     from scopemap.io.live_source import LiveSource
     from scopemap.io.opening import sequence_of
     from scopemap.io.result_folder import NOT_OF_THE_RESULT, result_folder
     from scopemap.report.frame_pictures import FramePictures
+    from scopemap.report.page import write_report
     from scopemap.runner.live import LiveSession, finished
 
     silent = quiet or as_json
@@ -88,7 +83,7 @@ def live(
         sender = stack.enter_context(_sender(igtl, silent=silent))
         folder = stack.enter_context(result_folder(out, overwrite=overwrite))
         reading = LiveSource(source)
-        working = parse_size(size) if size else None
+        working = options.parse_size(size) if size else None
         sequence = sequence_of(reading, camera=camera, fov_deg=fov, size=working, settings=config.input)
         interruption = stack.enter_context(Interruption(reading.stop))
 
@@ -108,8 +103,6 @@ def live(
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     state = session.state()
     if out is not None:
-        from scopemap.report.page import write_report
-
         write_report(out)
     if as_json:
         print_json(result.provenance | {"live": state | {"path": len(state["path"])}})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,12 +14,29 @@ import typer
 from scopemap.errors import InputError, SettingsError
 
 _QUOTED = 80  # characters of a text that an error repeats
+advanced = partial(typer.Option, rich_help_panel="Advanced")
+"""An option below the first page of a command's help."""
+
 Align = Literal["none", "origin", "se3", "sim3", "scale"]
 Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
+Input = Annotated[
+    Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence.")
+]
+PresetName = Annotated[
+    Literal["default", "paper", "paper-strict", "realtime"] | None,
+    typer.Option(
+        help="default: best of what needs no download; paper: the method as published, made robust; paper-strict: "
+        "without what it does beyond the text; realtime: fast."
+    ),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
+]
 Dataset = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
+    str | None, advanced(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
 ]
 CameraFile = Annotated[
     Path | None,
@@ -26,9 +44,26 @@ CameraFile = Annotated[
         metavar="FILE|NUMBERS", help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 [k3]]', px of the input's images."
     ),
 ]
+FieldOfView = Annotated[
+    float | None,
+    typer.Option(
+        min=5.0,
+        max=170.0,
+        help="Horizontal field of view, degrees, of an unknown camera; default: from the motion, or 70 (live: 70).",
+    ),
+]
+NearFar = Annotated[
+    str | None,
+    typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces the anchor."),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
+]
 SetPairs = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.keyframe_every=5.")
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier call wrote there.")]
 
 
 def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
@@ -46,19 +81,37 @@ def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
         raise InputError(f"cannot write {file}: no permission to write in {around}")
 
 
+def _matched(text: str, pattern: str, what: str, expected: str) -> re.Match[str]:
+    match = re.fullmatch(pattern, text)
+    if match is None:
+        raise SettingsError(f"cannot read the {what} '{text[:_QUOTED]}': expected {expected}")
+    return match
+
+
+def parse_board(text: str) -> tuple[int, int]:
+    """Return (columns, rows) of "COLUMNSxROWS"."""
+    match = _matched(text, r"(\d{1,3})x(\d{1,3})", "board", "COLUMNSxROWS such as 9x6")
+    return int(match[1]), int(match[2])
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """Return (k, n) of "K/N", 1 <= k <= n."""
+    expected = "K/N with K from 1 to N, such as 3/10"
+    match = _matched(text, r"(\d{1,6})/(\d{1,6})", "part", expected)
+    if not 1 <= int(match[1]) <= int(match[2]):
+        raise SettingsError(f"cannot read the part '{text}': expected {expected}")
+    return int(match[1]), int(match[2])
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Return (width, height) of "WIDTHxHEIGHT", px."""
-    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
-    if not match:
-        raise SettingsError(f"cannot read the size '{text[:_QUOTED]}': expected WIDTHxHEIGHT such as 320x256")
+    match = _matched(text, r"(\d{1,6})x(\d{1,6})", "size", "WIDTHxHEIGHT such as 320x256")
     return int(match[1]), int(match[2])
 
 
 def parse_slice(text: str) -> slice:
     """Return the slice of "A:B:S", a Python slice over the input's frames; A, B and S may be left out."""
-    if not re.fullmatch(r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?", text):
-        quoted = text[:_QUOTED]
-        raise SettingsError(f"cannot read the frames '{quoted}': expected START:STOP or START:STOP:STEP such as 0:100")
+    _matched(text, r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?", "frames", "START:STOP or START:STOP:STEP such as 0:100")
     return slice(*(int(part) if part else None for part in text.split(":")))
 
 
@@ -70,18 +123,14 @@ Frames = Annotated[
 
 def parse_box(text: str) -> tuple[int, ...]:
     """Return (x, y, width, height) of "X,Y,WIDTH,HEIGHT", px."""
-    if not re.fullmatch(r"\d{1,6}(,\d{1,6}){3}", text):
-        raise SettingsError(
-            f"cannot read the box '{text[:_QUOTED]}': expected X,Y,WIDTH,HEIGHT in px such as 0,0,300,40"
-        )
+    _matched(text, r"\d{1,6}(,\d{1,6}){3}", "box", "X,Y,WIDTH,HEIGHT in px such as 0,0,300,40")
     return tuple(int(part) for part in text.split(","))
 
 
 def parse_memory(text: str) -> int:
     """Return MB of "2GB", "1500MB" or "1.5G"."""
-    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([MG])B?", text.strip(), re.IGNORECASE)
-    if not match:
-        raise SettingsError(f"cannot read the memory '{text[:_QUOTED]}': expected a size such as 2GB or 1500MB")
+    pattern = r"(\d{1,6}(?:\.\d{1,3})?)\s*([MGmg])[Bb]?"
+    match = _matched(text.strip(), pattern, "memory", "a size such as 2GB or 1500MB")
     return round(float(match[1]) * (1000 if match[2].upper() == "G" else 1))
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from scopemap.cli.options import RunFolder
+
 
 def report(
-    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    run: RunFolder,
     pictures: Annotated[
         bool,
         typer.Option("--pictures", help="Take the frames' pictures from the input again; done where none were kept."),

@@ -4,137 +4,100 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from scopemap.cli import options
 from scopemap.cli.figures import print_json, print_warnings
 from scopemap.cli.interruption import Interruption
-from scopemap.cli.options import (
-    AsJson,
-    CameraFile,
-    Dataset,
-    Frames,
-    Quiet,
-    SetPairs,
-    parse_box,
-    parse_memory,
-    parse_near_far,
-    parse_settings,
-    parse_size,
-)
 from scopemap.cli.progress import run_progress
 from scopemap.notices import notices_of
 
 if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.reconstruction import Reconstruction
-    from scopemap.report.submap_summaries import SubmapSummary
-
+    from scopemap.report.kept_run import KeptRun
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
 _MOST_LOSSES = 5
 
 
 def run(
-    source: Annotated[
-        Path,
-        typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence."),
-    ],
+    source: options.Input,
     out: Annotated[Path, typer.Option(help="Folder for the result.")],
-    preset: Annotated[
-        Literal["default", "paper", "paper-strict", "realtime"] | None,
-        typer.Option(
-            help="default: best of what needs no download; paper: the method as published, made robust; paper-strict: "
-            "without what it does beyond the text; realtime: fast."
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
-    ] = None,
-    dataset: Dataset = None,
-    camera: CameraFile = None,
+    preset: options.PresetName = None,
+    config: options.ConfigFile = None,
+    dataset: options.Dataset = None,
+    camera: options.CameraFile = None,
     camera_fit: Annotated[
         str | None,
-        typer.Option(
+        options.advanced(
             metavar="FIT",
             help="What a calibration of another size means: exact (refused), scale (images were resized), crop:X,Y.",
         ),
     ] = None,
-    fov: Annotated[
-        float | None,
-        typer.Option(
-            min=5.0,
-            max=170.0,
-            help="Horizontal field of view, degrees, of an unknown camera; default: estimated from the motion, or 70.",
-        ),
-    ] = None,
+    fov: options.FieldOfView = None,
     stereo: Annotated[
         Literal["auto", "none", "left-right", "top-bottom"] | None,
-        typer.Option(help="Two views in one image, of which the left or upper is used; auto: recognised."),
+        options.advanced(help="Two views in one image, of which the left or upper is used; auto: recognised."),
     ] = None,
     deinterlace: Annotated[
         bool,
-        typer.Option("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
+        options.advanced("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
     ] = False,
     redact: Annotated[
         list[str] | None,
-        typer.Option(
+        options.advanced(
             metavar="X,Y,W,H", help="Blacken a box of the input's pictures, px, before anything sees it; repeatable."
         ),
     ] = None,
     camera_at_rest: Annotated[
         bool,
-        typer.Option(
+        options.advanced(
             "--camera-at-rest", help="The camera does not move (robotic surgery): one surface per frame, surfaces/."
         ),
     ] = False,
     surface_at: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="The surface as seen at that second, where tissue moves on its own."),
+        options.advanced(metavar="SECONDS", help="The surface as seen at that second, where tissue moves on its own."),
     ] = None,
-    near_far: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces a preset's anchor."
-        ),
-    ] = None,
+    near_far: options.NearFar = None,
     depth: Annotated[
         str | None,
         typer.Option(help="scopenet, shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files)."),
     ] = None,
     flow: Annotated[
         str | None,
-        typer.Option(help="dis, raft-small, raft-large or none; RAFT needs the extra networks and its weights."),
+        options.advanced(help="dis, raft-small, raft-large or none; RAFT needs the extra networks and its weights."),
     ] = None,
     colours: Annotated[
         Literal["albedo", "raw"] | None,
-        typer.Option(help="Of the mesh: the tissue's, without the lamp's fall-off, or the video's own."),
+        options.advanced(help="Of the mesh: the tissue's, without the lamp's fall-off, or the video's own."),
     ] = None,
     mesh_faces: Annotated[
-        int | None, typer.Option(min=4, metavar="N", help="Simplify the mesh to about so many faces.")
+        int | None, options.advanced(min=4, metavar="N", help="Simplify the mesh to about so many faces.")
     ] = None,
     mesh_smooth: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Smooth the mesh, so many iterations of Taubin's filter.")
+        int | None, options.advanced(min=0, metavar="N", help="Smooth the mesh, so many iterations of Taubin's filter.")
     ] = None,
     mesh_watertight: Annotated[
-        bool, typer.Option("--mesh-watertight", help="Close the mesh where no frame saw anything, too; grey there.")
+        bool, options.advanced("--mesh-watertight", help="Close the mesh where no frame saw anything, too; grey there.")
     ] = False,
-    frames: Frames = None,
-    fps: Annotated[float | None, typer.Option(help="Most frames per second that are used, by the time stamps.")] = None,
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
+    frames: options.Frames = None,
+    fps: Annotated[
+        float | None, options.advanced(help="Most frames per second that are used, by the time stamps.")
     ] = None,
+    size: options.Size = None,
     memory: Annotated[
         str | None,
-        typer.Option(
+        options.advanced(
             metavar="SIZE", help="Limit of memory, such as 2GB; coarser voxels, where the surface needs more."
         ),
     ] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="Device of the networks.")] = None,
-    settings: SetPairs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")] = False,
+    device: Annotated[Literal["auto", "cpu", "cuda"] | None, options.advanced(help="Device of the networks.")] = None,
+    settings: options.SetPairs = None,
+    overwrite: options.Overwrite = False,
     resume: Annotated[
         bool | None,
         typer.Option(
@@ -142,8 +105,8 @@ def run(
             help="Resume a killed run from its checkpoint; default: where input, settings and versions agree.",
         ),
     ] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Reconstruct camera poses, depth and a tissue surface from a video.
 
@@ -155,11 +118,11 @@ def run(
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
-        "input.redact": [parse_box(box) for box in redact] if redact else None,
+        "input.redact": [options.parse_box(box) for box in redact] if redact else None,
         "input.fps": fps,
-        "run.memory_mb": parse_memory(memory) if memory else None,
+        "run.memory_mb": options.parse_memory(memory) if memory else None,
         "depth.backend": depth,
-        "depth.near_far_mm": parse_near_far(near_far) if near_far else None,
+        "depth.near_far_mm": options.parse_near_far(near_far) if near_far else None,
         "tracking.camera_at_rest": camera_at_rest or None,
         "networks.flow": flow,
         "networks.device": device,
@@ -169,7 +132,7 @@ def run(
         "fusion.mesh_smooth": mesh_smooth,
         "fusion.holes": "watertight" if mesh_watertight else None,
     }
-    chosen = {key: value for key, value in given.items() if value is not None} | parse_settings(settings or [])
+    chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
     from scopemap.io.opening import open_sequence
@@ -181,7 +144,7 @@ def run(
         dataset=dataset,
         camera=camera,
         fov_deg=fov,
-        size=parse_size(size) if size else None,
+        size=options.parse_size(size) if size else None,
         frames=frames,
         settings=resolved.input,
     )
@@ -219,12 +182,13 @@ def summary_lines(result: Reconstruction) -> list[str]:
     from scopemap.reconstruction import scale_words
     from scopemap.report.kept_run import run_of
     from scopemap.report.losses import losses
-    from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
-    run, facts, known = run_of(result), result.provenance, result.provenance["scale"]["known"]
+    facts, known = result.provenance, result.provenance["scale"]["known"]
+    counts = [f"{facts['tracked']} of {facts['frames']} frames tracked"]
+    counts += [f"{facts[key]} {key.replace('_', ' ')}" for key in ("lost", "in_other_maps") if facts[key]]
     unit = " mm" if known else " (scale unknown)"
     lines = [
-        f"{_counted(facts)}, path {result.trajectory.path_length_mm:.1f}{unit}",
+        f"{', '.join(counts)}, path {result.trajectory.path_length_mm:.1f}{unit}",
         scale_words(facts["scale"]) + ("" if known else "; every mm below is in this scale"),
         f"camera: {facts['camera']['source']}",
         f"size: {facts['camera']['size']}",
@@ -234,16 +198,26 @@ def summary_lines(result: Reconstruction) -> list[str]:
         _time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
+    run = run_of(result)
     if result.others:
-        submaps = submaps_in_time(run)
-        lines.append(f"maps in order of time: {', '.join(_map_words(submap) for submap in submaps)}")
-        lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(submaps)] if doubt]
+        lines += _map_lines(run)
     lost = losses(run)
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
     lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
         lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter segments, see frames.csv")
     return lines + [f"note: {notice}" for notice in notices_of(facts) if notice.level == "info"]
+
+
+def _map_lines(run: KeptRun) -> list[str]:
+    from scopemap.report.submap_summaries import doubt_words, submaps_in_time
+
+    submaps, maps = submaps_in_time(run), []
+    for submap in submaps:
+        facts = ", ".join(filter(None, (f"{submap.first} to {submap.last}", submap.inliers)))
+        maps.append(f"{submap.name} with {submap.frames} frames ({facts})")
+    doubt = doubt_words(submaps)
+    return [f"maps in order of time: {', '.join(maps)}"] + [f"most doubtful map: {doubt}"] * bool(doubt)
 
 
 def _time_words(result: Reconstruction) -> str:
@@ -258,32 +232,15 @@ def compiling_words(seconds: float) -> str:
     """Return what compiling the kernels took, and that it was for this process alone where they cannot be cached."""
     if seconds < 0.1:
         return ""
-    kept = (
-        "once"
-        if os.environ.get("NUMBA_CACHE_DIR") != ""
-        else "every time: set NUMBA_CACHE_DIR to a folder to keep them"
-    )
+    is_cached = os.environ.get("NUMBA_CACHE_DIR") != ""
+    kept = "once" if is_cached else "every time: set NUMBA_CACHE_DIR to a folder to keep them"
     return f"; {seconds:.1f} s of it to compile kernels, {kept}"
-
-
-def _counted(facts: dict[str, Any]) -> str:
-    """Return how many frames are tracked in the result, lost, and in other maps."""
-    others = (("lost", "lost"), ("in_other_maps", "in other maps"))
-    parts = [f"{facts['tracked']} of {facts['frames']} frames tracked"]
-    return ", ".join(parts + [f"{facts[key]} {words}" for key, words in others if facts[key]])
-
-
-def _map_words(submap: SubmapSummary) -> str:
-    facts = ", ".join(filter(None, (f"{submap.first} to {submap.last}", submap.inliers)))
-    return f"{submap.name} with {submap.frames} frames ({facts})"
 
 
 def _surface(figures: dict[str, float]) -> str:
     """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
     if "depth_error" not in figures:
         return ""
-    return (
-        f"; covers {int(100 * figures['coverage_mean'])}% of what the frames see "
-        f"(least {int(100 * figures['coverage_least'])}%), "
-        f"depth {figures['depth_error']:.1%} off theirs"
-    )
+    mean, least = int(100 * figures["coverage_mean"]), int(100 * figures["coverage_least"])
+    seen = f"; covers {mean}% of what the frames see (least {least}%)"
+    return f"{seen}, depth {figures['depth_error']:.1%} off theirs"

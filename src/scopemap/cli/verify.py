@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from scopemap.cli.figures import print_json
-from scopemap.cli.options import AsJson, Quiet
+from scopemap.cli.options import AsJson, Quiet, RunFolder
 
 _MOST_NAMED = 20
 
 
 def verify(
-    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    run: RunFolder,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 import webbrowser
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from scopemap.cli.options import RunFolder
+
 
 def view(
-    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    run: RunFolder,
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="PORT", help="0: any free port.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:

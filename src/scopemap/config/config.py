@@ -3,14 +3,15 @@
 Order of precedence: defaults < preset < TOML file < single settings (`--set fusion.every=2`); the preset itself may be
 named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
 one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
-that names the nearest key. METHOD below is arXiv 2508.11282; it publishes none of its constants (section "WEMA-RTDL"),
-so values are ours: those of the tracker were chosen by trial on the sequences of BENCHMARK.md; tau, the filter's
-sigmas, rho and WEMA's weights and omega are plausible values that were not searched.
+that names the nearest key. Each stage's `method` names a set of its constants.
+
+METHOD below is arXiv 2508.11282. It publishes none of its constants (section "WEMA-RTDL"): those of the tracker were
+chosen by trial on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are
+plausible values that were not searched.
 """
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
 from pathlib import Path
@@ -22,7 +23,7 @@ from scopemap.config.depth import DepthSettings, MapisSettings, NetworkSettings
 from scopemap.config.input import InputSettings, MaskSettings
 from scopemap.config.mapping import FusionSettings, MappingSettings
 from scopemap.config.presets import PRESETS
-from scopemap.config.settings import Settings
+from scopemap.config.settings import Settings, hint
 from scopemap.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.errors import SettingsError
 
@@ -76,7 +77,8 @@ class Config(Settings):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            raise SettingsError("; ".join(explain(item) for item in error.errors())) from None
+            found = [item for item in error.errors() if item["type"] != "default_factory_not_called"]
+            raise SettingsError("; ".join(map(explain, found))) from None
 
     def toml(self) -> str:
         """Return all settings as TOML text that `load` reads back; settings of None are left out."""
@@ -122,21 +124,12 @@ def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
 
 
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    names = setting_names()
-    if dotted not in names:
-        nearest = _nearest(dotted, names)
-        raise SettingsError(f"unknown setting '{dotted}'" + (f": did you mean '{nearest}'?" if nearest else ""))
+    if dotted not in (names := setting_names()):
+        raise SettingsError(f"unknown setting '{dotted}': {hint(dotted, names)}")
     *groups, name = dotted.split(".")
     for group in groups:
         tree = tree.setdefault(group, {})
     tree[name] = value
-
-
-def _nearest(dotted: str, names: list[str]) -> str | None:
-    """Return the setting with the same group and last part ("tracking.advanced.huber"), else the most similar one."""
-    parts = dotted.split(".")
-    same = [name for name in names if (name.split(".")[0], name.split(".")[-1]) == (parts[0], parts[-1])]
-    return next(iter(same or difflib.get_close_matches(dotted, names, n=1, cutoff=0.3)), None)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from scopemap.config.settings import Settings
+from scopemap.config.settings import Settings, StageSettings, constants_of
 
 Box = tuple[
     Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
@@ -49,20 +50,32 @@ class InputSettings(Settings):
     skip_duplicates: bool = Field(True, description="leave out images of a video that repeat the one before")
 
 
-class MaskAdvanced(Settings):
+@dataclass(frozen=True)
+class MaskAdvanced:
     """Constants of masking."""
 
-    exposure: bool = Field(True, description="mask under-exposed and over-exposed pixels")
-    dark_level: int = Field(12, ge=0, le=255, description="grey level up to which a pixel counts as under-exposed")
-    files_grow_px: int = Field(3, ge=0, description="px by which masks from files are widened")
+    field_of_view: bool = True  # find the circular or octagonal field of view and black borders
+    highlights: bool = True  # find specular highlights and mask them
+    overlays: bool = True  # find burned-in text and logos, which stay while the rest moves
+    exposure: bool = True  # mask under-exposed and over-exposed pixels
+    dark_level: int = 12  # grey level up to which a pixel counts as under-exposed
+    files_grow_px: int = 3  # by which masks from files are widened
 
 
-class MaskSettings(Settings):
+MASK: dict[str, dict[str, Any]] = {
+    "scopemap": {},
+    "no-overlays": {"overlays": False},
+    "no-field-of-view": {"field_of_view": False},
+    "no-highlights": {"highlights": False},
+    "no-exposure": {"exposure": False},
+}
+
+
+class MaskSettings(StageSettings):
     """Which pixels count as usable tissue."""
 
-    field_of_view: bool = Field(True, description="find the circular or octagonal field of view and black borders")
-    highlights: bool = Field(True, description="find specular highlights and mask them")
-    overlays: bool = Field(True, description="find burned-in text and logos, which stay while the rest moves")
+    METHODS = MASK
+    method: str = Field("scopemap", description="what is found in the picture itself and masked")
     files: str = Field(
         "",
         description="folder of masks, one image per frame, found by the number in its name: non-zero pixels are masked "
@@ -74,4 +87,4 @@ class MaskSettings(Settings):
         "without one the depth network, where it can (scopenet), which misses some and takes pale tissue for others; "
         "off: nobody, masks from files are not read either",
     )
-    advanced: MaskAdvanced = MaskAdvanced()
+    advanced: MaskAdvanced = constants_of(MaskAdvanced(), MASK)

@@ -2,91 +2,85 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from pydantic import Field
 
-from scopemap.config.settings import Settings
+from scopemap.config.settings import StageSettings, constants_of
 
 
-class MappingAdvanced(Settings):
-    """Constants of bundle adjustment."""
+@dataclass(frozen=True)
+class MappingAdvanced:
+    """Constants of bundle adjustment, loop closure and triangulation."""
 
-    keyframe_gaps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (1, 2, 3, 5, 8), min_length=1, description="a keyframe's corners are tracked to the keyframes so many before it"
-    )
-    correlated_observations: float = Field(
-        4.0, ge=1, description="so many observations count as one: errors of flow are alike at neighbouring corners"
-    )
-    depth_sigma_share: float = Field(
-        0.2, gt=0, description="standard deviation that every estimated depth has at least, over the depth"
-    )
-    scale_sigma: float = Field(0.1, gt=0, description="standard deviation of ln of a keyframe's depth scale")
-    depth_step_sigma: float = Field(
-        0.1, ge=0, description="sigma of ln depth between nodes of the depth correction field; 0: depth is only scaled"
-    )
-    rotation_sigma_deg: float = Field(
-        3.0, gt=0, description="standard deviation of the tracked rotation between keyframes, deg"
-    )
-    translation_sigma_share: float = Field(
-        0.1, gt=0, description="standard deviation of the tracked translation between keyframes, over the median depth"
-    )
-    max_sigma_px: float = Field(
-        0.8,
-        gt=0,
-        description="poses stay as tracked where the robust sigma of adjusted reprojection errors is larger, px",
-    )
-    max_depth_change: float = Field(
-        0.3, gt=0, description="poses stay as tracked where the median change of ln depth is larger"
-    )
+    min_loop_inliers: int = 25  # of PnP, that a loop closure needs; 0: no loop closure, no map merging
+    # Triangulate the depth of keyframes against frames around them, where the scene is rigid; all frames take it over.
+    # False: depth as predicted, corrected at the keyframes' corners.
+    triangulate_depth: bool = True
+    keyframe_gaps: tuple[int, ...] = (1, 2, 3, 5, 8)  # a keyframe's corners are tracked to those so many before it
+    # So many observations count as one: errors of flow are alike at neighbouring corners.
+    correlated_observations: float = 4.0
+    depth_sigma_share: float = 0.2  # standard deviation that every estimated depth has at least, over the depth
+    scale_sigma: float = 0.1  # standard deviation of ln of a keyframe's depth scale
+    depth_step_sigma: float = 0.1  # of ln depth between nodes of the depth correction field; 0: depth is only scaled
+    rotation_sigma_deg: float = 3.0  # standard deviation of the tracked rotation between keyframes
+    translation_sigma_share: float = 0.1  # of the tracked translation between keyframes, over the median depth
+    # Poses stay as tracked where the robust sigma of adjusted reprojection errors, or the median change of ln depth is
+    # larger.
+    max_sigma_px: float = 0.8
+    max_depth_change: float = 0.3
 
 
-class MappingSettings(Settings):
+MAPPING: dict[str, dict[str, Any]] = {
+    "full": {},
+    "none": {},
+    "no-loops": {"min_loop_inliers": 0},
+    "no-triangulation": {"triangulate_depth": False},
+    "previous-keyframe-only": {"keyframe_gaps": (1,)},
+    "fixed-depth": {"scale_sigma": 1e-3},
+    "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0},
+}
+
+
+class MappingSettings(StageSettings):
     """Bundle adjustment of all keyframes after the last frame, with loop closure and map merging."""
 
-    method: Literal["none", "full"] = Field(
+    METHODS = MAPPING
+    method: str = Field(
         "full",
         description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
         "predicted (measured depth tracks as well or better without)",
     )
-    min_loop_inliers: int = Field(
-        25, ge=0, description="PnP inliers that a loop closure needs at least; 0: no loop closure, no map merging"
-    )
-    triangulate_depth: bool = Field(
-        True,
-        description="triangulate the depth of keyframes against frames around them, where method is full and the scene "
-        "is rigid; all frames take it over; false: depth as predicted, corrected at the keyframes' corners",
-    )
-    advanced: MappingAdvanced = MappingAdvanced()
+    advanced: MappingAdvanced = constants_of(MappingAdvanced(), MAPPING)
 
 
-class FusionAdvanced(Settings):
+@dataclass(frozen=True)
+class FusionAdvanced:
     """Constants of fusion."""
 
-    weighted: bool = Field(
-        True,
-        description="weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface "
-        "less; False: 1",
-    )
-    min_incidence: float = Field(0.1, ge=0, le=1, description="cosine of incidence below which a pixel is not fused")
-    depth_sigma_share: float = Field(
-        0.2, gt=0, description="relative error that all depth has; more uncertain pixels weigh less; large: off"
-    )
-    truncation_share: float = Field(
-        0.08,
-        ge=0,
-        le=1,
-        description="truncation as a share of the pixel's depth, where that is larger than truncation_mm",
-    )
-    min_weight: float = Field(0.1, ge=0, description="voxels with less weight give no surface")
-    min_component_share: float = Field(
-        0.02, ge=0, le=1, description="components with less than this share of the faces are removed"
-    )
+    # Weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; False: 1.
+    weighted: bool = True
+    min_incidence: float = 0.1  # cosine of incidence below which a pixel is not fused
+    depth_sigma_share: float = 0.2  # relative error that all depth has; more uncertain pixels weigh less; large: off
+    truncation_share: float = 0.08  # of the pixel's depth, where that is larger than truncation_mm
+    min_weight: float = 0.1  # voxels with less weight give no surface
+    min_component_share: float = 0.02  # components with less than this share of the faces are removed
 
 
-class FusionSettings(Settings):
+FUSION: dict[str, dict[str, Any]] = {
+    "scopemap": {},
+    "unweighted": {"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
+    "all-components": {"min_component_share": 0.0},
+    "well-seen": {"min_weight": 0.5},
+}
+
+
+class FusionSettings(StageSettings):
     """Volumetric fusion. TSDF parameters that are not set follow the scene: see `scopemap.fusion.surface_fusion`."""
 
+    METHODS = FUSION
+    method: str = Field("scopemap", description="constants of fusion")
     enabled: bool = Field(True, description="false: no mesh")
     voxel_mm: float | None = Field(
         None, ge=0.01, le=1000, description="voxel size, mm; default: 1/60 of the clip's median depth"
@@ -105,17 +99,13 @@ class FusionSettings(Settings):
     )
     colours: Literal["albedo", "raw"] = Field(
         "albedo",
-        description="colours of the mesh; albedo: the tissue's, without the lamp's fall-off, in one exposure for all "
-        "frames; raw: the video's",
+        description="albedo: without the lamp's fall-off, in one exposure for all frames; raw: of the video",
     )
     holes: Literal["small", "none", "watertight"] = Field(
         "small",
-        description="holes of the mesh that are closed; small: those within the surface with a border of up to 20 "
-        "voxels' edges, their new vertices with confidence 0; what no frame saw stays open; watertight: all, smoothly, "
-        "what no frame saw grey and with confidence 0",
+        description="holes of the mesh that are closed, with confidence 0; small: those within the surface with a "
+        "border of up to 20 voxels' edges, not what no frame saw; watertight: all, what no frame saw in grey",
     )
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
-    mesh_faces: int | None = Field(
-        None, ge=4, description="simplify the mesh to about so many faces; default: as fusion gives it"
-    )
-    advanced: FusionAdvanced = FusionAdvanced()
+    mesh_faces: int | None = Field(None, ge=4, description="simplify the mesh to about so many faces; default: not")
+    advanced: FusionAdvanced = constants_of(FusionAdvanced(), FUSION)

@@ -40,7 +40,7 @@ class DepthPro(PretrainedNetwork):
     ) -> None:
         if not (use_known_focal or network.config.use_fov_model):
             raise WeightsError(
-                "this Depth Pro model finds no focal length: name another, or set depth.paper.depth_pro_focal=camera"
+                "this Depth Pro model finds no focal length: name another, or leave depth.method=network-focal out"
             )
         super().__init__(network, processor, device=device, origin=origin)
         self.use_known_focal = use_known_focal

@@ -74,7 +74,7 @@ class Mapper:
         table: RowTable = rows_in_memory,
         features: FeatureDetector | None = None,
     ) -> None:
-        links = settings.method == "full" and flow.name != "none"
+        links = settings.method != "none" and flow.name != "none"
         self._backend = Backend(settings, flow, table, features) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._last: tuple[int, TrackedPose] | None = None

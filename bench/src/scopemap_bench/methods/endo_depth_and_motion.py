@@ -16,17 +16,17 @@ only where the image or its overlap with the keyframe is nearly empty, or the re
 
 from __future__ import annotations
 
-from scopemap.config.tracking import TrackingAdvanced, TrackingPaper, TrackingSettings
+from scopemap.config.tracking import TrackingAdvanced, TrackingSettings
 from scopemap.tracking.track import FrameTracker
 from scopemap.tracking.tracker import Tracker
 
 SETTINGS = TrackingSettings(
     keyframe_every=2,
-    min_sharpness=0.0,
-    relocalisation_keyframes=0,
-    search_every=1,
-    new_map_after=0,
     advanced=TrackingAdvanced(
+        min_sharpness=0.0,
+        relocalisation_keyframes=0,
+        search_every=1,
+        new_map_after=0,
         corner_depth_sigma=0.0,
         min_keyframe_agreement=0.0,
         levels=2,
@@ -37,8 +37,6 @@ SETTINGS = TrackingSettings(
         min_inlier_share=0.0,
         min_correlation=-1.0,
         max_step=1e9,  # never reached
-    ),
-    paper=TrackingPaper(
         solver="gauss-newton",
         rotation_first=True,
         start="identity",

@@ -23,12 +23,8 @@ from scopemap_bench.methods.standing_still import StandingStill
 from scopemap_bench.plan import MethodPlan
 
 # Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
-PLAIN = {
-    "mapis.advanced.frame_scale": "none",
-    "mapis.paper.blend": "none",
-    "smoothing.method": "none",
-    "mapping.method": "none",
-}
+PLAIN = {"smoothing.method": "none", "mapping.method": "none"}
+_PLAIN_DEPTH = "+no-frame-scale+no-blend"
 
 BASELINES: dict[str, Callable[[], FrameTracker]] = {
     "endo-depth-and-motion": create_endo_depth_and_motion,
@@ -65,8 +61,11 @@ class PipelineMethod:
 
     def config(self, settings: Mapping[str, Any]) -> Config:
         """Return the preset, then the shared `settings` (it cannot replace a depth that they name), then its own."""
-        plain = {} if self.plan.use == "scopemap" else PLAIN
-        return Config.load(self.plan.preset, settings={**settings, **plain, **self.plan.settings})
+        config = Config.load(self.plan.preset, settings={**settings, **self.plan.settings})
+        if self.plan.use == "scopemap":
+            return config
+        plain = PLAIN | {"mapis.method": config.mapis.method + _PLAIN_DEPTH}
+        return Config.load(self.plan.preset, settings={**settings, **self.plan.settings, **plain})
 
     def missing(self, settings: Mapping[str, Any]) -> str:
         """Return the weights that are not on this machine."""

@@ -36,37 +36,38 @@ TRACKED = {"mapping.method": "none"}
 # One part each taken away or replaced: of what tracks and makes depth consistent, measured without the back end, which
 # would hide most of it ...
 FRONT_END: dict[str, dict[str, Any]] = {
-    "no corners": {"tracking.advanced.corner_depth_sigma": 0.0},
-    "no early keyframes": {"tracking.advanced.min_keyframe_agreement": 0.0},
+    "no corners": {"tracking.method": "no-corners"},
+    "no early keyframes": {"tracking.method": "no-early-keyframes"},
     "keyframe every 2": {"tracking.keyframe_every": 2},
     "keyframe every 5": {"tracking.keyframe_every": 5},
     "keyframe every 20": {"tracking.keyframe_every": 20},
-    "no frame scale": {"mapis.advanced.frame_scale": "none"},
-    "no blending": {"mapis.paper.blend": "none"},
-    "constant blend": {"mapis.paper.blend": "constant"},
-    "paper's equation for the blend": {"mapis.paper.blend": "paper-equation"},
-    "depth values copied, not moved": {"mapis.paper.order": "refine-first"},
+    "no frame scale": {"mapis.method": "no-frame-scale"},
+    "no blending": {"mapis.method": "no-blend"},
+    "constant blend": {"mapis.method": "constant-blend"},
+    "paper's equation for the blend": {"mapis.method": "paper-equation"},
+    "depth values copied, not moved": {"mapis.method": "values-copied"},
     "WEMA": {"smoothing.method": "wema"},
-    "WEMA, s = 1": {"smoothing.method": "wema", "smoothing.dynamic": False},
+    "WEMA, s = 1": {"smoothing.method": "wema-constant"},
     "no flow": {"networks.flow": "none"},
 }
 # ... of photometric alignment, where it is used: measured depth ...
-PHOTOMETRIC: dict[str, dict[str, Any]] = {
-    "no distance to the frame's depth": {"tracking.advanced.depth_weight": 0.0},
-    "grey values only": {"tracking.paper.channels": "grey"},
-    "no lamp": {"tracking.paper.lamp_gamma": 0.0},
-    "no gain and bias": {"tracking.paper.gain_bias": False},
-    "neither lamp nor gain and bias": {"tracking.paper.lamp_gamma": 0.0, "tracking.paper.gain_bias": False},
-    "no SO(3) stage": {"tracking.paper.rotation_first": False},
-    "Gauss-Newton": {"tracking.paper.solver": "gauss-newton"},
-    "full resolution": {"tracking.advanced.finest_level": 0},
+PHOTOMETRIC = {
+    "no distance to the frame's depth": "no-depth-distance",
+    "grey values only": "grey-only",
+    "no lamp": "no-lamp",
+    "no gain and bias": "no-gain-bias",
+    "neither lamp nor gain and bias": "no-lamp+no-gain-bias",
+    "no SO(3) stage": "no-rotation-stage",
+    "Gauss-Newton": "gauss-newton",
+    "full resolution": "full-resolution",
 }
+"""Methods of tracking."""
 # ... of the back end, with all of the front end; of loop closure, where the camera returns.
-LOOPS: dict[str, dict[str, Any]] = {"no loops": {"mapping.min_loop_inliers": 0}}
+LOOPS: dict[str, dict[str, Any]] = {"no loops": {"mapping.method": "no-loops"}}
 BACK_END: dict[str, dict[str, Any]] = {
-    "links to the keyframe before only": {"mapping.advanced.keyframe_gaps": (1,)},
-    "depth of keyframes hardly adjusted": {"mapping.advanced.scale_sigma": 1e-3},
-    "back end, but no corners while tracking": {"tracking.advanced.corner_depth_sigma": 0.0},
+    "links to the keyframe before only": {"mapping.method": "previous-keyframe-only"},
+    "depth of keyframes hardly adjusted": {"mapping.method": "fixed-depth"},
+    "back end, but no corners while tracking": {"tracking.method": "no-corners"},
 }
 
 
@@ -104,7 +105,7 @@ def real_runs(data: Path) -> Iterator[Run]:
         "trans_t1_a, true depth",
         trans,
         "se3",
-        {"depth.backend": f"files:{trans}", "fusion.advanced.min_weight": 0.5},
+        {"depth.backend": f"files:{trans}", "fusion.method": "well-seen"},
     )
     room = {"fusion.voxel_mm": 10, "fusion.truncation_mm": 40, "fusion.max_depth_mm": 4000}
     yield Run("7scenes_kitchen_100f, measured depth", kitchen, "sim3", {"depth.backend": f"files:{kitchen}"} | room)
@@ -142,7 +143,7 @@ def backend_runs(folder: Path, data: Path) -> Iterator[Run]:
         for variant, changes in {
             "as tracked": TRACKED,
             "default": {},
-            "always adjusted": {"mapping.advanced.max_sigma_px": 99.0, "mapping.advanced.max_depth_change": 9.0},
+            "always adjusted": {"mapping.method": "always-adjusted"},
         }.items():
             yield Run(f"{name}, {variant}", source, "sim3", NO_SURFACE | changes)
 
@@ -167,17 +168,17 @@ def ablation_runs(folder: Path, data: Path) -> Iterator[Run]:
     for name, changes in ({"default": {}} | LOOPS).items():
         yield Run(f"{name}: colon that returns, scopenet", returning, "sim3", NO_SURFACE | changes)
     exact = {"depth.backend": f"files:{colon}"} | NO_SURFACE
-    for name, changes in ({"as tracked": {}} | PHOTOMETRIC).items():
-        yield Run(f"{name}: colon, true depth", colon, "origin", exact | changes)
+    for name, method in ({"as tracked": "scopemap"} | PHOTOMETRIC).items():
+        yield Run(f"{name}: colon, true depth", colon, "origin", exact | {"tracking.method": method})
 
 
 def photometric_runs(data: Path) -> Iterator[Run]:
     """Yield the ablations of photometric alignment where it gives every pose: fast motion, predicted depth."""
     cecum = data / "endoscopy/c3vd/cecum_t1_a"
     alone = {"depth.backend": f"files:{cecum}_depth_anything", "depth.near_far_mm": (13.5, 100.0)}
-    alone |= NO_SURFACE | TRACKED | {"tracking.advanced.corner_depth_sigma": 0.0}
-    for name, changes in ({"photometric alignment alone": {}} | PHOTOMETRIC).items():
-        where = "cecum_t1_a, every third frame, Depth Anything"
+    alone |= NO_SURFACE | TRACKED
+    for name, method in ({"photometric alignment alone": "scopemap"} | PHOTOMETRIC).items():
+        where, changes = "cecum_t1_a, every third frame, Depth Anything", {"tracking.method": f"{method}+no-corners"}
         yield Run(f"{name}: {where}", cecum, "sim3", alone | changes, slice(None, None, 3))
 
 

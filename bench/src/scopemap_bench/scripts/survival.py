@@ -21,7 +21,7 @@ from scopemap.reconstruction import Reconstruction
 from scopemap.runner.run import reconstruct
 from scopemap.trajectory.formats.opening import read_trajectory
 
-FIXED = {"fusion.enabled": "false", "mapping.triangulate_depth": "false"}
+FIXED = {"fusion.enabled": "false", "mapping.method": "no-triangulation"}
 SMALL, LARGE = 10, 50
 
 

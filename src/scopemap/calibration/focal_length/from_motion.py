@@ -188,7 +188,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
-        adjusts = config.mapping.method == "full"
+        adjusts = config.mapping.method != "none"
         tried = _agreeing(try_lenses(windows), estimate, sequence, windows) if adjusts else None
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
