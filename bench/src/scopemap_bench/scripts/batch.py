@@ -33,8 +33,8 @@ from pathlib import Path
 from typing import Any
 
 from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.demo_clip import write_clip
-from scopemap_bench.scripts.measuring import command_line, options_of, print_head, print_row
 
 SIZE, CAMERA, POISONED = (160, 128), "80 80 79.5 63.5", "colon_03_poisoned"
 SETTINGS = ("--preset", "realtime", "--camera", CAMERA)
@@ -109,7 +109,7 @@ class Killer:
 def command(videos: object, out: Path, *options: str, workers: int = 2) -> list[str]:
     """Return the command of a batch."""
     fixed = ("--quiet", "--retries", RETRIES, "--workers", workers)
-    return command_line("batch", videos, "--out", out, *SETTINGS, *fixed, *options)
+    return measuring.command_line("batch", videos, "--out", out, *SETTINGS, *fixed, *options)
 
 
 def wait_for(results: int, out: Path, process: subprocess.Popen[bytes]) -> None:
@@ -288,7 +288,9 @@ def single_runs(videos: Path, folder: Path) -> Wanted:
     wanted = {}
     for video in sorted(videos.glob("*.mp4")):
         if video.stem != POISONED:
-            subprocess.run(command_line("run", video, "--out", folder / video.stem, *SETTINGS, "--quiet"), check=True)
+            subprocess.run(
+                measuring.command_line("run", video, "--out", folder / video.stem, *SETTINGS, "--quiet"), check=True
+            )
             wanted[video.stem] = content(folder / video.stem)
     return wanted
 
@@ -301,17 +303,17 @@ def print_trials(count: int, engines: list[str]) -> bool:
         write_videos(folder / "videos", count)
         wanted = single_runs(folder / "videos", folder / "single")
         heads = ("engine", "equal to single runs", "failed", "killed", "touched again by the same command")
-        print_head(*heads, f"s, {count} videos")
+        measuring.print_head(*heads, f"s, {count} videos")
         for engine in engines:
             cells, is_right = trial(engine, folder / "videos", folder / engine, wanted)
             all_right &= is_right
-            print_row(*cells[:-1], cells[-1] if is_right else f"{cells[-1]} WRONG")
+            measuring.print_row(*cells[:-1], cells[-1] if is_right else f"{cells[-1]} WRONG")
     return all_right
 
 
 def main() -> None:
     """Print a table."""
-    parser = options_of(__doc__)
+    parser = measuring.options_of(__doc__)
     parser.add_argument("--videos", type=int, default=24)
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
     parser.add_argument("--local-jobs", nargs=2, help=argparse.SUPPRESS)

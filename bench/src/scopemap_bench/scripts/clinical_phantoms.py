@@ -24,19 +24,7 @@ from scopemap.config import Config
 from scopemap.io.opening import open_sequence
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.scripts.measuring import (
-    cell,
-    evaluated,
-    folder_or_scratch,
-    options_of,
-    phantom,
-    print_head,
-    print_row,
-    provenance,
-    rotation,
-    run_once,
-    submaps,
-)
+from scopemap_bench.scripts import measuring
 
 FRAMES = 120
 EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
@@ -71,17 +59,19 @@ LENSES = (
 def print_phantoms(names: Iterable[str], seeds: Iterable[int], preset: str, folder: Path) -> None:
     """Render, run, measure and print the first table."""
     heads = ("phantom, seed", "frames tracked", "frames in the largest submap", "submaps")
-    print_head(*heads, "ATE RMSE mm", "rotation mean / max deg", "mesh to truth mm")
+    measuring.print_head(*heads, "ATE RMSE mm", "rotation mean / max deg", "mesh to truth mm")
     for name in names:
         for seed in seeds:
             stem = f"{name.split(':')[0].split(',')[0].replace(' ', '-')}-{seed}"
-            source = phantom(folder / stem, *PHANTOMS[name], "--frames", FRAMES, "--seed", seed)
-            run = run_once(source, folder / f"{stem}-{preset}", "--preset", preset)
-            facts, figures = provenance(run), evaluated(run, "--truth", source, "--align", "sim3")
+            source = measuring.phantom(folder / stem, *PHANTOMS[name], "--frames", FRAMES, "--seed", seed)
+            run = measuring.run_once(source, folder / f"{stem}-{preset}", "--preset", preset)
+            facts, figures = measuring.provenance(run), measuring.evaluated(run, "--truth", source, "--align", "sim3")
             tracked = facts["tracked"] + facts.get("in_other_maps", 0)
-            cells = [f"{name}, {seed}", f"{tracked} of {FRAMES}", facts["tracked"], submaps(run)]
-            mesh = cell(figures, ".2f", "mesh_accuracy_mm")
-            print_row(*cells, cell(figures, ".3f", "ate_rmse_mm"), rotation(figures), mesh)
+            cells = [f"{name}, {seed}", f"{tracked} of {FRAMES}", facts["tracked"], measuring.submaps(run)]
+            mesh = measuring.cell(figures, ".2f", "mesh_accuracy_mm")
+            measuring.print_row(
+                *cells, measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures), mesh
+            )
 
 
 def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:
@@ -94,7 +84,7 @@ def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:
 
 def print_lenses(folder: Path) -> None:
     """Print how far the estimated focal length is off at the picture's centre, or that the run does not know."""
-    print_head("scene, lens", "true f / width", "fx off", "camera's source, as a run states it")
+    measuring.print_head("scene, lens", "true f / width", "fx off", "camera's source, as a run states it")
     for scene, kind, fov_deg, seed, deform in LENSES:
         camera, pictures = lens_of(kind, fov_deg), folder / f"lens-{seed}"
         file = folder / f"lens-{seed}.yaml"
@@ -110,17 +100,17 @@ def print_lenses(folder: Path) -> None:
         knows = found.camera_source.startswith("estimated")
         verdict = f"{off:+.1%}" if knows else f"unknown; assumed {off:+.0%}"
         name = f"{scene}{', breathing' if deform else ''}, {kind}, {fov_deg:g} deg"
-        print_row(name, f"{true_share:.3f}", verdict, found.camera_source.split(";")[0])
+        measuring.print_row(name, f"{true_share:.3f}", verdict, found.camera_source.split(";")[0])
 
 
 def main() -> None:
     """Print both tables."""
-    parser = options_of(__doc__, out=True)
+    parser = measuring.options_of(__doc__, out=True)
     parser.add_argument("--only", nargs="+", help="beginnings of phantoms' names; without the second table")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--preset", default="default")
     options = parser.parse_args()
-    with folder_or_scratch(options.out) as folder:
+    with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         names = [name for name in PHANTOMS if name.startswith(tuple(options.only or ("",)))]
         print_phantoms(names, range(21, 21 + options.seeds), options.preset, folder)

@@ -29,16 +29,7 @@ from scopemap.io.opening import open_sequence, sequence_of
 from scopemap.odometry import Step
 from scopemap.runner.live import LiveSession, finished
 from scopemap.runner.reconstructor import Reconstructor
-from scopemap_bench.scripts.measuring import (
-    command_line,
-    evaluated,
-    memory_mb,
-    options_of,
-    phantom,
-    print_head,
-    print_row,
-    there_and_back,
-)
+from scopemap_bench.scripts import measuring
 
 PERIOD = 300  # frames of the phantom
 EVERY_S = 1.0
@@ -49,7 +40,7 @@ MOST_READ = 250  # frames of the clip
 def write_input(folder: Path, source: Path, count: int) -> None:
     """Link a phantom's pictures there and back under increasing numbers, with its camera; write its poses likewise."""
     pictures, poses = sorted(source.glob("*_color.png")), (source / "pose.txt").read_text().splitlines()
-    order = there_and_back(count, len(pictures))
+    order = measuring.there_and_back(count, len(pictures))
     folder.mkdir()
     for number, index in enumerate(order):
         (folder / f"{number:06d}_color.png").symlink_to(pictures[index])
@@ -61,22 +52,22 @@ def write_input(folder: Path, source: Path, count: int) -> None:
 def print_run(source: Path, out: Path, count: int, preset: str) -> None:
     """Run a source in a process that is watched, and print its row."""
     started, seen = time.perf_counter(), []
-    process = subprocess.Popen(command_line("run", source, "--out", out, "--quiet", "--preset", preset))
+    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet", "--preset", preset))
     while True:
         ended, status, used = os.wait4(process.pid, os.WNOHANG)
         if ended:
             break
         with suppress(OSError):  # it has just ended
-            seen.append((memory_mb(process.pid), len(list(Path(f"/proc/{process.pid}/fd").iterdir()))))
+            seen.append((measuring.memory_mb(process.pid), len(list(Path(f"/proc/{process.pid}/fd").iterdir()))))
         time.sleep(EVERY_S)
     if status:
         raise SystemExit(f"the run of {source} failed")
     tenths = [f"{seen[len(seen) * k // 10][0]:.0f}" for k in range(1, 10)]
     per_frame_ms = 1e3 * (used.ru_utime + used.ru_stime) / count
-    ate_mm = evaluated(out, "--truth", source, "--align", "sim3")["ate_rmse_mm"]
+    ate_mm = measuring.evaluated(out, "--truth", source, "--align", "sim3")["ate_rmse_mm"]
     cells = [count, f"{time.perf_counter() - started:.0f}", f"{per_frame_ms:.0f}"]
     cells += [f"{used.ru_maxrss * 1024 / 1e6:.0f}", " ".join(tenths), max(files for _, files in seen)]
-    print_row(*cells, f"{ate_mm:.2f}")
+    measuring.print_row(*cells, f"{ate_mm:.2f}")
 
 
 def write_loop(clip: Path, file: Path, fps: int, count: int) -> None:
@@ -86,7 +77,7 @@ def write_loop(clip: Path, file: Path, fps: int, count: int) -> None:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "16", "preset": "veryfast"})
         stream.height, stream.width = frames[0].shape[0] // 2 * 2, frames[0].shape[1] // 2 * 2
         stream.pix_fmt = "yuv420p"
-        for index in there_and_back(count, len(frames)):
+        for index in measuring.there_and_back(count, len(frames)):
             picture = np.ascontiguousarray(frames[index][: stream.height, : stream.width])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
@@ -98,7 +89,9 @@ class LiveTable:
     def __init__(self, source: LiveSource, seconds: float) -> None:
         self._source, self._seconds, self._part = source, seconds, 0
         self._begin()
-        print_head("part", "frames", "dropped", "tracked", "latency ms, median / 95 %", "CPU ms a frame", "memory MB")
+        measuring.print_head(
+            "part", "frames", "dropped", "tracked", "latency ms, median / 95 %", "CPU ms a frame", "memory MB"
+        )
 
     def observe(self, step: Step, reconstructor: Reconstructor) -> None:
         """Count a step."""
@@ -115,7 +108,9 @@ class LiveTable:
         latency = " / ".join(f"{value:.0f}" for value in np.percentile(self._latencies_ms, [50, 95]))
         used_ms = 1000 * (time.process_time() - self._cpu_s) / count
         counts = (count, self._source.dropped - self._dropped, self._tracked)
-        print_row(f"{self._part + 1} of {PARTS}", *counts, latency, f"{used_ms:.0f}", f"{memory_mb():.0f}")
+        measuring.print_row(
+            f"{self._part + 1} of {PARTS}", *counts, latency, f"{used_ms:.0f}", f"{measuring.memory_mb():.0f}"
+        )
         self._begin()
 
     def _begin(self) -> None:
@@ -150,7 +145,7 @@ def measure_live(given: argparse.Namespace, folder: Path) -> None:
 
 def main() -> None:
     """Render, run, print."""
-    parser = options_of(__doc__)
+    parser = measuring.options_of(__doc__)
     parser.add_argument("--frames", type=int, nargs="*", default=[300, 1200])
     parser.add_argument("--size", default="320x256")
     parser.add_argument("--preset", default="default")
@@ -162,9 +157,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         if given.frames:
-            drawn = phantom(folder / "phantom", "--frames", PERIOD, "--size", given.size)
+            drawn = measuring.phantom(folder / "phantom", "--frames", PERIOD, "--size", given.size)
             heads = ("frames", "seconds", "processor time a frame, ms", "peak MB", "MB each tenth")
-            print_head(*heads, "open files at most", "ATE mm")
+            measuring.print_head(*heads, "open files at most", "ATE mm")
         for count in sorted(given.frames):
             write_input(folder / f"input-{count}", drawn, count)
             print_run(folder / f"input-{count}", folder / f"out-{count}", count, given.preset)

@@ -18,19 +18,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-from scopemap_bench.scripts.measuring import (
-    cell,
-    evaluated,
-    folder_or_scratch,
-    options_of,
-    phantom,
-    print_head,
-    print_row,
-    provenance,
-    rotation,
-    scopemap,
-    submaps,
-)
+from scopemap_bench.scripts import measuring
 
 PHANTOMS = {
     "colon phantom": ("--scene", "colon", "--frames", 120, "--seed", 11),
@@ -79,7 +67,7 @@ def clips(data: Path, out: Path) -> dict[str, Clip]:
 def drawn(clip: Clip) -> Clip:
     """Return the clip, after its phantom was rendered where it is missing."""
     if clip.name in PHANTOMS:
-        phantom(clip.source, *PHANTOMS[clip.name])
+        measuring.phantom(clip.source, *PHANTOMS[clip.name])
     return clip
 
 
@@ -89,24 +77,24 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> dict[str, float]
     for _ in range(repeat):
         shutil.rmtree(run, ignore_errors=True)
         started = time.perf_counter()
-        scopemap("run", clip.source, "--out", run, "--preset", preset, "--quiet", *clip.arguments)
+        measuring.scopemap("run", clip.source, "--out", run, "--preset", preset, "--quiet", *clip.arguments)
         elapsed_s.append(time.perf_counter() - started)
-    facts, figures = provenance(run), {}
+    facts, figures = measuring.provenance(run), {}
     if clip.has_truth:
         against = ("--truth", clip.source, "--align", "sim3")
         # A clip without true depth refuses to measure it.
-        figures = evaluated(run, *against, *(() if clip.name in NO_TRUE_DEPTH else ("--depth", "median")))
+        figures = measuring.evaluated(run, *against, *(() if clip.name in NO_TRUE_DEPTH else ("--depth", "median")))
     frames = facts["frames"]
-    rpe = [cell(figures, ".3f", name) for name in ("rpe_10_mm", "rpe_10_deg")]
-    print_row(
+    rpe = [measuring.cell(figures, ".3f", name) for name in ("rpe_10_mm", "rpe_10_deg")]
+    measuring.print_row(
         clip.name if preset == "default" else f"{clip.name}, `{preset}`",
         f"{facts['tracked']} of {frames}",
-        submaps(run),
-        cell(figures, ".3f", "ate_rmse_mm"),
-        rotation(figures),
+        measuring.submaps(run),
+        measuring.cell(figures, ".3f", "ate_rmse_mm"),
+        measuring.rotation(figures),
         " / ".join(filter(None, rpe)),
-        cell(figures.get("depth", {}), ".3f", "abs_rel"),
-        cell(figures, ".2f", "mesh_accuracy_mm"),
+        measuring.cell(figures.get("depth", {}), ".3f", "abs_rel"),
+        measuring.cell(figures, ".2f", "mesh_accuracy_mm"),
         f"{frames / statistics.median(elapsed_s):.1f}",
     )
     return {stage: facts["seconds"].get(stage, 0.0) / frames for stage in STAGES}
@@ -131,16 +119,16 @@ def draw_speed(stages: dict[str, dict[str, float]], file: Path) -> None:
 
 def main() -> None:
     """Run, measure, print, draw."""
-    parser = options_of(__doc__, data=True, out=True)
+    parser = measuring.options_of(__doc__, data=True, out=True)
     parser.add_argument("--picture", type=Path, help="draw the time of each stage into this PNG")
     parser.add_argument("--only", nargs="+", default=["*"], help="names of clips; * is any text")
     parser.add_argument("--presets", nargs="+", default=["default", "realtime"])
     parser.add_argument("--repeat", type=int, default=1, help="runs of each clip")
     options = parser.parse_args()
-    with folder_or_scratch(options.out) as out:
+    with measuring.folder_or_scratch(options.out) as out:
         stages = {}
         heads = ("clip", "frames in the result", "submaps", "ATE RMSE mm", "rotation mean / max deg")
-        print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", "mesh to truth mm", "frames per s")
+        measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", "mesh to truth mm", "frames per s")
         for preset in options.presets:
             for name, clip in clips(options.data, out).items():
                 wanted = any(fnmatch(name, pattern) for pattern in options.only)

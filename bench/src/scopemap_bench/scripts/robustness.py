@@ -30,8 +30,7 @@ from scopemap.config import Config
 from scopemap.errors import ScopemapError
 from scopemap.io.opening import open_sequence
 from scopemap.runner.run import reconstruct
-from scopemap_bench.scripts import batch, fuzz
-from scopemap_bench.scripts.measuring import options_of, phantom, print_head, print_row
+from scopemap_bench.scripts import batch, fuzz, measuring
 
 PRESETS = ("default", "realtime")
 SMALL = ("--scene", "colon", "--frames", 24, "--size", "160x128")
@@ -100,7 +99,7 @@ def content(out: Path) -> dict[str, bytes]:
 
 def undisturbed(folder: Path) -> Undisturbed:
     """Draw the phantom and run it by each preset."""
-    source, wanted, seconds = phantom(folder / "phantom", *SMALL), {}, {}
+    source, wanted, seconds = measuring.phantom(folder / "phantom", *SMALL), {}, {}
     for preset in PRESETS:
         run(source, folder / f"warm-{preset}", preset)  # compiles kernels where no cache has them
         started = time.monotonic()
@@ -156,7 +155,7 @@ def words(counts: Counter[str]) -> str:
 
 def main() -> None:
     """Disturb, compare, print; exit code 1 where something is not as it must be."""
-    parser = options_of(__doc__)
+    parser = measuring.options_of(__doc__)
     parser.add_argument("--kills", type=int, default=16)
     parser.add_argument("--failures", type=int, default=6)
     parser.add_argument("--inputs", type=int, default=600)
@@ -169,10 +168,10 @@ def main() -> None:
         killed = kill_until(known, folder / "killed", given.kills, given.seed)
         failed = fail_writing(known, folder / "failed", given.failures)
     ended, findings = fuzz.fuzz(given.inputs, given.seed)
-    print_head("disturbance", "what became of it")
-    print_row("killed at random instants", words(killed))
-    print_row("one call that writes failed", words(failed))
-    print_row("damaged inputs", words(ended))
+    measuring.print_head("disturbance", "what became of it")
+    measuring.print_row("killed at random instants", words(killed))
+    measuring.print_row("one call that writes failed", words(failed))
+    measuring.print_row("damaged inputs", words(ended))
     print()
     all_right = batch.print_trials(given.videos, ["processes"])
     sys.exit(0 if all_right and not findings and words(killed + failed) == words(killed + failed).lower() else 1)

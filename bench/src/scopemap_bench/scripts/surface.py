@@ -27,16 +27,7 @@ from scopemap.fusion.agreement import compare_with_frame
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.scripts.measuring import (
-    cell,
-    evaluated,
-    folder_or_scratch,
-    options_of,
-    phantom,
-    print_head,
-    print_row,
-    run_once,
-)
+from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import PHANTOMS, Clip, clips, drawn
 
 PULLING = "EndoNeRF pulling_soft_tissues"
@@ -52,21 +43,21 @@ MOVED_MM, GROWN_PX = 2.0, 9
 
 def print_surface(clip: Clip, out: Path) -> None:
     """Run a clip unless its run is there, and print its row of the first table."""
-    run = run_once(drawn(clip).source, clip.run_folder(out), *clip.arguments)
+    run = measuring.run_once(drawn(clip).source, clip.run_folder(out), *clip.arguments)
     against = ("--truth", clip.source, "--align", "sim3") if clip.has_truth else ()
     # A clip without true depth refuses to measure it.
     depth = ("--depth", "sequence-median") if clip.name in PHANTOMS else ()
-    figures = evaluated(run, "--against-video", *against, *depth)
+    figures = measuring.evaluated(run, "--against-video", *against, *depth)
     agreement = figures.get("against_video", {})
     kept_out, nearest = agreement.get("held_out", {}), agreement.get("nearest_frame", {})
-    print_row(
+    measuring.print_row(
         clip.name,
-        cell(kept_out, ".3f", "coverage_mean", "coverage_least"),
-        cell(kept_out, ".3f", "depth_error"),
-        f"{cell(kept_out, '.3f', 'ssim')} ({cell(nearest, '.3f', 'ssim')})",
-        cell(figures.get("depth", {}), ".3f", "abs_rel"),
-        cell(figures, ".2f", "mesh_accuracy_mm"),
-        cell(figures, ".2f", "mesh_completeness_mm"),
+        measuring.cell(kept_out, ".3f", "coverage_mean", "coverage_least"),
+        measuring.cell(kept_out, ".3f", "depth_error"),
+        f"{measuring.cell(kept_out, '.3f', 'ssim')} ({measuring.cell(nearest, '.3f', 'ssim')})",
+        measuring.cell(figures.get("depth", {}), ".3f", "abs_rel"),
+        measuring.cell(figures, ".2f", "mesh_accuracy_mm"),
+        measuring.cell(figures, ".2f", "mesh_completeness_mm"),
     )
 
 
@@ -115,11 +106,11 @@ def agreement_there(source: Path, run: Path, index: int) -> str:
 
 def print_at_a_second(seed: int, out: Path) -> None:
     """Run a poked phantom as a whole and at its first and last second; print the rows of the third table."""
-    source = phantom(out / "phantoms" / f"poke-{seed}", *POKED, "--seed", seed)
-    whole = run_once(source, out / f"poke-{seed}-whole")
+    source = measuring.phantom(out / "phantoms" / f"poke-{seed}", *POKED, "--seed", seed)
+    whole = measuring.run_once(source, out / f"poke-{seed}-whole")
     for index, second in SECONDS.items():
-        at = run_once(source, out / f"poke-{seed}-{index}", "--surface-at", second)
-        print_row(seed, f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
+        at = measuring.run_once(source, out / f"poke-{seed}-{index}", "--surface-at", second)
+        measuring.print_row(seed, f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
 
 
 def measure(options: argparse.Namespace, out: Path) -> None:
@@ -128,31 +119,31 @@ def measure(options: argparse.Namespace, out: Path) -> None:
     known = clips(options.data, out)
     known[PULLING] = Clip(PULLING, options.data / "endoscopy" / pulling, has_truth=False)
     heads = ("clip", "kept out: covered mean / least", "depth", "SSIM (points)", "AbsRel")
-    print_head(*heads, "mesh to truth mm", "truth to mesh mm")
+    measuring.print_head(*heads, "mesh to truth mm", "truth to mesh mm")
     for name in CLIPS:
         if name in wanted:
             print_surface(known[name], out)
     if AT_REST in wanted:
-        run = run_once(known[PULLING].source, out / "at-rest", "--camera-at-rest", "--depth", "scopenet")
+        run = measuring.run_once(known[PULLING].source, out / "at-rest", "--camera-at-rest", "--depth", "scopenet")
         scale, errors_mm = errors_at_rest(run, known[PULLING].source)
         print()
-        print_head("surfaces", "scale", "error, median mm", "least / most mm")
+        measuring.print_head("surfaces", "scale", "error, median mm", "least / most mm")
         spread = f"{errors_mm.min():.2f} / {errors_mm.max():.2f}"
-        print_row(len(errors_mm), f"{scale:.3f}", f"{np.median(errors_mm):.2f}", spread)
+        measuring.print_row(len(errors_mm), f"{scale:.3f}", f"{np.median(errors_mm):.2f}", spread)
     if AT_A_SECOND in wanted:
         print()
-        print_head("seed", "second", "all frames: depth, SSIM", "`--surface-at`: depth, SSIM")
+        measuring.print_head("seed", "second", "all frames: depth, SSIM", "`--surface-at`: depth, SSIM")
         for seed in options.seeds:
             print_at_a_second(seed, out)
 
 
 def main() -> None:
     """Run, measure, print."""
-    parser = options_of(__doc__, data=True, out=True)
+    parser = measuring.options_of(__doc__, data=True, out=True)
     parser.add_argument("--only", nargs="+", help=f"names of clips, '{AT_REST}', '{AT_A_SECOND}'")
     parser.add_argument("--seeds", type=int, nargs="+", default=[32], help="of the third table")
     options = parser.parse_args()
-    with folder_or_scratch(options.out) as out:
+    with measuring.folder_or_scratch(options.out) as out:
         measure(options, out)
 
 
