@@ -288,9 +288,7 @@ def single_runs(videos: Path, folder: Path) -> Wanted:
     wanted = {}
     for video in sorted(videos.glob("*.mp4")):
         if video.stem != POISONED:
-            subprocess.run(
-                measuring.command_line("run", video, "--out", folder / video.stem, *SETTINGS, "--quiet"), check=True
-            )
+            measuring.scopemap("run", video, "--out", folder / video.stem, *SETTINGS, "--quiet")
             wanted[video.stem] = content(folder / video.stem)
     return wanted
 

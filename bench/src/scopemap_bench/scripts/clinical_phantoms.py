@@ -68,10 +68,8 @@ def print_phantoms(names: Iterable[str], seeds: Iterable[int], preset: str, fold
             facts, figures = measuring.provenance(run), measuring.evaluated(run, "--truth", source, "--align", "sim3")
             tracked = facts["tracked"] + facts.get("in_other_maps", 0)
             cells = [f"{name}, {seed}", f"{tracked} of {FRAMES}", facts["tracked"], measuring.submaps(run)]
-            mesh = measuring.cell(figures, ".2f", "mesh_accuracy_mm")
-            measuring.print_row(
-                *cells, measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures), mesh
-            )
+            cells += [measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures)]
+            measuring.print_row(*cells, measuring.cell(figures, ".2f", "mesh_accuracy_mm"))
 
 
 def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:

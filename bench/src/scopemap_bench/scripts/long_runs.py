@@ -89,9 +89,8 @@ class LiveTable:
     def __init__(self, source: LiveSource, seconds: float) -> None:
         self._source, self._seconds, self._part = source, seconds, 0
         self._begin()
-        measuring.print_head(
-            "part", "frames", "dropped", "tracked", "latency ms, median / 95 %", "CPU ms a frame", "memory MB"
-        )
+        heads = ("part", "frames", "dropped", "tracked", "latency ms, median / 95 %")
+        measuring.print_head(*heads, "CPU ms a frame", "memory MB")
 
     def observe(self, step: Step, reconstructor: Reconstructor) -> None:
         """Count a step."""
@@ -106,11 +105,9 @@ class LiveTable:
         """Print the row."""
         count = len(self._latencies_ms)
         latency = " / ".join(f"{value:.0f}" for value in np.percentile(self._latencies_ms, [50, 95]))
-        used_ms = 1000 * (time.process_time() - self._cpu_s) / count
+        used = (f"{1000 * (time.process_time() - self._cpu_s) / count:.0f}", f"{measuring.memory_mb():.0f}")
         counts = (count, self._source.dropped - self._dropped, self._tracked)
-        measuring.print_row(
-            f"{self._part + 1} of {PARTS}", *counts, latency, f"{used_ms:.0f}", f"{measuring.memory_mb():.0f}"
-        )
+        measuring.print_row(f"{self._part + 1} of {PARTS}", *counts, latency, *used)
         self._begin()
 
     def _begin(self) -> None:
