@@ -127,7 +127,7 @@ def kill(process: int) -> None:
 def by_processes(videos: Path, out: Path) -> str:
     """Run a batch of which the whole command is killed."""
     process = subprocess.Popen(command(videos, out))
-    wait_for(4, out, process)
+    wait_for(2, out, process)
     kill(process.pid)
     process.wait()
     subprocess.run(command(videos, out), check=False)
