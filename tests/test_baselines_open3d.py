@@ -127,19 +127,6 @@ def test_frames_that_show_nothing_are_lost_and_the_next_one_is_not(method: str) 
 
 
 @needs_open3d
-@pytest.mark.parametrize("method", COLOUR + CLOUDS)
-def test_depth_under_the_mask_has_no_say(method: str) -> None:
-    moved, masks = _bowl(1, further_mm=1.0), np.ones((CAMERA.height, CAMERA.width), bool)
-    masks[:, :60] = False
-    wrong = np.where(masks, moved.depth_mm, moved.depth_mm + 2.0).astype(np.float32)
-    poses = []
-    for depth_mm in (moved.depth_mm, wrong):
-        frames = [replace(_bowl(0), valid=masks), replace(moved, valid=masks, depth_mm=depth_mm)]
-        poses.append(list(_follow(Open3dTracker(method), frames))[1].T_world_camera)
-    np.testing.assert_allclose(poses[0], poses[1], atol=1e-8)
-
-
-@needs_open3d
 def test_the_reference_has_the_depth_that_was_adopted_last() -> None:
     """Refined depth, where there is any, replaces the raw depth that the frame was tracked with."""
     tracker = Open3dTracker(CLOUDS[1])

@@ -10,7 +10,6 @@ from sample_trajectories import write_c3vd
 
 from scopemap.config import Config
 from scopemap.errors import InputError, SettingsError
-from scopemap.trajectory.formats.text import read_poses
 from scopemap_bench.entry import Entry, entries_of
 from scopemap_bench.methods.method import create_method
 from scopemap_bench.plan import Plan, found_sequences, read_plan, shipped_plans
@@ -152,20 +151,6 @@ def test_plans_that_come_along_name_methods_that_exist(name: str, tmp_path: Path
         create_method(method, tmp_path)
     with pytest.raises(SettingsError, match=name):
         read_plan(tmp_path / "none.toml")
-
-
-def test_a_phantom_along_a_path_from_a_file_is_rendered_once_for_all_methods(tmp_path: Path) -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 2, 3] = [0.0, 1.0, 2.0]
-    write_c3vd(tmp_path / "data", poses)
-    old = 'scene = "tube", frames = 5, seed = 4, width = 64, height = 48, events = "black:2-3"'
-    new = 'scene = "colon", frames = 3, width = 64, height = 48, path_file = "pose.txt"'
-    *_, entry, _ = [row for row in rows_of(SMALL.replace(old, new), tmp_path) if row.method.name == "ours"]
-    entry.render_phantom()
-    first = (entry.source / "mesh_truth.ply").stat().st_mtime_ns
-    entry.render_phantom()
-    assert (entry.source / "mesh_truth.ply").stat().st_mtime_ns == first
-    np.testing.assert_allclose(read_poses(entry.source / "pose.txt")[:, :3, 3].std(axis=0).max(), np.std([0, 1, 2]))
 
 
 def test_two_sequences_of_one_name_or_an_unknown_method_are_refused_before_anything_runs(tmp_path: Path) -> None:

@@ -77,9 +77,9 @@ def pose_groups(
     matched: MatchedTrajectories | None = None
     # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
     modes: tuple[AlignMode, ...] = (align, "origin")
-    for mode in modes if reference is not None else ():
+    for mode in modes:
         with suppress(AlignmentError):
-            matched = matched or match(estimate, reference, mode)
+            matched = matched or (match(estimate, reference, mode) if reference is not None else None)
     if matched is None or reference is None:
         tracked = estimate.tracked
         own = {"frames": len(tracked), "tracked": int(np.count_nonzero(tracked))}
