@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,10 +13,7 @@ from scopemap.report.canvas import ESTIMATE_COLOUR
 from scopemap_bench.pictures import (
     BAR_COLOUR,
     draw_ate,
-    draw_displacement_bars,
-    draw_displacement_scatter,
     draw_frames_until_loss,
-    draw_matched_points,
 )
 
 NAN = float("nan")
@@ -53,14 +49,6 @@ def test_bars_are_as_long_as_their_values(tmp_path: Path) -> None:
     assert lengths[1] > 150
 
 
-def test_there_is_a_panel_per_sequence_and_a_bar_per_known_value(tmp_path: Path) -> None:
-    draw_ate(grid([[1.0, NAN, 1.0]] * 5), tmp_path / "many.png", alignment="se3")
-    _, _, sizes, _ = cv2.connectedComponentsWithStats(
-        is_colour(read(tmp_path / "many.png"), BAR_COLOUR).astype(np.uint8)
-    )
-    assert (sizes[1:, cv2.CC_STAT_AREA] > 500).sum() == 10
-
-
 def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
     frames = grid([[90.0, 45.0, 90.0]])
     draw_frames_until_loss(frames, [90], tmp_path / "loss.png")
@@ -71,42 +59,3 @@ def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
     assert lost[0] / kept[0] == pytest.approx(0.5, abs=0.02)
     with pytest.raises(ValueError, match="lengths"):
         draw_frames_until_loss(frames, [90, 80], tmp_path / "bad.png")
-
-
-def test_displacement_bars_have_whiskers_and_medians(tmp_path: Path) -> None:
-    mean, std, none = grid([[1.0, 2.0]]), grid([[3.0, 0.5]]), grid([[NAN, NAN]])
-    draw_displacement_bars(mean, std, 0.5 * mean, tmp_path / "with.png", where="world")
-    first, second = bar_lengths(read(tmp_path / "with.png"))
-    # The longest whisker ends at 4 mm, which leaves the bar of 1 mm a quarter of what a bar of 4 mm would have.
-    assert second / first == pytest.approx(2.0, abs=0.1)
-    draw_displacement_bars(mean, none, 0.5 * mean, tmp_path / "bare.png", where="world")
-    assert bar_lengths(read(tmp_path / "bare.png"))[1] > 1.5 * second
-
-
-def test_scatters_share_their_scale(tmp_path: Path) -> None:
-    low, high = np.full(40, 1.0), np.full(40, 3.0)
-    draw_displacement_scatter({"low": low, "high": high}, tmp_path / "two.png", where="world")
-    picture = read(tmp_path / "two.png")
-    half = picture.shape[1] // 2
-    sides = (picture[:, :half], picture[:, half:])
-    heights = [np.median(np.nonzero(is_colour(side, "#d95f02", within=60))[0]) for side in sides]
-    assert heights[0] > heights[1] + 60
-    draw_displacement_scatter({"none": np.full(5, NAN), "low": low}, tmp_path / "none.png", where="camera")
-
-
-def test_matched_points_that_agree_hide_each_other(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).uniform(30, 50, (500, 3))
-    for name, offset in (("same", 0.0), ("apart", 4.0)):
-        draw_matched_points({name: (points, points + offset)}, tmp_path / f"{name}.png", where="world")
-    blue = [is_colour(read(tmp_path / f"{name}.png"), BAR_COLOUR).sum() for name in ("same", "apart")]
-    # The current points are drawn over the previous ones.
-    assert blue[0] < 0.6 * blue[1]
-    draw_matched_points({"none": (np.empty((0, 3)), np.empty((0, 3)))}, tmp_path / "none.png", where="world")
-    with pytest.raises(ValueError, match="current points of x"):
-        draw_matched_points({"x": (points, points[:3])}, tmp_path / "bad.png", where="world")
-
-
-def test_figures_leave_the_backend_alone(tmp_path: Path) -> None:
-    before = matplotlib.get_backend(auto_select=False)
-    draw_ate(grid([[1.0]]), tmp_path / "x.png", alignment="none")
-    assert matplotlib.get_backend(auto_select=False) == before

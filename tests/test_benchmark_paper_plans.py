@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 from drawn_benchmarks import as_hamlyn, as_scared, as_scared_c, seen
@@ -160,16 +159,3 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     assert "weights that are missing: alexnet, depth-anything, depth-pro, raft-large" in lines
     assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
     assert not list(tmp_path.iterdir())
-
-
-def test_without_weights_a_row_names_them_and_the_plan_goes_on(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path / "none"))
-    plan = read_plan("scared")
-    few = plan.model_copy(update={"method": tuple(m for m in plan.method if m.name in (*OURS, "standing still"))})
-    rows, _ = run(few, data / "train", tmp_path, monkeypatch)
-    status: dict[str, Any] = {row.method: row.status for row in rows}
-    assert status == dict.fromkeys(OURS, "missing") | {"scopemap": "done", "standing still": "done"}
-    text = (tmp_path / "tables" / "overview.csv").read_text()
-    assert "needs weights: depth-pro" in text

@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from scopemap.errors import InputError
 from scopemap_bench import runner
 from scopemap_bench.entry import Entry
 from scopemap_bench.plan import Plan, read_plan
@@ -100,18 +99,8 @@ def test_every_method_is_a_row_and_one_that_dies_says_so(done: tuple[Benchmark, 
     assert 0 < ours.figure("poses", "ate_rmse_mm") < still.figure("poses", "ate_rmse_mm")
     assert math.isnan(imported.figure("poses", "ate_rmse_mm"))
     assert {"poses", "paper", "evo", "depth", "surface"} <= set(ours.figures)
-
-
-def test_a_row_says_where_and_with_what_it_was_run(done: tuple[Benchmark, Path]) -> None:
-    row = done[0].results[0]
-    assert {"machine", "commit", "versions", "align", "key"} <= set(row.facts)
-    assert row.facts["align"] == "origin"
-    assert row.timing["ms_per_frame"] > row.timing["track_ms_per_frame"] > 0
-    assert row.timing["peak_memory_mb"] > 100
-    assert {"seconds_read", "seconds_preprocess"} <= set(row.timing)
-
-
-def test_every_run_keeps_its_folder(done: tuple[Benchmark, Path]) -> None:
+    assert {"machine", "commit", "versions", "align", "key"} <= set(ours.facts)
+    assert ours.timing["ms_per_frame"] > ours.timing["track_ms_per_frame"] > 0
     folder = done[1] / "runs" / "colon" / "ours"
     kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     assert {"entry.json", "result.json", "log.txt", "run/trajectory.tum", "run/mesh.ply", "run/depth"} <= kept
@@ -197,9 +186,3 @@ def _eventually(condition: Callable[[], bool], within_s: float = 60.0) -> bool:
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.05)
     return condition()
-
-
-def test_a_folder_that_cannot_be_is_one_clear_line(plan: Plan, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write a benchmark to"):
-        run_plan(plan, tmp_path / "file" / "out", data=tmp_path)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from scopemap_bench.table import Figure, Table, escape_markdown
 
@@ -114,15 +110,3 @@ def _best(values: list[float], better: str, digits: int = 3) -> list[int]:
 )
 def test_the_best_value(values: list[float], better: str, best: list[int]) -> None:
     assert _best(values, better) == best
-
-
-@given(
-    st.lists(st.floats(-100, 100) | st.just(NAN), min_size=1, max_size=8), st.sampled_from(["lower", "higher", "one"])
-)
-def test_no_value_is_printed_better_than_the_best(values: list[float], better: str) -> None:
-    best = _best(values, better, digits=2)
-    known = [value for value in values if not math.isnan(value)]
-    assert bool(best) == (len(known) > 1)
-    cost = {"lower": lambda x: x, "higher": lambda x: -x, "one": lambda x: abs(x - 1)}[better]
-    for place in best:
-        assert all(cost(round(values[place], 2)) <= cost(round(value, 2)) + 1e-8 for value in known)

@@ -37,7 +37,10 @@ def places(tmp_path: Path) -> tuple[Path, Path, Path]:
 
 def test_runs_and_foreign_files_stand_side_by_side(places: tuple[Path, Path, Path], tmp_path: Path) -> None:
     ours, theirs, truth = places
+    # A run that is an import is compared, and left out of the page.
+    (ours / "provenance.json").write_text(json.dumps({"input": str(truth), "imported": str(theirs)}))
     result = run("compare", ours, theirs, "--truth", truth, "--out", tmp_path / "out")
+    assert not (tmp_path / "out/report.html").exists()
     assert "0.309" in result.stdout
     assert "theirs.txt" in result.stdout
     rows = list(csv.DictReader((tmp_path / "out/tables/overview.csv").read_text().splitlines()))
@@ -46,16 +49,6 @@ def test_runs_and_foreign_files_stand_side_by_side(places: tuple[Path, Path, Pat
     assert float(rows[1]["ATE RMSE [mm]"]) == pytest.approx(0, abs=1e-6)
     figures = {file.name for file in (tmp_path / "out/figures").iterdir()}
     assert {"ate.png", "frames_until_loss.png"} <= figures
-
-
-def test_an_imported_trajectory_is_compared_and_left_out_of_the_page(
-    places: tuple[Path, Path, Path], tmp_path: Path
-) -> None:
-    ours, theirs, truth = places
-    (ours / "provenance.json").write_text(json.dumps({"input": str(truth), "imported": str(theirs)}))
-    result = run("compare", ours, "--truth", truth, "--out", tmp_path / "out")
-    assert "0.309" in result.stdout
-    assert not (tmp_path / "out/report.html").exists()
 
 
 def test_names_alignment_and_json(places: tuple[Path, Path, Path]) -> None:
@@ -124,13 +117,8 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
     assert "<title>one, phantom, two, phantom" in (out / "report.html").read_text(encoding="utf-8")
 
 
-def test_plans_that_come_along_are_listed() -> None:
-    output = run("bench").stdout
-    assert "c3vd-rgbd: C3VD, ten clips, true depth, 8 methods" in output
-    assert "scared-c" in output
-
-
 def test_a_plan_needs_a_folder_and_its_data(tmp_path: Path) -> None:
+    assert "c3vd-rgbd: C3VD, ten clips, true depth, 8 methods" in run("bench").output
     assert "--out" in run("bench", "scared", code=2).output
     error = run("bench", "scared", "--out", tmp_path / "out", "--data", tmp_path, code=1).exception
     assert isinstance(error, InputError)

@@ -67,12 +67,6 @@ def test_previews_have_one_range_for_all_frames_and_unknown_is_black(images: Seq
     np.testing.assert_allclose(depth_mm[10:].min(), np.nanmin(_frame(images, 1, 40.0).depth_mm), atol=0.01)
 
 
-def test_without_depth_there_is_no_preview(tmp_path: Path) -> None:
-    DepthWriter(tmp_path).finish(scale_known=True)
-    assert not (tmp_path / "depth_preview").exists()
-    assert json.loads((tmp_path / "depth" / "depth.json").read_text())["scale_known"] is True
-
-
 def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out: Path) -> None:
     assert result.provenance["scale"] == {
         "known": False,
@@ -90,12 +84,6 @@ def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out:
     assert UNKNOWN.encode() in (out / "mesh.glb").read_bytes()
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) == len(result.mesh.faces)
     assert len(list((out / "depth_preview").iterdir())) == FRAMES
-
-
-def test_the_assumed_view_is_said_once_and_no_option_is_named_that_was_not_given(result: Reconstruction) -> None:
-    lines = [line for line in summary_lines(result) if "field of view" in line or "focal" in line]
-    assert len(lines) == 1
-    assert lines[0] == "camera: assumed: horizontal field of view 70 deg"
 
 
 @pytest.mark.parametrize(

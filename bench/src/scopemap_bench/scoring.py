@@ -74,10 +74,12 @@ def pose_groups(
 
     Without an alignment, "poses" holds the figures that need no truth, by the names of `pose_report`.
     """
-    matched = None
-    if reference is not None:
-        # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
-        matched = _matched(estimate, reference, align) or _matched(estimate, reference, "origin")
+    matched: MatchedTrajectories | None = None
+    # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
+    modes: tuple[AlignMode, ...] = (align, "origin")
+    for mode in modes:
+        with suppress(AlignmentError):
+            matched = matched or (match(estimate, reference, mode) if reference is not None else None)
     if matched is None or reference is None:
         tracked = estimate.tracked
         own = {"frames": len(tracked), "tracked": int(np.count_nonzero(tracked))}
@@ -90,13 +92,6 @@ def pose_groups(
             known = PROTOCOLS[name]
             figures[name] = known(estimate, reference) | {"description": known.description, "source": known.source}
     return figures, matched
-
-
-def _matched(estimate: Trajectory, reference: Trajectory, align: AlignMode) -> MatchedTrajectories | None:
-    try:
-        return match(estimate, reference, align)
-    except AlignmentError:
-        return None
 
 
 def surface_figures_of(
@@ -114,13 +109,6 @@ def surface_figures_of(
         mesh = trimesh.load_mesh(file, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"cannot read the mesh {file}: {error}") from error
-    return surface_figures(mesh, truth, similarity, icp=icp)
-
-
-def surface_figures(
-    mesh: trimesh.Trimesh, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
-) -> dict[str, float]:
-    """Return the figures of a mesh, world mm, against the true surface of a data set, as in `surface_figures_of`."""
     true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
     if true_surface is None:
         return {}

@@ -113,9 +113,9 @@ class Speed:
         return f"{self.frames} frames of {self.clip} at {self.size[0]}x{self.size[1]} px, preset {self.preset}"
 
     def json(self) -> dict[str, Any]:
-        """Return the figures as `read_speed` reads them."""
-        rounded = {name: {k: _rounded(v) for k, v in asdict(stage).items()} for name, stage in self.stages.items()}
-        return {k: _rounded(v) for k, v in asdict(self).items()} | {"stages": rounded}
+        """Return the figures, rounded, as `read_speed` reads them."""
+        rounded: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_float=lambda text: round(float(text), 4))
+        return rounded
 
     def slower_than(self, before: Speed, tolerance: float) -> list[str]:
         """Return a line for each stage whose ratio to the calibration has grown by more than the share `tolerance`.
@@ -276,7 +276,3 @@ def _calibrations_ms() -> list[float]:
         dis.calc(*pair, np.zeros((256, 320, 2), np.float32))
         times_ms.append(1e3 * (time.thread_time() - started))
     return times_ms
-
-
-def _rounded(value: Any) -> Any:
-    return round(value, 4) if isinstance(value, float) else value

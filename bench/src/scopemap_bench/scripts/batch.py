@@ -32,16 +32,16 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import av
-
-from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.scripts import measuring
+from scopemap_bench.scripts.demo_clip import write_clip
 
 SIZE, CAMERA, POISONED = (160, 128), "80 80 79.5 63.5", "colon_03_poisoned"
 SETTINGS = ("--preset", "realtime", "--camera", CAMERA)
 RETRIES = 2
 # They hold times, or what holds times.
 OF_ITS_TIME = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
+Wanted = dict[str, dict[str, bytes]]
 
 
 def write_videos(folder: Path, count: int) -> None:
@@ -50,14 +50,9 @@ def write_videos(folder: Path, count: int) -> None:
     for number in range(count):
         name = POISONED if number == 3 else f"colon_{number:02d}"
         spec = PhantomSpec(frames=8 + number % 5, width=SIZE[0], height=SIZE[1], seed=number)
-        phantom = prepare(spec)
-        with av.open(str(folder / f"{name}.mp4"), "w") as container:
-            stream = container.add_stream("libx264", rate=30, options={"crf": "18"})
-            stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-            for index in range(len(phantom.poses)):
-                rgb = render_frame(phantom, index)[0]
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
-            container.mux(stream.encode())
+        with tempfile.TemporaryDirectory() as scratch:
+            write_clip(Path(scratch), spec)
+            (folder / f"{name}.mp4").write_bytes((Path(scratch) / "colon.mp4").read_bytes())
 
 
 def content(out: Path) -> dict[str, bytes]:
@@ -113,8 +108,8 @@ class Killer:
 
 def command(videos: object, out: Path, *options: str, workers: int = 2) -> list[str]:
     """Return the command of a batch."""
-    program = [sys.executable, "-m", "scopemap", "batch", str(videos), "--out", str(out), *SETTINGS, "--quiet"]
-    return [*program, "--retries", str(RETRIES), "--workers", str(workers), *options]
+    fixed = ("--quiet", "--retries", RETRIES, "--workers", workers)
+    return measuring.command_line("batch", videos, "--out", out, *SETTINGS, *fixed, *options)
 
 
 def wait_for(results: int, out: Path, process: subprocess.Popen[bytes]) -> None:
@@ -267,7 +262,7 @@ ENGINES: dict[str, Callable[[Path, Path], str]] = {
 }
 
 
-def trial(engine: str, videos: Path, out: Path, wanted: dict[str, dict[str, bytes]]) -> tuple[list[str], bool]:
+def trial(engine: str, videos: Path, out: Path, wanted: Wanted) -> tuple[list[str], bool]:
     """Return the row of an engine, and whether all is as it must be."""
     begun = time.monotonic()
     with Killer(out, once=True) as killer:
@@ -292,22 +287,35 @@ def trial(engine: str, videos: Path, out: Path, wanted: dict[str, dict[str, byte
     return cells, is_right
 
 
-def single_runs(videos: Path, folder: Path) -> dict[str, dict[str, bytes]]:
+def single_runs(videos: Path, folder: Path) -> Wanted:
     """Return the content of the result of each video but the poisoned one."""
     wanted = {}
     for video in sorted(videos.glob("*.mp4")):
-        if video.stem == POISONED:
-            continue
-        out = folder / video.stem
-        run = [sys.executable, "-m", "scopemap", "run", str(video), "--out", str(out), *SETTINGS, "--quiet"]
-        subprocess.run(run, check=True)
-        wanted[video.stem] = content(out)
+        if video.stem != POISONED:
+            measuring.scopemap("run", video, "--out", folder / video.stem, *SETTINGS, "--quiet")
+            wanted[video.stem] = content(folder / video.stem)
     return wanted
+
+
+def print_trials(count: int, engines: list[str]) -> bool:
+    """Print a row for each engine, by so many videos; return whether all is as it must be."""
+    all_right = True
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        write_videos(folder / "videos", count)
+        wanted = single_runs(folder / "videos", folder / "single")
+        heads = ("engine", "equal to single runs", "failed", "killed", "touched again by the same command")
+        measuring.print_head(*heads, f"s, {count} videos")
+        for engine in engines:
+            cells, is_right = trial(engine, folder / "videos", folder / engine, wanted)
+            all_right &= is_right
+            measuring.print_row(*cells[:-1], cells[-1] if is_right else f"{cells[-1]} WRONG")
+    return all_right
 
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = measuring.options_of(__doc__)
     parser.add_argument("--videos", type=int, default=24)
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
     parser.add_argument("--local-jobs", nargs=2, help=argparse.SUPPRESS)
@@ -315,20 +323,7 @@ def main() -> None:
     if given.local_jobs:
         local_jobs(given.local_jobs[0], Path(given.local_jobs[1]))
         return
-    all_right = True
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        write_videos(folder / "videos", given.videos)
-        begun = time.monotonic()
-        wanted = single_runs(folder / "videos", folder / "single")
-        print(f"{given.videos} videos; {len(wanted)} single runs: {time.monotonic() - begun:.0f} s\n")
-        print("| engine | equal to single runs | failed | killed | touched again by the same command | s |")
-        print("|---|---|---|---|---|---|", flush=True)
-        for engine in given.engines:
-            cells, is_right = trial(engine, folder / "videos", folder / engine, wanted)
-            all_right &= is_right
-            print("| " + " | ".join(cells) + f" |{'' if is_right else ' WRONG'}", flush=True)
-    sys.exit(0 if all_right else 1)
+    sys.exit(0 if print_trials(given.videos, given.engines) else 1)
 
 
 if __name__ == "__main__":

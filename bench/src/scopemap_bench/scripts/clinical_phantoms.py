@@ -1,77 +1,120 @@
-"""What clinical video does to a run, on phantoms with exact truth; as Markdown.
+"""What clinical video does to a run, on phantoms with exact truth; and what a run makes of an unknown lens.
 
     python -m scopemap_bench.scripts.clinical_phantoms [--only NAME ...] [--seeds N] [--preset NAME] [--out FOLDER]
 
-Each phantom (160 frames of 320x256) has one difficulty: ten pixels a frame, with two turns of 30 degrees
-(fast), the same turn between two frames (cut), an instrument that comes and goes twice (instruments), contact with the
-wall under automatic exposure (contact), fluid over the lens (fluid), tissue that is pushed two ways and stays so
-(pushed), and that breathes (breathing). One run of the command line each, with scopenet. ATE is that of the largest map
-after a Sim(3) alignment; other maps of at least ten frames are counted. Phantoms in --out are rendered once: to compare
-with another version, run this file with that version first on the path and the same folder.
+First table: each phantom (120 frames of 320x256 px) has one difficulty, one run of the command line with scopenet. ATE
+is that of the largest submap after a Sim(3) alignment. Second table: phantoms through lenses of known kind and field of
+view, given as plain pictures: every fourth of 120 frames, as the estimate uses them.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import tempfile
+import math
+from collections.abc import Iterable
 from pathlib import Path
 
-from scopemap_bench.scripts.overview import scopemap
+import cv2
+from scopemap.calibration.focal_length.estimate import with_focal_from_motion
 
-FRAMES = 160
+from scopemap.calibration.focal_length.trial import KINDS
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.formats.writing import write_calibration
+from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.config import Config
+from scopemap.io.opening import open_sequence
+from scopemap_bench.phantom.render import prepare, render_frame
+from scopemap_bench.phantom.spec import PhantomSpec
+from scopemap_bench.scripts import measuring
+
+FRAMES = 120
+EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
+CAMERA = ("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15", *EXPOSURE)
 PHANTOMS = {
-    "fast": ("--scene", "colon", "--set", "speed=6", "--events", "turn:50-58,turn:100-108"),
-    "cut": ("--scene", "colon", "--events", "turn:80-80"),
-    "instruments": ("--scene", "laparoscopy", "--events", "instrument:20-80,instrument:95-150"),
-    "contact": (
-        *("--scene", "colon", "--events", "contact:60-100"),
-        *("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4"),
+    "fast: ten pixels a frame, two turns of 30 degrees": (
+        *("--scene", "colon", "--set", "speed=6"),
+        *("--events", "turn:40-48,turn:80-88"),
     ),
-    "fluid": ("--scene", "colon", "--events", "fluid:50-100"),
-    "pushed": ("--scene", "laparoscopy", "--events", "push:50-90"),
+    "cut: 30 degrees between two frames": ("--scene", "colon", "--events", "turn:60-60"),
+    "instruments, twice": ("--scene", "laparoscopy", "--events", "instrument:15-60,instrument:70-110"),
+    "contact, automatic exposure": ("--scene", "colon", "--events", "contact:45-75", *EXPOSURE),
+    "fluid over the lens": ("--scene", "colon", "--events", "fluid:40-80"),
+    "pushed organs that stay so": ("--scene", "laparoscopy", "--events", "push:40-70"),
     "breathing": ("--scene", "colon", "--deform"),
+    "black, blurred, full of smoke: 10 frames each": (
+        *("--scene", "colon", "--events", "black:40-49,blur:65-74,smoke:95-104"),
+    ),
+    "motion blur, H.264, lagging exposure, scattered light": ("--scene", "colon", *CAMERA),
 }
-HEADER = (
-    "| phantom, seed | frames tracked | frames in the largest map | maps of >= 10 frames | ATE RMSE mm "
-    "| rotation mean / max deg | mesh to truth mm |\n|---|---|---|---|---|---|---|"
+SIZE, EVERY, LENS_FRAMES = (320, 256), 4, 120
+# Scene, kind of the lens, horizontal field of view in degrees, seed, whether tissue breathes.
+LENSES = (
+    ("laparoscopy", "pinhole", 60.0, 301, False),
+    ("laparoscopy", "equidistant fisheye", 75.0, 303, False),
+    ("laparoscopy", "orthographic fisheye", 100.0, 304, False),
+    ("colon", "pinhole", 75.0, 306, False),
+    ("laparoscopy", "pinhole", 90.0, 302, True),
 )
 
 
-def row(name: str, phantom: Path, out: Path, preset: str) -> str:
-    """Return the row of one run."""
-    scopemap("run", str(phantom), "--out", str(out), "--preset", preset, "--quiet", "--overwrite")
-    told = json.loads((out / "provenance.json").read_text())
-    arguments = ("evaluate", str(out), "--truth", str(phantom), "--align", "sim3", "--json")
-    printed = scopemap(*arguments, check=False)
-    found = json.loads(printed) if printed else {}
-    cells = [f"{told['tracked'] + told.get('in_other_maps', 0)} of {FRAMES}", str(told["tracked"])]
-    cells.append(str(1 + len(list((out / "maps").glob("*")))))
-    cells.append(f"{found['ate_rmse_mm']:.3f}" if found else "")
-    angles = ("rotation_unaligned_mean_deg", "rotation_unaligned_max_deg")
-    cells.append(" / ".join(f"{found[angle]:.2f}" for angle in angles) if found else "")
-    mesh = found.get("mesh_accuracy_mm")
-    return f"| {name} | {' | '.join(cells)} | {'' if mesh is None else f'{mesh:.2f}'} |"
+def print_phantoms(names: Iterable[str], seeds: Iterable[int], preset: str, folder: Path) -> None:
+    """Render, run, measure and print the first table."""
+    heads = ("phantom, seed", "frames tracked", "frames in the largest submap", "submaps")
+    measuring.print_head(*heads, "ATE RMSE mm", "rotation mean / max deg", "mesh to truth mm")
+    for name in names:
+        for seed in seeds:
+            stem = f"{name.split(':')[0].split(',')[0].replace(' ', '-')}-{seed}"
+            source = measuring.phantom(folder / stem, *PHANTOMS[name], "--frames", FRAMES, "--seed", seed)
+            run = measuring.run_once(source, folder / f"{stem}-{preset}", "--preset", preset)
+            facts, figures = measuring.provenance(run), measuring.evaluated(run, "--truth", source, "--align", "sim3")
+            tracked = facts["tracked"] + facts.get("in_other_maps", 0)
+            cells = [f"{name}, {seed}", f"{tracked} of {FRAMES}", facts["tracked"], measuring.submaps(run)]
+            cells += [measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures)]
+            measuring.print_row(*cells, measuring.cell(figures, ".2f", "mesh_accuracy_mm"))
+
+
+def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:
+    """Return a lens of a kind and a horizontal field of view for pictures of `SIZE`."""
+    radius = {"pinhole": math.tan, "equidistant fisheye": float, "orthographic fisheye": math.sin}[kind]
+    focal_px = SIZE[0] / 2 / radius(math.radians(fov_deg / 2))
+    plane = PinholeCamera(focal_px, focal_px, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)
+    return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
+
+
+def print_lenses(folder: Path) -> None:
+    """Print how far the estimated focal length is off at the picture's centre, or that the run does not know."""
+    measuring.print_head("scene, lens", "true f / width", "fx off", "camera's source, as a run states it")
+    for scene, kind, fov_deg, seed, deform in LENSES:
+        camera, pictures = lens_of(kind, fov_deg), folder / f"lens-{seed}"
+        file = folder / f"lens-{seed}.yaml"
+        write_calibration(camera, file)
+        spec = PhantomSpec(scene=scene, frames=LENS_FRAMES, seed=seed, deform=deform, camera_file=file)
+        model = prepare(spec)
+        pictures.mkdir(exist_ok=True)
+        for index in range(0, LENS_FRAMES, EVERY):
+            cv2.imwrite(str(pictures / f"{index:06d}.png"), render_frame(model, index)[0][..., ::-1])
+        found, _ = with_focal_from_motion(open_sequence(pictures), Config())
+        true_share = camera.central.fx / SIZE[0]
+        off = found.camera.fx / (true_share * found.camera.width) - 1
+        knows = found.camera_source.startswith("estimated")
+        verdict = f"{off:+.1%}" if knows else f"unknown; assumed {off:+.0%}"
+        name = f"{scene}{', breathing' if deform else ''}, {kind}, {fov_deg:g} deg"
+        measuring.print_row(name, f"{true_share:.3f}", verdict, found.camera_source.split(";")[0])
 
 
 def main() -> None:
-    """Render, run, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=PHANTOMS, default=list(PHANTOMS))
-    parser.add_argument("--seeds", type=int, default=2)
+    """Print both tables."""
+    parser = measuring.options_of(__doc__, out=True)
+    parser.add_argument("--only", nargs="+", help="beginnings of phantoms' names; without the second table")
+    parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--preset", default="default")
-    parser.add_argument("--out", type=Path, help="keep phantoms and results here")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = options.out or Path(scratch)
-        print(HEADER, flush=True)
-        for name in options.only:
-            for seed in range(21, 21 + options.seeds):
-                phantom = folder / f"{name}-{seed}"
-                if not (phantom / "mesh_truth.ply").is_file():
-                    numbers = ("--frames", str(FRAMES), "--seed", str(seed))
-                    scopemap("phantom", str(phantom), *PHANTOMS[name], *numbers, "--quiet")
-                print(row(f"{name}, {seed}", phantom, folder / f"{name}-{seed}-run", options.preset), flush=True)
+    with measuring.folder_or_scratch(options.out) as folder:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [name for name in PHANTOMS if name.startswith(tuple(options.only or ("",)))]
+        print_phantoms(names, range(21, 21 + options.seeds), options.preset, folder)
+        if not options.only:
+            print()
+            print_lenses(folder)
 
 
 if __name__ == "__main__":

@@ -1,30 +1,23 @@
 """What a large archive takes on a cluster: by figures of one machine, and by a simulation of many (discrete events).
 
-    python -m scopemap_bench.scripts.cluster_simulation [--hours H] [--nodes N] [--seed S]      the tables of
-            docs/scale.md
-    python -m scopemap_bench.scripts.cluster_simulation --measure VIDEO                         the figures at the
-            top, anew
+    python -m scopemap_bench.scripts.cluster_simulation [--hours H] [--nodes N] [--seed S]
 
-Each worker takes the next video when it is free, as with the engines of `scopemap batch`, or the next of its own share
-of the list, as with `--part`. Nothing is known here of a network or a shared file system.
+prints the tables of docs/scale.md. Each worker takes the next video when it is free, as with the engines of
+`scopemap batch`, or the next of its share of the list, as with `--part`. No network and no shared file system is
+simulated.
 """
 
 from __future__ import annotations
 
-import argparse
 import heapq
-import resource
-import subprocess
-import sys
-import tempfile
-import time
 from collections import deque
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-# Of the colonoscopy video (247 frames of 384x384 px at 25 frames/s), default settings, two cores; by --measure.
+from scopemap_bench.scripts.measuring import options_of, print_head, print_row
+
+# Of the colonoscopy video (247 frames of 384x384 px at 25 frames/s), default settings, two cores.
 FRAME_S, FRAME_MB, RESULT_MB = 1 / 4.0, 0.161, 42.8
 VIDEO_MB_S, RATE_HZ = 0.184, 25.0
 WAITING_MB = 5 * 384 * 384 / 1e6  # a frame that waits for its fusion, docs/faq.md
@@ -166,44 +159,28 @@ def tables(hours: float, nodes: int, seed: int) -> None:
         "frames that wait on disk": f"{waiting_gb:.0f} GB beside each worker for a video of average length",
         "writing": f"{flow_mb:.1f} MB/s a worker; 1 GB/s carries {1000 / flow_mb:.0f} workers",
     }
-    print("| what | how much |\n|---|---|")
-    print("\n".join(f"| {what} | {how_much} |" for what, how_much in rows.items()))
-    print(f"\n| {nodes} nodes, {nodes * WORKERS} workers | hours | node hours | busy | work done twice, h | failed |")
-    print("|---|---|---|---|---|---|")
+    print_head("what", "how much")
+    for what, how_much in rows.items():
+        print_row(what, how_much)
+    print()
+    print_head(
+        f"{nodes} nodes, {nodes * WORKERS} workers", "hours", "node hours", "busy", "work done twice, h", "failed"
+    )
     for case in CASES:
         found = simulate(case, lengths_s, nodes, seed)
         h, node_h = found["hours"], found["hours"] * nodes
-        row = f"{h:.0f} | {node_h:,.0f} | {found['work'] / (node_h * WORKERS):.1%} | {found['twice']:.1f}"
-        print(f"| {case.name} | {row} | {found['failed']:.0f} |")
-
-
-def measure(video: Path) -> None:
-    """Run a video by default and print the figures at the top."""
-    with tempfile.TemporaryDirectory() as temporary:
-        out, begun = Path(temporary) / "out", time.monotonic()
-        run = [sys.executable, "-m", "scopemap", "run", str(video), "--out", str(out), "--quiet"]
-        subprocess.run(run, check=True)
-        seconds, peak = time.monotonic() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
-        sizes = {file: file.stat().st_size / 1e6 for file in out.rglob("*") if file.is_file()}
-        frames = len((out / "frames.csv").read_text().splitlines()) - 1
-    depth = sum(size for file, size in sizes.items() if file.parent.name.startswith("depth"))
-    print(f"{seconds:.1f} s for {frames} frames: {seconds / frames:.3f} s a frame")
-    print(f"{(peak.ru_utime + peak.ru_stime) / frames:.3f} s of processor time a frame, {peak.ru_maxrss / 1e6:.2f} GB")
-    print(f"depth {depth / frames:.3f} MB a frame, {sum(sizes.values()) - depth:.1f} MB beside it")
+        busy, twice, failed = found["work"] / (node_h * WORKERS), found["twice"], found["failed"]
+        print_row(case.name, f"{h:.0f}", f"{node_h:,.0f}", f"{busy:.1%}", f"{twice:.1f}", f"{failed:.0f}")
 
 
 def main() -> None:
     """Print tables, or measure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hours", type=float, default=10_000)
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--measure", type=Path)
     given = parser.parse_args()
-    if given.measure:
-        measure(given.measure)
-    else:
-        tables(given.hours, given.nodes, given.seed)
+    tables(given.hours, given.nodes, given.seed)
 
 
 if __name__ == "__main__":

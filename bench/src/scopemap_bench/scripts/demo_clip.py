@@ -7,7 +7,6 @@ writes colon.mp4, camera.yaml and pose.txt into the core package.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import tempfile
 from fractions import Fraction
@@ -19,6 +18,7 @@ import cv2
 import scopemap
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
+from scopemap_bench.scripts.measuring import options_of
 
 SPEC = PhantomSpec(scene="colon", frames=60, width=320, height=256, seed=0)
 _OPTIONS = {"crf": "18", "preset": "slow"}
@@ -44,7 +44,7 @@ def write_clip(out: Path, spec: PhantomSpec = SPEC) -> None:
 
 def main() -> None:
     """Write the clip."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--out", type=Path, default=Path(scopemap.__file__).parent / "demo_clip")
     write_clip(parser.parse_args().out)
 

@@ -1,4 +1,4 @@
-"""Real frames for measuring depth: four scenes with true depth, two clips without. Rectified pinholes of any size.
+"""Real frames for measuring depth: four scenes with true depth, seen by rectified pinholes of any size.
 
 "wide" is trans_t1_a seen at 0.6 times the focal length, where depth and distance along the ray differ most. What does
 not count is taken out of the truth: dark surround, depth clipped by the data set, instruments with a margin.
@@ -29,7 +29,6 @@ _CLIPPED_MM = 99.9
 _ENDONERF_FOCAL_PX = 569.468
 _INSTRUMENT_MARGIN_PX = 9
 _TRUTH_EVERY = 6
-_CLIP_FRAMES = 41
 
 
 def c3vd_frames(
@@ -65,11 +64,11 @@ def trans(data: Path, size: Size, zoom: float = 1.0) -> Iterator[tuple[Frame, np
         yield replace(frame, depth_mm=None), np.where(frame.valid, frame.depth_mm, np.nan)
 
 
-def endonerf(data: Path, size: Size, every: int = _TRUTH_EVERY) -> Iterator[tuple[Frame, np.ndarray]]:
+def endonerf(data: Path, size: Size) -> Iterator[tuple[Frame, np.ndarray]]:
     """Yield frames of EndoNeRF pulling with their stereo depth, instruments left out. The camera is at rest."""
     folder = data / "endoscopy" / "endonerf" / "pulling_soft_tissues"
     camera = PinholeCamera(_ENDONERF_FOCAL_PX, _ENDONERF_FOCAL_PX, 319.5, 255.5, 640, 512).resized(*size)
-    for file in sorted((folder / "images").iterdir())[::every]:
+    for file in sorted((folder / "images").iterdir())[::_TRUTH_EVERY]:
         number = file.name.split(".")[0]
         rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
         # Some depth files have 16 bit, most 8: all are mm.
@@ -82,18 +81,6 @@ def endonerf(data: Path, size: Size, every: int = _TRUTH_EVERY) -> Iterator[tupl
         yield frame, np.where(frame.valid, cv2.resize(truth_mm, size, interpolation=cv2.INTER_NEAREST), np.nan)
 
 
-def cecum_clip(data: Path, size: Size) -> Iterator[tuple[Frame, np.ndarray]]:
-    """Yield frames 0..40 of cecum_t1_a and, (H, W) bool, the pixels that count: all that show tissue."""
-    for _, frame in c3vd_frames(data / "endoscopy" / "c3vd" / "cecum_t1_a", size, count=_CLIP_FRAMES):
-        yield frame, frame.valid
-
-
-def endonerf_clip(data: Path, size: Size) -> Iterator[tuple[Frame, np.ndarray]]:
-    """Yield all frames of EndoNeRF pulling and, (H, W) bool, the pixels that count: those with stereo depth."""
-    for frame, truth_mm in endonerf(data, size, every=1):
-        yield frame, np.isfinite(truth_mm)
-
-
 SCENES: dict[str, Callable[[Path, Size], Iterator[tuple[Frame, np.ndarray]]]] = {
     "cecum clouds": cecum,
     "trans_t1_a": trans,
@@ -101,12 +88,6 @@ SCENES: dict[str, Callable[[Path, Size], Iterator[tuple[Frame, np.ndarray]]]] = 
     "endonerf pulling": endonerf,
 }
 """By name: (frame, true depth (H, W) mm, NaN = unknown or not to be counted)."""
-
-CLIPS: dict[str, Callable[[Path, Size], Iterator[tuple[Frame, np.ndarray]]]] = {
-    "cecum_t1_a 0..40": cecum_clip,
-    "endonerf pulling": endonerf_clip,
-}
-"""By name: (frame, pixels that count) of consecutive frames."""
 
 
 def drawn(points_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:

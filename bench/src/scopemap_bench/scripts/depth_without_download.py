@@ -1,69 +1,133 @@
-"""How good is depth without any download? Errors of constant depth, shading and the embedded network on real frames.
+"""How good is depth without any download? Constant depth, shading and the embedded network on real frames; instruments.
 
-    python -m scopemap_bench.scripts.depth_without_download --data ../shared/data [--model FILE] [--json FILE]
-            [--pictures FOLDER]
+    python -m scopemap_bench.scripts.depth_without_download --data FOLDER [--model FILE ...] [--size WxH ...]
 
-The scenes are described in `depth_scenes.py`, the figures in `depth_measures.py`. Several --model (weights of the
-network trained with different seeds) share a row: mean (least..most). Without any, the weights in the package are
-measured. The few constants of shading were chosen on these very frames; the network never saw them.
+The scenes are described in `depth_scenes.py`. Of several --model (weights of the network) each has a row. The few
+constants of shading were chosen on these very frames; the network never saw them. Sigma is judged after median scaling,
+by errors that are Laplace distributed in log depth: 0.76 and 0.94 of the pixels are within 1 and 2 sigma where it is
+right. Last table: pixels masked as instruments, and IoU with `gt_masks`.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import re
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.stats import spearmanr
 
-from scopemap.config import DepthSettings
+from scopemap.config import DepthSettings, MaskSettings
+from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
-
-# Siblings are found where this file runs as a script; here, too, where it is loaded by its path.
-from scopemap_bench.scripts.depth_measures import (
-    LAPLACE_WITHIN,
-    Prediction,
-    SequenceScore,
-    Steadiness,
-    link_clip,
-    score_sequence,
-    steadiness,
-)
-from scopemap_bench.scripts.depth_pictures import draw_scene, draw_sparsification
-from scopemap_bench.scripts.depth_scenes import CLIPS, SCENES, Size
+from scopemap.io.opening import open_sequence
+from scopemap.masking.mask_files import MaskFiles
+from scopemap.masking.masker import Masker
+from scopemap_bench.evaluation.depth import evaluate_depth, evaluate_depth_sequence, scale_jitter
+from scopemap_bench.scripts.depth_scenes import SCENES, Size
+from scopemap_bench.scripts.measuring import options_of, print_head, print_row
 
 SIZES: tuple[Size, ...] = ((160, 128), (320, 256))
-NETWORK = "scopenet"
+Predicted = tuple[np.ndarray, np.ndarray | None]
+"""Depth and, if known, its standard deviation, (H, W) mm each, NaN = unknown."""
+Estimator = Callable[[Frame], Predicted]
+_SATURATED_LEVEL = 250
 
-Estimator: TypeAlias = Callable[[Frame], Prediction]
-Table: TypeAlias = dict[str, dict[str, SequenceScore]]
-Column: TypeAlias = tuple[str, Callable[[SequenceScore], float], str]
+
+@dataclass(frozen=True)
+class SceneScore:
+    """Figures of a scene, means over its frames; NaN where there is nothing to measure.
+
+    Attributes
+    ----------
+    abs_rel, delta : after median scaling, mean |d - g| / g and share of pixels within a factor of 1.25.
+    metric_abs_rel : of the millimetres as predicted. one_scale_abs_rel : with one scale for all frames.
+    scale_log_std : standard deviation over the frames of ln median(g) / median(d).
+    saturated_ratio : abs_rel where a channel is 250 or more, over abs_rel elsewhere.
+    rank : Spearman's correlation of the relative error with sigma / d.
+    within_1_sigma, within_2_sigma : share of pixels with |ln d / g| below 1, 2 times sigma / d.
+    """
+
+    abs_rel: float
+    delta: float
+    metric_abs_rel: float
+    one_scale_abs_rel: float
+    scale_log_std: float
+    saturated_ratio: float
+    rank: float
+    within_1_sigma: float
+    within_2_sigma: float
+
+
+def score_scene(frames: Sequence[Frame], truths_mm: Sequence[np.ndarray], made: Sequence[Predicted]) -> SceneScore:
+    """Return the figures of predictions against true depth (H, W) mm, NaN where it is unknown or does not count."""
+    pairs = [(depth_mm, truth_mm) for (depth_mm, _), truth_mm in zip(made, truths_mm, strict=True)]
+    scaled = [evaluate_depth(*pair, scaling="median") for pair in pairs]
+    one_scale = evaluate_depth_sequence(lambda: pairs, scaling="sequence-median").mean
+    places = [
+        _where(frame.rgb, truth_mm, prediction, report["scale"])
+        for frame, truth_mm, prediction, report in zip(frames, truths_mm, made, scaled, strict=True)
+    ]
+    return SceneScore(
+        _mean([report["abs_rel"] for report in scaled]),
+        _mean([report["delta_1"] for report in scaled]),
+        _mean([evaluate_depth(*pair)["abs_rel"] for pair in pairs]),
+        one_scale.get("abs_rel", math.nan),
+        scale_jitter(np.array([report["scale"] for report in scaled]))["log_std"],
+        *map(_mean, zip(*places, strict=True)),
+    )
+
+
+def _where(rgb: np.ndarray, truth_mm: np.ndarray, prediction: Predicted, scale: float) -> tuple[float, ...]:
+    """Return the saturated ratio of a frame, and rank and shares of sigma."""
+    depth_mm, sigma_mm = prediction
+    known = np.isfinite(truth_mm) & (depth_mm > 0)
+    ratio = scale * depth_mm[known].astype(np.float64) / truth_mm[known]
+    error, bright = np.abs(ratio - 1), rgb[known].max(-1) >= _SATURATED_LEVEL
+    saturated = _mean(error[bright]) / _mean(error[~bright]) if bright.any() and error[~bright].any() else math.nan
+    if sigma_mm is None or len(error) < 2:
+        return saturated, math.nan, math.nan, math.nan
+    relative = (sigma_mm / depth_mm)[known].astype(np.float64)
+    varied = min(np.ptp(error), np.ptp(relative)) > 0
+    rank = float(spearmanr(error, relative).statistic) if varied else math.nan
+    return saturated, rank, *(_mean(np.abs(np.log(ratio)) < sigmas * relative) for sigmas in (1, 2))
+
+
+def _mean(values: np.ndarray | Sequence[float]) -> float:
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def constant() -> Estimator:
     """Return depth that is the shading's prior everywhere."""
-    depth_mm = DepthSettings().shading_median_mm
-    return lambda frame: Prediction(np.full(frame.valid.shape, depth_mm, np.float32))
+    return lambda frame: (np.full(frame.valid.shape, DepthSettings().shading_median_mm, np.float32), None)
 
 
 def shading() -> Estimator:
     """Return depth by shading, its scale held from a sequence's first frame on."""
     estimator = ShadingDepth(DepthSettings())
-    return lambda frame: Prediction(estimator.estimate(frame).values)
+    return lambda frame: (estimator.estimate(frame).values, None)
 
 
 def shading_as_depth() -> Estimator:
     """Return what shading takes for distance along the ray, as if it were depth."""
     estimate = shading()
-    return lambda frame: Prediction(estimate(frame).depth_mm * np.linalg.norm(frame.camera.rays, axis=-1))
+    return lambda frame: (estimate(frame)[0] * np.linalg.norm(frame.camera.rays, axis=-1), None)
+
+
+def network(model: str) -> Estimator:
+    """Return the embedded network, with the package's weights where `model` is empty."""
+    estimator = ScopeNetDepth(model)
+
+    def estimate(frame: Frame) -> Predicted:
+        found = estimator.estimate(frame)
+        return found.values, found.sigma
+
+    return estimate
 
 
 WITHOUT_WEIGHTS: dict[str, Callable[[], Estimator]] = {
@@ -71,169 +135,58 @@ WITHOUT_WEIGHTS: dict[str, Callable[[], Estimator]] = {
     "shading as depth": shading_as_depth,
     "shading x ray z": shading,
 }
-"""By name: makes the estimator anew for each sequence, as some remember its first frame."""
+"""By name: makes the estimator anew for each scene, as some remember its first frame."""
 
 
 def networks(models: Sequence[str]) -> dict[str, Callable[[], Estimator]]:
-    """Return the embedded network with each of these weights files, by default with the package's own."""
-    from scopemap.depth.scopenet.estimator import ScopeNetDepth
-
-    def make(model: str) -> Estimator:
-        network = ScopeNetDepth(model)
-
-        def estimate(frame: Frame) -> Prediction:
-            found = network.estimate(frame)
-            return Prediction(found.values, found.sigma)
-
-        return estimate
-
-    names = {model: f"{NETWORK} {Path(model).parent.name}/{Path(model).name}" for model in models} or {"": NETWORK}
-    return {name: partial(make, model) for model, name in names.items()}
+    """Return the embedded network with each of these weights files, by default with the package's."""
+    names = {model: f"scopenet {Path(model).parent.name}/{Path(model).name}" for model in models} or {"": "scopenet"}
+    return {name: partial(network, model) for model, name in names.items()}
 
 
 def measure(
-    data: Path,
-    size: Size = SIZES[0],
-    makers: Mapping[str, Callable[[], Estimator]] = WITHOUT_WEIGHTS,
-    pictures: Path | None = None,
-) -> Table:
-    """Return the score by scene and estimator; with `pictures`, a PNG of each goes there."""
-    table: Table = {}
+    data: Path, size: Size = SIZES[0], makers: Mapping[str, Callable[[], Estimator]] = WITHOUT_WEIGHTS
+) -> dict[str, dict[str, SceneScore]]:
+    """Return the score by scene and estimator."""
+    table: dict[str, dict[str, SceneScore]] = {}
     for scene, pairs in SCENES.items():
         frames, truths_mm = zip(*pairs(data, size), strict=True)
-        table[scene] = {}
-        for name, maker in makers.items():
-            made = [*map(maker(), frames)]
-            table[scene][name] = score_sequence(frames, truths_mm, made)
-            if pictures is not None:
-                file = f"{scene} {size[0]}x{size[1]} {name}"
-                draw_scene(frames, truths_mm, made, pictures / (re.sub(r"[^\w.]+", "_", file) + ".png"))
-    if pictures is not None:
-        draw_sparsification(table, pictures / f"sparsification_{size[0]}x{size[1]}.png")
+        table[scene] = {name: score_scene(frames, truths_mm, [*map(made(), frames)]) for name, made in makers.items()}
     return table
 
 
-def measure_clips(
-    data: Path, size: Size, makers: Mapping[str, Callable[[], Estimator]]
-) -> dict[str, dict[str, Steadiness]]:
-    """Return how steady depth is on consecutive frames, by clip and estimator."""
-    table: dict[str, dict[str, Steadiness]] = {}
-    for clip, items in CLIPS.items():
-        frames, counted = zip(*items(data, size), strict=True)
-        links = link_clip(frames)
-        table[clip] = {
-            name: steadiness(frames[0].camera, counted, [made.depth_mm for made in map(maker(), frames)], links)
-            for name, maker in makers.items()
-        }
-    return table
-
-
-def spread(values: Iterable[float], form: str) -> str:
-    """Return one value as text, or several as mean (least..most); "-" where nothing was measured."""
-    known = np.array([value for value in values if math.isfinite(value)])
-    if not len(known):
-        return "-"
-    if len(known) == 1:
-        return format(known[0], form)
-    return f"{known.mean():{form}} ({known.min():{form}}..{known.max():{form}})"
-
-
-def rows(scores: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the scores by row of a table: the network's weights share one."""
-    shared: dict[str, list[Any]] = {}
-    for name, score in scores.items():
-        shared.setdefault(NETWORK if name.startswith(NETWORK) else name, []).append(score)
-    return shared
-
-
-def aligned(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Return a table as text: the first column to the left, the others to the right."""
-    widths = [max(len(line[i]) for line in [head, *body]) + (2 if i else 1) for i in range(len(head))]
-    lines = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in [head, *body]]
-    return "\n".join("".join(line).rstrip() for line in lines)
-
-
-def summary(table: Table) -> str:
-    """Return median-scaled AbsRel / delta of all scenes as one table."""
-    body = [
-        [
-            name,
-            *(
-                f"{spread([s.abs_rel for s in group], '.3f')} / {spread([s.delta for s in group], '.2f')}"
-                for group in (rows(scores)[name] for scores in table.values())
-            ),
-        ]
-        for name in rows(next(iter(table.values())))
-    ]
-    return aligned(["AbsRel / delta<1.25", *(scene.rjust(16) for scene in table)], body)
-
-
-SCALE_COLUMNS: tuple[Column, ...] = (
-    ("metric AbsRel", lambda s: s.mean.metric_abs_rel, ".3f"),
-    ("true/predicted", lambda s: s.mean.scale, ".2f"),
-    ("std ln scale", lambda s: s.scale_log_std, ".3f"),
-    ("one scale", lambda s: s.one_scale.abs_rel, ".3f"),
-    ("+ exponent", lambda s: s.scale_and_exponent.abs_rel, ".3f"),
-    ("delta", lambda s: s.scale_and_exponent.delta, ".2f"),
-    ("exponent", lambda s: s.scale_and_exponent.exponent, ".2f"),
-    ("exponent, medians", lambda s: s.exponent_and_medians.abs_rel, ".3f"),
-)
-PLACE_COLUMNS: tuple[Column, ...] = (
-    ("saturated share", lambda s: s.mean.saturated_share, ".3f"),
-    ("AbsRel there", lambda s: s.mean.saturated_abs_rel, ".3f"),
-    ("elsewhere", lambda s: s.mean.unsaturated_abs_rel, ".3f"),
-    ("edge share", lambda s: s.mean.edge_share, ".3f"),
-    ("AbsRel there", lambda s: s.mean.edge_abs_rel, ".3f"),
-    ("elsewhere", lambda s: s.mean.smooth_abs_rel, ".3f"),
-)
-UNCERTAINTY_COLUMNS: tuple[Column, ...] = (
-    ("rank", lambda s: s.mean.rank, ".2f"),
-    ("AUSE", lambda s: s.mean.ause, ".3f"),
-    ("AUSE / random's", lambda s: s.mean.ause_share, ".2f"),
-    (f"1 sigma (ideal {LAPLACE_WITHIN[0]:.2f})", lambda s: s.mean.within_1_sigma, ".2f"),
-    (f"2 sigma (ideal {LAPLACE_WITHIN[1]:.2f})", lambda s: s.mean.within_2_sigma, ".2f"),
-    ("error / b", lambda s: s.mean.error_over_b, ".2f"),
-)
-
-
-def scene_table(
-    title: str, scores: Mapping[str, Any], columns: Sequence[tuple[str, Callable[[Any], float], str]]
-) -> str:
-    """Return the figures of one scene as a table, a row per estimator."""
-    body = [
-        [name, *(spread(map(value, group), form) for _, value, form in columns)] for name, group in rows(scores).items()
-    ]
-    return aligned([title, *(column[0] for column in columns)], body)
-
-
-STEADY_COLUMNS: tuple[tuple[str, Callable[[Steadiness], float], str], ...] = (
-    ("std ln step", lambda s: s.log_step_std, ".4f"),
-    ("change", lambda s: s.change, ".4f"),
-    ("below 1 %", lambda s: s.rtc, ".3f"),
-    ("same colour", lambda s: s.opw_change, ".4f"),
-)
-
-
-def report(table: Table, clips: Mapping[str, Mapping[str, Steadiness]]) -> str:
-    """Return all tables of one size as text."""
-    parts = [summary(table)]
+def print_scores(size: Size, table: Mapping[str, Mapping[str, SceneScore]]) -> None:
+    """Print the scores of one size."""
+    heads = ("scene", f"depth, {size[0]}x{size[1]} px", "AbsRel / delta<1.25", "as predicted", "one scale")
+    print_head(*heads, "std ln scale", "saturated / elsewhere", "rank of sigma", "within 1 / 2 sigma")
     for scene, scores in table.items():
-        parts.append(scene_table(scene, scores, SCALE_COLUMNS))
-        parts.append(scene_table(f"{scene}, where", scores, PLACE_COLUMNS))
-        told = {name: score for name, score in scores.items() if score.sparsification}
-        if told:
-            parts.append(scene_table(f"{scene}, uncertainty", told, UNCERTAINTY_COLUMNS))
-    parts += [scene_table(f"{clip}, frame to frame", scores, STEADY_COLUMNS) for clip, scores in clips.items()]
-    return "\n\n".join(parts)
+        for name, s in scores.items():
+            sigma = [f"{s.rank:.2f}", f"{s.within_1_sigma:.2f} / {s.within_2_sigma:.2f}"]
+            cells = [f"{s.abs_rel:.3f} / {s.delta:.2f}", f"{s.metric_abs_rel:.3f}", f"{s.one_scale_abs_rel:.3f}"]
+            cells += [f"{s.scale_log_std:.3f}", f"{s.saturated_ratio:.1f}" if math.isfinite(s.saturated_ratio) else ""]
+            print_row(scene, name, *cells, *(sigma if math.isfinite(s.rank) else ["", ""]))
 
 
-def strict(value: Any) -> Any:
-    """Return nested dictionaries and sequences of figures with None for NaN, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: strict(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [strict(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def print_instruments(data: Path, model: str) -> None:
+    """Print how much of each clip is masked as instruments, as a run masks it, and IoU with true masks."""
+    endoscopy = data / "endoscopy"
+    pulling = endoscopy / "endonerf" / "pulling_soft_tissues"
+    print_head("instruments", "frames", "masked", "most of a frame", "IoU with `gt_masks`")
+    for source in (pulling, endoscopy / "video" / "laparoscopy_rvim.mp4", endoscopy / "c3vd" / "cecum_t1_a"):
+        # Each fourth frame of clips without truth.
+        sequence = open_sequence(source, frames=slice(None, None, None if source == pulling else 4))
+        masker = Masker(MaskSettings(instruments="auto"))
+        estimator = ScopeNetDepth(model, rays_known=sequence.calibrated)
+        files = MaskFiles(pulling / "gt_masks", sequence.rectifier) if source == pulling else None
+        shares, both, either = [], 0, 0
+        for frame in sequence.frames():
+            mask = masker.instruments(estimator.estimate(masker(frame)).instruments)
+            true = None if files is None else files.covered(frame.index)
+            shares.append(float(mask.mean()) if mask is not None else 0.0)
+            if mask is not None and true is not None:
+                both, either = both + np.count_nonzero(mask & true), either + np.count_nonzero(mask | true)
+        iou = f"{both / either:.3f}" if either else ""
+        print_row(source.stem, len(shares), f"{np.mean(shares):.1%}", f"{max(shares):.1%}", iou)
 
 
 def _size(text: str) -> Size:
@@ -241,32 +194,17 @@ def _size(text: str) -> Size:
     return width, height
 
 
-def main() -> int:
+def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
+    parser = options_of(__doc__, data=True)
     parser.add_argument("--model", action="append", default=[], help="weights of the network (file); repeatable")
-    parser.add_argument("--no-network", action="store_true", help="measure constant depth and shading only")
     parser.add_argument("--size", type=_size, nargs="+", default=SIZES, metavar="WxH", help="sizes of the frames, px")
-    parser.add_argument("--json", type=Path, help="write every figure to this file")
-    parser.add_argument("--pictures", type=Path, help="draw depth, errors and sparsification into this folder")
     options = parser.parse_args()
-    makers = WITHOUT_WEIGHTS | ({} if options.no_network else networks(options.model))
-    if options.pictures:
-        options.pictures.mkdir(parents=True, exist_ok=True)
-    kept: dict[str, Any] = {}
     for size in options.size:
-        table = measure(options.data, size, makers, options.pictures)
-        clips = measure_clips(options.data, size, makers)
-        print(f"{size[0]}x{size[1]} px\n\n{report(table, clips)}\n", flush=True)
-        kept[f"{size[0]}x{size[1]}"] = {
-            part: {key: {name: asdict(score) for name, score in scores.items()} for key, scores in found.items()}
-            for part, found in (("scenes", table), ("clips", clips))
-        }
-    if options.json:
-        options.json.write_text(json.dumps(strict(kept), indent=1, allow_nan=False) + "\n")
-    return 0
+        print_scores(size, measure(options.data, size, WITHOUT_WEIGHTS | networks(options.model)))
+        print()
+    print_instruments(options.data, (options.model or [""])[0])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

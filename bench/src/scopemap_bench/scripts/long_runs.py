@@ -1,92 +1,167 @@
-"""Time and memory of long runs: a phantom's frames there and back until they are long enough.
+"""Time and memory of long runs, and of a live session that is played to at the clip's own speed.
 
-    python -m scopemap_bench.scripts.long_runs [--frames 300 6000 20000] [--size 320x256] [--preset default]
+    python -m scopemap_bench.scripts.long_runs [--frames 300 1200] [--size 320x256] [--preset default]
+            [--live CLIP [--minutes 1] [--fps 15] [--camera FILE]]
 
-Each is one run of the command line. Printed are its seconds, its processor time per frame, its peak memory, its memory
-at each tenth of the time (the last ones are the adjustment, the fusion and the writing), its open files, and the error
-of its path after a Sim(3) alignment.
+First table: a phantom's frames there and back until they are long enough, one run of the command line each: memory at
+each tenth of the time (the last ones are the adjustment, the fusion and the writing), ATE after a Sim(3) alignment.
+Second table: a clip, there and back, played as `scopemap live` plays it to a session in this process.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from contextlib import suppress
+from itertools import islice
+from multiprocessing import Process
 from pathlib import Path
+
+import av
+import numpy as np
+from scopemap.io.live import LiveSource
+
+from scopemap.config import Config
+from scopemap.io.opening import open_sequence, sequence_of
+from scopemap.odometry import Step
+from scopemap.runner.live import LiveSession, finished
+from scopemap.runner.reconstructor import Reconstructor
+from scopemap_bench.scripts import measuring
 
 PERIOD = 300  # frames of the phantom
 EVERY_S = 1.0
+PARTS = 5  # of a live session
+MOST_READ = 250  # frames of the clip
 
 
-def write_input(folder: Path, phantom: Path, count: int) -> None:
+def write_input(folder: Path, source: Path, count: int) -> None:
     """Link a phantom's pictures there and back under increasing numbers, with its camera; write its poses likewise."""
-    pictures, poses = sorted(phantom.glob("*_color.png")), (phantom / "pose.txt").read_text().splitlines()
-    loop = [*range(len(pictures)), *range(len(pictures) - 2, 0, -1)]
+    pictures, poses = sorted(source.glob("*_color.png")), (source / "pose.txt").read_text().splitlines()
+    order = measuring.there_and_back(count, len(pictures))
     folder.mkdir()
-    for number in range(count):
-        (folder / f"{number:06d}_color.png").symlink_to(pictures[loop[number % len(loop)]])
-    (folder / "pose.txt").write_text("".join(f"{poses[loop[k % len(loop)]]}\n" for k in range(count)))
-    for camera in phantom.glob("*.yaml"):
+    for number, index in enumerate(order):
+        (folder / f"{number:06d}_color.png").symlink_to(pictures[index])
+    (folder / "pose.txt").write_text("".join(f"{poses[index]}\n" for index in order))
+    for camera in source.glob("*.yaml"):
         (folder / camera.name).symlink_to(camera)
 
 
-def memory_mb(process: int) -> float:
-    """Return the resident memory of a process, MB; raises `OSError` where it has ended."""
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def measure(source: Path, out: Path, arguments: list[str]) -> tuple[float, float, float, list[tuple[float, int]]]:
-    """Return seconds, processor seconds, peak memory in MB, and (memory in MB, open files) every few seconds."""
-    started = time.perf_counter()
-    command = [sys.executable, "-m", "scopemap", "run", str(source), "--out", str(out), "--quiet", *arguments]
-    process, seen = subprocess.Popen(command), []
+def print_run(source: Path, out: Path, count: int, preset: str) -> None:
+    """Run a source in a process that is watched, and print its row."""
+    started, seen = time.perf_counter(), []
+    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet", "--preset", preset))
     while True:
         ended, status, used = os.wait4(process.pid, os.WNOHANG)
         if ended:
             break
         with suppress(OSError):  # it has just ended
-            seen.append((memory_mb(process.pid), len(list(Path(f"/proc/{process.pid}/fd").iterdir()))))
+            seen.append((measuring.memory_mb(process.pid), len(list(Path(f"/proc/{process.pid}/fd").iterdir()))))
         time.sleep(EVERY_S)
     if status:
         raise SystemExit(f"the run of {source} failed")
-    return time.perf_counter() - started, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6, seen
+    tenths = [f"{seen[len(seen) * k // 10][0]:.0f}" for k in range(1, 10)]
+    per_frame_ms = 1e3 * (used.ru_utime + used.ru_stime) / count
+    ate_mm = measuring.evaluated(out, "--truth", source, "--align", "sim3")["ate_rmse_mm"]
+    cells = [count, f"{time.perf_counter() - started:.0f}", f"{per_frame_ms:.0f}"]
+    cells += [f"{used.ru_maxrss * 1024 / 1e6:.0f}", " ".join(tenths), max(files for _, files in seen)]
+    measuring.print_row(*cells, f"{ate_mm:.2f}")
 
 
-def error_mm(source: Path, out: Path) -> float:
-    """Return the ATE RMSE after a Sim(3) alignment, mm."""
-    command = [sys.executable, "-m", "scopemap", "evaluate", str(out), "--truth", str(source)]
-    printed = subprocess.run([*command, "--align", "sim3", "--json"], capture_output=True, text=True).stdout
-    return float(json.loads(printed)["ate_rmse_mm"])
+def write_loop(clip: Path, file: Path, fps: int, count: int) -> None:
+    """Write `count` frames of a clip, there and back, at a rate, as H.264."""
+    frames = [item.rgb for item in islice(open_sequence(clip).source.frames(slice(None)), MOST_READ)]
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "16", "preset": "veryfast"})
+        stream.height, stream.width = frames[0].shape[0] // 2 * 2, frames[0].shape[1] // 2 * 2
+        stream.pix_fmt = "yuv420p"
+        for index in measuring.there_and_back(count, len(frames)):
+            picture = np.ascontiguousarray(frames[index][: stream.height, : stream.width])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+
+
+class LiveTable:
+    """Prints a row for each part of a session when its last frame has come."""
+
+    def __init__(self, source: LiveSource, seconds: float) -> None:
+        self._source, self._seconds, self._part = source, seconds, 0
+        self._begin()
+        heads = ("part", "frames", "dropped", "tracked", "latency ms, median / 95 %")
+        measuring.print_head(*heads, "CPU ms a frame", "memory MB")
+
+    def observe(self, step: Step, reconstructor: Reconstructor) -> None:
+        """Count a step."""
+        part = min(int(PARTS * step.frame.time_s / self._seconds), PARTS - 1)
+        if part > self._part:
+            self.end()
+            self._part = part
+        self._latencies_ms.append(1000 * (self._source.now_s() - step.frame.time_s))
+        self._tracked += step.track.status != "lost"
+
+    def end(self) -> None:
+        """Print the row."""
+        count = len(self._latencies_ms)
+        latency = " / ".join(f"{value:.0f}" for value in np.percentile(self._latencies_ms, [50, 95]))
+        used = (f"{1000 * (time.process_time() - self._cpu_s) / count:.0f}", f"{measuring.memory_mb():.0f}")
+        counts = (count, self._source.dropped - self._dropped, self._tracked)
+        measuring.print_row(f"{self._part + 1} of {PARTS}", *counts, latency, *used)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._latencies_ms: list[float] = []
+        self._tracked, self._dropped, self._cpu_s = 0, self._source.dropped, time.process_time()
+
+
+def print_live(file: Path, camera: Path | None, seconds: float) -> None:
+    """Play a file to a session; print the table and what became of it."""
+    config = Config.load("realtime", settings={"input.focal": "assume"})
+    source = LiveSource(str(file))
+    table = LiveTable(source, seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        sequence = sequence_of(source, camera=camera, settings=config.input)
+        session = LiveSession(source, sequence, config, observers=(table.observe,), snapshots=Path(folder))
+        reconstructor = session.run()
+        table.end()
+        result = finished(reconstructor, source)
+    load = f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    print(f"\n{source.read} frames, {source.dropped} dropped, {result.provenance['tracked']} tracked; load {load}")
+
+
+def measure_live(given: argparse.Namespace, folder: Path) -> None:
+    """Write the clip's loop and play it."""
+    file, seconds = folder / "loop.mp4", 60 * given.minutes
+    writing = Process(target=write_loop, args=(given.live, file, given.fps, round(seconds * given.fps)))
+    writing.start()  # its memory is not that of the session
+    writing.join()
+    print(f"\n{given.live.name} at {given.fps} frames/s for {given.minutes:g} minutes\n")
+    print_live(file, given.camera, seconds)
 
 
 def main() -> None:
     """Render, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, nargs="+", default=[300, 6000, 20000], help="in increasing order")
+    parser = measuring.options_of(__doc__)
+    parser.add_argument("--frames", type=int, nargs="*", default=[300, 1200])
     parser.add_argument("--size", default="320x256")
     parser.add_argument("--preset", default="default")
-    options = parser.parse_args()
-    print("| frames | seconds | processor time a frame, ms | peak MB | MB each tenth | open files | ATE mm |")
-    print("|---|---|---|---|---|---|---|")
+    parser.add_argument("--live", type=Path, metavar="CLIP")
+    parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--fps", type=int, default=15)
+    parser.add_argument("--camera", type=Path)
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        phantom = Path(scratch) / "phantom"
-        render = ["phantom", str(phantom), "--frames", str(PERIOD), "--size", options.size, "--quiet"]
-        subprocess.run([sys.executable, "-m", "scopemap", *render], check=True)
-        for count in sorted(options.frames):
-            source, out = Path(scratch) / f"input{count}", Path(scratch) / f"out{count}"
-            write_input(source, phantom, count)
-            seconds, cpu_s, peak_mb, seen = measure(source, out, ["--preset", options.preset])
-            tenths = [f"{seen[len(seen) * k // 10][0]:.0f}" for k in range(1, 10)] if len(seen) >= 10 else []
-            files = f"{max(n for _, n in seen)} at most"
-            per_frame = 1e3 * cpu_s / count
-            cells = [str(count), f"{seconds:.0f}", f"{per_frame:.0f}", f"{peak_mb:.0f}", " ".join(tenths), files]
-            cells.append(f"{error_mm(source, out):.2f}")
-            print(f"| {' | '.join(cells)} |", flush=True)
+        folder = Path(scratch)
+        if given.frames:
+            drawn = measuring.phantom(folder / "phantom", "--frames", PERIOD, "--size", given.size)
+            heads = ("frames", "seconds", "processor time a frame, ms", "peak MB", "MB each tenth")
+            measuring.print_head(*heads, "open files at most", "ATE mm")
+        for count in sorted(given.frames):
+            write_input(folder / f"input-{count}", drawn, count)
+            print_run(folder / f"input-{count}", folder / f"out-{count}", count, given.preset)
+        if given.live:
+            measure_live(given, folder)
 
 
 if __name__ == "__main__":

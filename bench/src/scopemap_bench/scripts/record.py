@@ -1,9 +1,8 @@
-"""Keeps a table with the command, commit and date that made it, and tells which tables are older than the code.
+"""The eight tables of bench/results/: made at one commit, and checked for being older than the code.
 
-    python -m scopemap_bench.scripts.record [--note TEXT] NAME -- COMMAND ...     run COMMAND, write
-            bench/results/NAME.md
-    python -m scopemap_bench.scripts.record --check                               name the tables that the code has
-            outdated
+    python -m scopemap_bench.scripts.record --all --data FOLDER       make all; the commit must be whole
+    python -m scopemap_bench.scripts.record NAME ... --data FOLDER    make some
+    python -m scopemap_bench.scripts.record --check                   name the tables that the code has outdated
 
 A table is outdated where `src/` or `bench/src/` has changed since its commit. `.ci/release` asks; tests do not.
 """
@@ -15,13 +14,37 @@ import re
 import shlex
 import subprocess
 import sys
+import tempfile
+import time
 from datetime import UTC, datetime
 from pathlib import Path
+
+from scopemap_bench.scripts.measuring import options_of
 
 ROOT = Path(__file__).resolve().parents[4]
 RESULTS = ROOT / "bench" / "results"
 MEASURED = ("src", "bench/src")
 """What a table depends on."""
+
+SCRIPT = "python -m scopemap_bench.scripts"
+PLAN = "env SCOPEMAP_WEIGHTS_DIR=DATA/weights python -m scopemap bench"
+TABLES: dict[str, tuple[str, str]] = {
+    "overview": (f"{SCRIPT}.overview --data DATA --out OUT --picture docs/pictures/speed.png", ""),
+    "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
+    "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),
+    "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),
+    "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
+    "ablations": (
+        f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations",
+        "ablations/tables/overview.md",
+    ),
+    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --inputs 600 --videos 6", ""),
+    "long-runs": (
+        f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5",
+        "",
+    ),
+}
+"""By name: the command, whose DATA and OUT are folders, and the file below OUT that holds the table; "": printed."""
 
 
 def git(*arguments: str) -> str:
@@ -29,55 +52,68 @@ def git(*arguments: str) -> str:
     return subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def record(name: str, note: str, command: list[str]) -> Path:
-    """Run a command and keep what it prints; raises `SystemExit` where it fails or the code is not committed."""
-    if git("status", "--porcelain", "--", *MEASURED):
-        sys.exit("record: the sources differ from the last commit; commit first: the table names what ran by it")
-    commit, date = git("rev-parse", "--short", "HEAD"), datetime.now(UTC).date().isoformat()
-    run = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    printed = ""
-    for line in run.stdout or []:
-        print(line, end="", flush=True)
-        printed += line
-    if run.wait() != 0:
-        sys.exit(f"record: {shlex.join(command)} failed with exit code {run.returncode}")
+def record(name: str, data: Path, out: Path, commit: str) -> None:
+    """Make a table and write it to bench/results/; raises `SystemExit` where its command fails."""
+    command, file = TABLES[name]
+    words = [word.replace("DATA", str(data)).replace("OUT", str(out)) for word in shlex.split(command)]
+    words = [sys.executable if word == "python" else word for word in words]
+    started = time.monotonic()
+    run = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    if run.returncode != 0:
+        sys.exit(f"record: {command} failed with exit code {run.returncode}\n{run.stdout}")
+    table = (out / file).read_text(encoding="utf-8") if file else run.stdout
+    table = re.sub(r"\A# .*\n+", "", table).strip()
+    date = datetime.now(UTC).date().isoformat()
+    text = f"# {name}\n\nCommit {commit}, {date}, by\n\n    {command}\n\n{table}\n"
     RESULTS.mkdir(exist_ok=True)
-    file = RESULTS / f"{name}.md"
-    head = f"# {name}\n\nCommit {commit}, {date}, by\n\n    {shlex.join(command)}\n\n"
-    file.write_text(head + (f"{note}\n\n" if note else "") + printed.strip() + "\n", encoding="utf-8")
-    return file
+    (RESULTS / f"{name}.md").write_text(text, encoding="utf-8")
+    print(f"{name}: {time.monotonic() - started:.0f} s", flush=True)
 
 
 def outdated() -> list[str]:
-    """Return one line for each table whose commit is not known or older than the last change of src/."""
+    """Return one line for each table that is missing, or whose commit is unknown or older than the last change."""
     found = []
-    for file in sorted(RESULTS.glob("*.md")):
-        commit = re.search(r"^Commit (\w+)", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for name in TABLES:
+        file = RESULTS / f"{name}.md"
+        text = file.read_text(encoding="utf-8") if file.is_file() else ""
+        commit = re.search(r"^Commit (\w+)", text, flags=re.MULTILINE)
         try:
             changes = git("rev-list", "--count", f"{commit[1]}..HEAD", "--", *MEASURED) if commit else "unknown"
         except subprocess.CalledProcessError:
             changes = "unknown"
         if changes != "0":
-            found.append(f"{file.relative_to(ROOT)}: {changes} commits to the sources since it was measured")
+            found.append(f"{name}: {changes} commits to the sources since it was measured")
     return found
 
 
+def make(names: list[str], data: Path) -> None:
+    """Make tables at the present commit; raises `SystemExit` where it is not whole."""
+    if git("status", "--porcelain", "--", *MEASURED):
+        sys.exit("record: the sources differ from the last commit; commit first: a table names what made it")
+    commit = git("rev-parse", "--short", "HEAD")
+    with tempfile.TemporaryDirectory() as out:
+        for name in names:
+            record(name, data.resolve(), Path(out), commit)
+
+
 def main() -> None:
-    """Record or check."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", nargs="?")
-    parser.add_argument("--note", default="")
+    """Make or check."""
+    parser: argparse.ArgumentParser = options_of(__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(TABLES))
+    parser.add_argument("--all", action="store_true")
     parser.add_argument("--check", action="store_true")
-    parser.add_argument("command", nargs=argparse.REMAINDER)
+    parser.add_argument("--data", type=Path, help="folder of the real data")
     options = parser.parse_args()
+    names = list(TABLES) if options.all else options.names
+    if unknown := set(names) - set(TABLES):
+        parser.error(f"unknown table: {', '.join(sorted(unknown))}")
     if options.check:
         lines = outdated()
         print("\n".join(lines) or "all tables are of the present code")
         sys.exit(1 if lines else 0)
-    command = [word for word in options.command if word != "--"]
-    if not options.name or not command:
-        parser.error("give a name and, after --, the command")
-    print(record(options.name, options.note, command))
+    if not names or options.data is None:
+        parser.error("give --all or names of tables, and --data; or --check")
+    make(names, options.data)
 
 
 if __name__ == "__main__":

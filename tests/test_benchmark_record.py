@@ -1,0 +1,78 @@
+"""The tables of bench/results/: which are older than the code, and what is written when they are made."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from scopemap_bench.scripts import record
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project of one commit, with two tables: one printed, one written to a file by its command."""
+    monkeypatch.setattr(record, "ROOT", tmp_path)
+    monkeypatch.setattr(record, "RESULTS", tmp_path / "bench" / "results")
+    writes = "import pathlib, sys; pathlib.Path(sys.argv[1]).write_text('# Title\\n\\n| 2 |\\n')"
+    tables = {
+        "printed": ("python -c \"import sys; print('| 1 |', len(sys.argv[1]) > 4)\" DATA", ""),
+        "filed": (f'python -c "{writes}" OUT/table.md', "table.md"),
+    }
+    monkeypatch.setattr(record, "TABLES", tables)
+    for folder in record.MEASURED:
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "code.py").write_text("")
+    commit(tmp_path, "init")
+    return tmp_path
+
+
+def commit(folder: Path, message: str) -> None:
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (("init", "-q"), ("add", "."), (*who, "commit", "-q", "-m", message)):
+        subprocess.run(["git", *words], cwd=folder, check=True)
+
+
+def test_tables_are_outdated_by_a_commit_to_the_measured_sources_alone(project: Path) -> None:
+    assert record.outdated() == [
+        f"{name}: unknown commits to the sources since it was measured" for name in record.TABLES
+    ]
+    record.make(list(record.TABLES), project)
+    commit(project, "tables")
+    assert record.outdated() == []
+    (project / "README.md").write_text("words")
+    commit(project, "words")
+    assert record.outdated() == []
+    for count, folder in enumerate(record.MEASURED, start=1):
+        (project / folder / "code.py").write_text("x = 1")
+        commit(project, folder)
+        assert record.outdated()[0] == f"printed: {count} commits to the sources since it was measured"
+
+
+def test_a_table_names_its_command_and_commit_and_no_folder_of_this_machine(project: Path) -> None:
+    record.make(["printed", "filed"], project)
+    head = record.git("rev-parse", "--short", "HEAD")
+    printed, filed = ((record.RESULTS / f"{name}.md").read_text() for name in ("printed", "filed"))
+    assert printed.startswith(f"# printed\n\nCommit {head}, ")
+    assert printed.endswith("\n\n| 1 | True\n")
+    assert "    python -c" in printed
+    assert str(project) not in printed
+    assert filed.endswith("OUT/table.md\n\n| 2 |\n")
+
+
+def test_no_table_is_made_of_code_that_is_not_committed_or_by_a_command_that_fails(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(record.TABLES, "broken", ('python -c "raise SystemExit(3)"', ""))
+    with pytest.raises(SystemExit, match="failed with exit code 3"):
+        record.make(["broken"], project)
+    (project / "src" / "code.py").write_text("x = 2")
+    with pytest.raises(SystemExit, match="commit first"):
+        record.make(["printed"], project)
+    assert not record.RESULTS.exists()
+
+
+def test_the_tables_are_eight_and_what_is_kept_is_theirs() -> None:
+    assert len(record.TABLES) == 8
+    assert {file.stem for file in record.RESULTS.glob("*.md")} <= set(record.TABLES)
