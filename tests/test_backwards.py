@@ -12,12 +12,13 @@ from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping import Mapper
-from scopemap.runner.backwards import _agree, _moved
+from scopemap.runner.backwards import _agree, _join
 from scopemap.tracking.relocalisation import Keyframe
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track, TrackingLoss
 from scopemap.tracking.tracker import Tracker
 from scopemap.trajectory.causes import LossCause
+from scopemap.trajectory.frame_table import FrameTable
 
 FRAMES, LOST = 16, range(6, 9)
 LIGHT = {
@@ -67,10 +68,10 @@ def _off(result: Reconstruction, phantom: Path, frames: range) -> tuple[float, f
 
 def test_a_map_that_leads_back_to_an_earlier_one_joins_it(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = _run(phantom, monkeypatch)
-    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (FRAMES - 1)
-    assert {record.map for record in result.records} == {0}
-    assert [result.records[k].track.reason for k in LOST] == ["tracked backwards"] * len(LOST)
-    assert result.records[LOST.stop].track.reason == "relocalised"
+    assert result.frames["status"].tolist() == ["initial"] + ["ok"] * (FRAMES - 1)
+    assert set(result.frames["map"].tolist()) == {0}
+    assert [result.frames["reason"][k] for k in LOST] == ["tracked backwards"] * len(LOST)
+    assert result.frames["reason"][LOST.stop] == "relocalised"
     turn, way_mm = _off(result, phantom, range(FRAMES))
     assert turn < np.radians(1.0)
     assert way_mm < 0.5
@@ -79,10 +80,10 @@ def test_a_map_that_leads_back_to_an_earlier_one_joins_it(phantom: Path, monkeyp
 def test_lost_frames_are_tracked_backwards_in_a_map_of_its_own(phantom: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = _run(phantom, monkeypatch, twice=range(LOST.start), mapping__min_loop_inliers=0)
     # The earlier frames are never found from the later ones: two maps, the larger with the lost frames.
-    assert [record.track.status for record in result.records] == ["other-map"] * LOST.start + ["ok"] * len(LOST) + [
-        "ok"
-    ] * (FRAMES - LOST.stop)
-    assert result.records[LOST.stop].track.reason == "new map"
+    assert result.frames["status"].tolist() == ["other-map"] * LOST.start + ["ok"] * len(LOST) + ["ok"] * (
+        FRAMES - LOST.stop
+    )
+    assert result.frames["reason"][LOST.stop] == "new map"
     np.testing.assert_allclose(result.trajectory.T_world_camera[LOST.start], np.eye(4), atol=1e-9)
     turn, way_mm = _off(result, phantom, range(LOST.start, FRAMES))
     assert turn < np.radians(1.0)
@@ -96,7 +97,7 @@ def test_nothing_goes_back_where_it_is_not_wanted(
     phantom: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
 ) -> None:
     result = _run(phantom, monkeypatch, **changes)
-    assert [result.records[k].track.status for k in LOST] == ["lost"] * len(LOST)
+    assert [result.frames["status"][k] for k in LOST] == ["lost"] * len(LOST)
 
 
 def test_motions_that_differ_join_nothing() -> None:
@@ -118,11 +119,12 @@ def test_a_joined_map_takes_the_earlier_number_and_world(phantom: Path) -> None:
     tracks += [Track(2, "initial", "new map", np.eye(4), 2, map=1), Track(3, "ok", "", T, 2, map=1)]
     for track in tracks:
         mapper.observe(track)
-    mapper.join(tracks[2], tracks[0], T)
-    moved = [_moved(track, tracks[2], tracks[0], T) for track in tracks]
-    assert [track.map for track in moved] == [0, 0, 0, 0]
-    assert [track.status for track in moved] == ["initial", "lost", "ok", "ok"]
-    assert moved[3].T_world_camera[0, 3] == 14.0
+    mapper.join(tracks[2].index, tracks[0].index, T)
+    frames = FrameTable.of(track.row for track in tracks)
+    _join(frames, 2, 0, T)
+    assert frames["map"].tolist() == [0, 0, 0, 0]
+    assert frames["status"].tolist() == ["initial", "lost", "ok", "ok"]
+    assert frames["T_world_camera"][3, 0, 3] == 14.0
     (submap,), _ = mapper.submaps()
     assert submap.frames == {0, 2, 3}
 

@@ -17,7 +17,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import rotation_angle_rad
 from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -55,7 +55,7 @@ def test_with_true_depth_it_beats_standing_still_by_far(folder: Path) -> None:
     errors_mm = {}
     for name, tracker in {"edam": create_endo_depth_and_motion(), "still": StandingStill()}.items():
         result = _run(folder, tracker)
-        assert result.lost == []
+        assert not len(result.lost)
         difference = result.trajectory.T_world_camera[:, :3, 3] - truth[:, :3, 3]
         errors_mm[name] = float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
         if name == "edam":
@@ -67,7 +67,7 @@ def test_with_true_depth_it_beats_standing_still_by_far(folder: Path) -> None:
 
 def test_a_keyframe_every_second_frame(folder: Path) -> None:
     result = _run(folder, create_endo_depth_and_motion())
-    assert [record.track.keyframe for record in result.records] == [0, *(2 * ((i - 1) // 2) for i in range(1, FRAMES))]
+    assert result.frames["keyframe"].tolist() == [0, *(2 * ((i - 1) // 2) for i in range(1, FRAMES))]
 
 
 def test_two_scales_and_grey_values_alone() -> None:
@@ -105,8 +105,8 @@ def test_a_black_frame_in_a_run_is_lost_and_tracking_goes_on(tmp_path: Path) -> 
     folder = write_tiny(tmp_path / "interrupted", events="black:3-3", frames=6)
     for tracker in (create_endo_depth_and_motion(), StandingStill()):
         result = _run(folder, tracker)
-        assert [record.index for record in result.lost] == [3]
-        assert result.records[-1].track.status == "ok"
+        assert result.lost["index"].tolist() == [3]
+        assert result.frames["status"][-1] == "ok"
 
 
 # ---- standing still
@@ -115,8 +115,8 @@ def test_a_black_frame_in_a_run_is_lost_and_tracking_goes_on(tmp_path: Path) -> 
 def test_standing_still_is_the_first_pose_for_ever(folder: Path) -> None:
     result = _run(folder, StandingStill())
     np.testing.assert_array_equal(result.trajectory.T_world_camera, np.tile(np.eye(4), (FRAMES, 1, 1)))
-    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (FRAMES - 1)
-    assert {record.track.keyframe for record in result.records} == {0}
+    assert result.frames["status"].tolist() == ["initial"] + ["ok"] * (FRAMES - 1)
+    assert set(result.frames["keyframe"].tolist()) == {0}
 
 
 def test_standing_still_scores_the_motion_itself(folder: Path) -> None:

@@ -48,7 +48,7 @@ def _break(patch: pytest.MonkeyPatch, kind: type, name: str, calls: set[int], er
 
 
 def _lost(result: Reconstruction) -> dict[int, str]:
-    return {record.index: record.track.reason for record in result.lost}
+    return dict(zip(result.lost["index"].tolist(), result.lost["reason"], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_reader_that_hangs_ends_the_frames_and_what_was_tracked_is_kept(
     finally:
         gate.set()
     assert time.monotonic() - started < 50
-    assert [record.index for record in result.records if record.track.status != "lost"] == [*range(6)]
+    assert result.frames["index"][result.frames["status"] != "lost"].tolist() == [*range(6)]
     (warning,) = [warning for warning in warned(result.provenance) if "hangs" in warning]
     late = "its picture after frame 5 did not come within 3 s: a decoder or a disk hangs; the frames until then"
     assert warning == f"{folder}: {late} were used"

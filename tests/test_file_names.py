@@ -18,7 +18,7 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError
 from scopemap.io import result_folder
-from scopemap.reconstruction import DepthReader
+from scopemap.io.depth_maps import DepthReader
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "scopemap"
 NAME = "Jörg, 内視鏡 №1"

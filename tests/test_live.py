@@ -159,7 +159,7 @@ def test_a_session_tracks_and_says_when_it_is_lost(session: LiveSession) -> None
     assert words[1] == "tracking"
     assert words[-1] == "lost: move back slowly"
     assert state["state"] == "ended"
-    assert state["tracked"] + state["lost"] == len(result.records) == state["read"] - state["dropped"]
+    assert state["tracked"] + state["lost"] == len(result.frames) == state["read"] - state["dropped"]
     assert 0 < state["latency_p50_ms"] <= state["latency_p95_ms"]
     assert len(state["path"]) == state["tracked"]
     assert len(result.mesh.faces) > 100
@@ -179,9 +179,9 @@ def test_a_reset_forgets_and_a_snapshot_is_kept(session: LiveSession) -> None:
     session._observers = (ask,)
     result = session.run().result()
     assert asked
-    assert result.records[0].index > asked[0]
-    assert session.state()["tracked"] + session.state()["lost"] == len(result.records)
-    assert result.records[0].track.status == "initial"
+    assert result.frames["index"][0] > asked[0]
+    assert session.state()["tracked"] + session.state()["lost"] == len(result.frames)
+    assert result.frames["status"][0] == "initial"
     snapshot = Path(session.state()["snapshot"])
     assert cv2.imread(str(snapshot)).shape == (128, 160, 3)
     assert snapshot.with_suffix(".ply").stat().st_size > 1000

@@ -29,6 +29,7 @@ from scopemap.runner.provenance import motion_notices
 from scopemap.tracking.at_rest import CameraAtRest
 from scopemap.tracking.reprojection import nonrigidity
 from scopemap.tracking.track import MOVING_SIGMAS, Track
+from scopemap.trajectory.frame_table import FrameTable
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
@@ -241,8 +242,8 @@ def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
 
 
 def test_notes_say_that_the_camera_was_stated_to_be_at_rest() -> None:
-    assert motion_notices([], Config()) == []
-    (notice,) = motion_notices([], Config.load(settings={"tracking.camera_at_rest": True}))
+    assert motion_notices(FrameTable.of([]), Config()) == []
+    (notice,) = motion_notices(FrameTable.of([]), Config.load(settings={"tracking.camera_at_rest": True}))
     assert notice.code == "camera-at-rest-stated"
 
 

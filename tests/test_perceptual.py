@@ -13,8 +13,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.depth.perceptual import LpipsAlex, StructureDistance, create_perceptual, structural_similarity
+from scopemap.depth.perceptual import LpipsAlex, StructureDistance, create_perceptual
 from scopemap.errors import SettingsError, WeightsError
+from scopemap.geometry.similarity import structural_similarity
 
 SHAPE = (70, 93, 3)
 

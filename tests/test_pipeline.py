@@ -77,10 +77,10 @@ def _position_errors_mm(result: Any, folder: Path) -> np.ndarray:
 
 def test_every_frame_is_tracked_and_a_surface_found(folder: Path) -> None:
     result = reconstruct(open_sequence(folder), with_true_depth(folder))
-    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (FRAMES - 1)
-    assert [record.index for record in result.records] == list(range(FRAMES))
+    assert result.frames["status"].tolist() == ["initial"] + ["ok"] * (FRAMES - 1)
+    assert result.frames["index"].tolist() == list(range(FRAMES))
     assert _position_errors_mm(result, folder).max() < 0.6
-    assert result.lost == []
+    assert not len(result.lost)
     assert len(result.mesh.faces) > 1000
     truth = trimesh.load(folder / "mesh_truth.ply", process=False)
     world = trimesh.transform_points(result.mesh.vertices, read_trajectory(folder).T_world_camera[0])
@@ -116,7 +116,7 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
         config = Config.load(settings={"depth.backend": "shading", "depth.downscale": downscale})
         result = reconstruct(open_sequence(folder), config, observers=(steps.append,))
         assert {frame.valid.shape for frame in spies.pop().seen} == {(SIZE[1] // downscale, SIZE[0] // downscale)}
-        assert result.lost == []
+        assert not len(result.lost)
         depths = [(step.raw_mm, step.frame.depth_mm, step.frame.depth_sigma_mm) for step in steps]
         assert {mm.shape for depth in depths for mm in depth if mm is not None} == {SIZE[::-1]}
         found[downscale] = np.stack([step.frame.depth_mm for step in steps if step.frame.depth_mm is not None])
@@ -176,14 +176,11 @@ def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
 
     tracker = Standing()
     result = reconstruct(open_sequence(folder), with_true_depth(folder), tracker=tracker)
-    lost = [record.index for record in result.lost]
+    lost = result.lost["index"].tolist()
     assert lost == [index for index in range(FRAMES) if index % 3 == 2]
     assert tracker.inserted == [index for index in range(FRAMES) if index not in lost]
-    for record in result.records:
-        if record.index in lost:
-            assert record.T_world_camera is None
-        else:
-            np.testing.assert_array_equal(record.T_world_camera, np.eye(4))
+    assert np.isnan(result.frames["T_world_camera"][lost]).all()
+    assert (result.frames["T_world_camera"][result.frames.tracked] == np.eye(4)).all()
 
 
 def test_removing_the_truth_changes_nothing(folder: Path, tmp_path: Path) -> None:
@@ -201,9 +198,9 @@ def test_a_black_frame_is_lost_and_tracking_resumes(interrupted: Path) -> None:
     steps: list[Step] = []
     config = with_true_depth(interrupted, mapis__advanced__frame_scale="robust")  # measured depth alone needs no link
     result = reconstruct(open_sequence(interrupted), config, observers=(steps.append,))
-    assert [record.index for record in result.lost] == [4]
-    assert result.lost[0].track.reason.startswith("only ")
-    assert result.records[4].T_world_camera is None
+    assert result.lost["index"].tolist() == [4]
+    assert result.lost["reason"][0].startswith("only ")
+    assert np.isnan(result.frames["T_world_camera"][4]).all()
     assert steps[4].frame.T_world_camera is None
     assert np.delete(_position_errors_mm(result, interrupted), 4).max() < 0.6
     assert steps[4].refined.warped_share == 0.0
@@ -218,8 +215,8 @@ def test_black_frames_at_the_start_are_left_behind(noisy: bool, tmp_path: Path) 
     for index in () if noisy else (0, 1):
         cv2.imwrite(str(folder / f"{index:04d}_color.png"), np.zeros((*SIZE[::-1], 3), np.uint8))
     result = reconstruct(open_sequence(folder), with_true_depth(folder))
-    assert [record.track.status for record in result.records] == ["lost"] * 2 + ["initial"] + ["ok"] * 3
-    np.testing.assert_array_equal(result.records[2].T_world_camera, np.eye(4))
+    assert result.frames["status"].tolist() == ["lost"] * 2 + ["initial"] + ["ok"] * 3
+    np.testing.assert_array_equal(result.frames["T_world_camera"][2], np.eye(4))
     errors = result.trajectory.positions_mm[2:] - true_poses(folder, 2)[2:, :3, 3]
     assert np.linalg.norm(errors, axis=1).max() < 0.6
 
@@ -243,8 +240,12 @@ def test_a_frame_that_is_too_dark_to_track_fixes_no_scale(folder: Path, tmp_path
 
 def test_smoothing_forgets_what_was_before_a_loss(interrupted: Path) -> None:
     smoothing = {"smoothing__method": "wema", "smoothing__dynamic": False}
-    result = reconstruct(open_sequence(interrupted), with_true_depth(interrupted, **smoothing))
-    raw = np.stack([record.track.T_world_camera for record in result.records])
+    raw: list[np.ndarray] = []
+    result = reconstruct(
+        open_sequence(interrupted),
+        with_true_depth(interrupted, **smoothing),
+        observers=(lambda step: raw.append(step.track.T_world_camera),),
+    )
     moved = np.abs(result.trajectory.T_world_camera - raw).max(axis=(1, 2))
     np.testing.assert_array_equal(moved[[0, 1, 5, 6]], 0.0)
     assert np.isnan(result.trajectory.T_world_camera[4]).all()
@@ -262,7 +263,7 @@ def test_nothing_but_black_is_an_input_error(tmp_path: Path) -> None:
 def test_every_preset_tracks_all_frames(preset: str, folder: Path) -> None:
     config = with_true_depth(folder, preset, **WITHOUT_NETWORKS, depth__anchor="auto")
     result = reconstruct(open_sequence(folder), config)
-    assert result.lost == []
+    assert not len(result.lost)
     assert _position_errors_mm(result, folder).max() < 1.5
 
 
@@ -288,18 +289,22 @@ def test_the_papers_form_runs_on_predicted_depth(folder: Path) -> None:
     result = reconstruct(open_sequence(folder), with_true_depth(folder, "paper", **chosen))
     assert result.provenance["tracked"] >= FRAMES - 1
     assert result.provenance["estimators"]["anchor"].startswith("shading prior")
-    assert [record.depth_scale for record in result.records] == [1.0] * FRAMES
+    assert result.frames["depth_scale"].tolist() == [1.0] * FRAMES
 
 
 def test_smoothing_is_of_the_result_and_not_of_the_tracking(folder: Path) -> None:
     smoothing = {"smoothing__method": "wema", "smoothing__dynamic": False}
+    tracked: list[np.ndarray] = []
     rough = reconstruct(open_sequence(folder), with_true_depth(folder))
-    smooth = reconstruct(open_sequence(folder), with_true_depth(folder, **smoothing))
+    smooth = reconstruct(
+        open_sequence(folder),
+        with_true_depth(folder, **smoothing),
+        observers=(lambda step: tracked.append(step.track.T_world_camera),),
+    )
     x, y = rough.trajectory.positions_mm, smooth.trajectory.positions_mm
     np.testing.assert_array_equal(y[:2], x[:2])
     np.testing.assert_allclose(y[2:], 0.6 * x[2:] + 0.3 * x[1:-1] + 0.1 * x[:-2], atol=2e-3)
-    for a, b in zip(rough.records, smooth.records, strict=True):
-        np.testing.assert_array_equal(a.track.T_world_camera, b.track.T_world_camera)
+    np.testing.assert_array_equal(rough.trajectory.T_world_camera, tracked)
 
 
 @pytest.mark.parametrize(("every", "fused"), [(1, [0, 1, 2, 3, 5, 6, 7, 8]), (3, [0, 3, 7])])
@@ -349,7 +354,7 @@ def test_stages_run_ahead_in_threads_and_not_too_far(folder: Path, monkeypatch: 
 
 def test_overlapping_stages_change_no_bit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     threaded = reconstruct(open_sequence(folder), Config.load())
-    monkeypatch.setattr("scopemap.runner.run._ahead", lambda items, thread, count=2: (item for item in items))
+    monkeypatch.setattr("scopemap.runner.run.in_thread", lambda items, thread, count=2: (item for item in items))
     serial = reconstruct(open_sequence(folder), Config.load())
     assert threaded.trajectory.T_world_camera.tobytes() == serial.trajectory.T_world_camera.tobytes()
     assert len(serial.mesh.faces) > 100

@@ -17,6 +17,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
 from scopemap.runner.provenance import Limits
+from scopemap.trajectory.frame_table import COLUMNS
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)
 FRAMES = 6
@@ -31,7 +32,7 @@ def _assert_equal(one: Reconstruction, other: Reconstruction) -> None:
     np.testing.assert_array_equal(one.trajectory.T_world_camera, other.trajectory.T_world_camera)
     np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
     np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
-    assert [record.row() for record in one.records] == [record.row() for record in other.records]
+    assert [one.frames.cells(name) for name in COLUMNS] == [other.frames.cells(name) for name in COLUMNS]
 
 
 @pytest.mark.parametrize("preset", ["default", "realtime"])
@@ -186,9 +187,9 @@ def test_limits_bound_what_is_kept(folder: Path) -> None:
     assert one.surface_is_full
     faces = len(one.surface().faces)
     result = one.result()
-    assert 0 < len(result.records) <= 4
+    assert 0 < len(result.frames) <= 4
     assert [step.track.status for step in steps] == ["initial"] + ["ok"] * (FRAMES - 1)
-    assert (result.records[0].index, result.records[-1].index) == (0, FRAMES - 1)
+    assert (result.frames["index"][0], result.frames["index"][-1]) == (0, FRAMES - 1)
     assert "older frames are not in the result: it keeps 4" in " ".join(warned(result.provenance))
     alone = Reconstructor(config, open_sequence(folder))
     alone.step(next(iter(alone.frames())))

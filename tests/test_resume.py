@@ -191,10 +191,7 @@ def test_frames_that_fail_between_the_states_of_two_stages_are_counted(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence, config = open_sequence(folder), Config.load("realtime")
-    runs = [
-        Run(sequence, config, Pipeline(config, create_estimators(config, sequence)), Clock(), None, lambda *_: None)
-        for _ in range(2)
-    ]
+    runs = [Run(sequence, Pipeline(config, create_estimators(config, sequence)), Clock()) for _ in range(2)]
     pipeline, frame = runs[0].pipeline, next(sequence.frames())
     checkpoints = Checkpoints(tmp_path, {}, runs[0])
     estimated = pipeline.estimate(frame)

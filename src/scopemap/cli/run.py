@@ -216,12 +216,11 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
-    from scopemap.reconstruction import scale_words
-    from scopemap.report.kept_run import run_of
+    from scopemap.notices import scale_words
     from scopemap.report.losses import losses
     from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
-    run, facts, known = run_of(result), result.provenance, result.provenance["scale"]["known"]
+    facts, known = result.provenance, result.provenance["scale"]["known"]
     unit = " mm" if known else " (scale unknown)"
     lines = [
         f"{_counted(facts)}, path {result.trajectory.path_length_mm:.1f}{unit}",
@@ -235,10 +234,10 @@ def summary_lines(result: Reconstruction) -> list[str]:
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
-        submaps = submaps_in_time(run)
+        submaps = submaps_in_time(result.frames)
         lines.append(f"maps in order of time: {', '.join(_map_words(submap) for submap in submaps)}")
         lines += [f"most doubtful map: {doubt}" for doubt in [doubt_words(submaps)] if doubt]
-    lost = losses(run)
+    lost = losses(result.frames)
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
     lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
@@ -249,7 +248,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
 def _time_words(result: Reconstruction) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
     seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
-    done = len(result.records) if after is None else sum(record.index > after for record in result.records)
+    done = len(result.frames) if after is None else int((result.frames["index"] > after).sum())
     since = "" if after is None else f" since it was resumed after frame {after}"
     return f"time: {seconds:.1f} s{since}, {done / seconds:.1f} frames/s"
 

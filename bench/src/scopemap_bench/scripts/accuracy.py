@@ -186,7 +186,7 @@ def row(run: Run, out: Path | None) -> str:
     started = time.perf_counter()
     config = Config.load(settings=run.settings)
     result = reconstruct(open_sequence(run.source, frames=run.frames, settings=config.input), config, out=out)
-    ms = 1e3 * (time.perf_counter() - started) / len(result.records)
+    ms = 1e3 * (time.perf_counter() - started) / len(result.frames)
     matched = match(result.trajectory, read_reference(run.source), run.align)
     report, mesh_file = pose_report(matched), run.source / "mesh_truth.ply"
     surface = ""

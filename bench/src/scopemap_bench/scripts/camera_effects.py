@@ -69,11 +69,11 @@ def row(name: str, source: Path) -> str:
     adjusted, truth = result.trajectory, read_reference(source)
     poses = np.stack([tracked.get(int(n), T) for n, T in zip(adjusted.indices, adjusted.T_world_camera, strict=True)])
     before = replace(adjusted, T_world_camera=poses)
-    good = {record.index for record in result.records if record.T_world_camera is not None}
-    keyframes = sorted({record.track.keyframe for record in result.records if record.index in good} & good)
+    good = set(result.frames["index"][result.frames.tracked].tolist())
+    keyframes = sorted(set(result.frames["keyframe"][result.frames.tracked].tolist()) & good)
     errors = [f"{pose_report(match(some, truth, 'sim3'))['ate_rmse_mm']:.3f}" for some in (before, adjusted)]
     drift = [steps(some, truth, keyframes) for some in (before, adjusted)]
-    return f"| {name} | {len(good)} of {len(result.records)} | {' | '.join(errors)} | {' | '.join(drift)} |"
+    return f"| {name} | {len(good)} of {len(result.frames)} | {' | '.join(errors)} | {' | '.join(drift)} |"
 
 
 def main() -> None:

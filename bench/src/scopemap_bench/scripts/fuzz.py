@@ -41,16 +41,17 @@ from drawn_datasets import WRITERS, write_cameras  # noqa: E402
 from drawn_run import draw_run  # noqa: E402
 from drawn_trajectories import write_settings, write_trajectories  # noqa: E402
 
+from scopemap.actions.verifying import verify_result  # noqa: E402
 from scopemap.cameras.formats.reading import read_calibration  # noqa: E402
 from scopemap.config import Config, DepthSettings  # noqa: E402
 from scopemap.depth.files import FilesDepth  # noqa: E402
 from scopemap.errors import ScopemapError  # noqa: E402
-from scopemap.io.checksums import verify_result, write_checksums  # noqa: E402
+from scopemap.io.checksums import write_checksums  # noqa: E402
+from scopemap.io.depth_maps import DepthReader  # noqa: E402
 from scopemap.io.opening import open_sequence  # noqa: E402
 from scopemap.io.reference import reference_trajectory  # noqa: E402
+from scopemap.io.run_folder import RunFolder  # noqa: E402
 from scopemap.masking.mask_files import MaskFiles  # noqa: E402
-from scopemap.reconstruction import DepthReader  # noqa: E402
-from scopemap.report.kept_run import read_run  # noqa: E402
 from scopemap.trajectory.formats.opening import read_trajectory  # noqa: E402
 from scopemap_bench.datasets.checking import check  # noqa: E402
 from scopemap_bench.datasets.survey import survey  # noqa: E402
@@ -249,7 +250,7 @@ def read_result(folder: Path) -> None:
     depth = DepthReader(folder)
     for index in range(3):
         depth.read_sigma(index)
-    read_run(folder)
+    RunFolder(folder).checked()
     verify_result(folder)
 
 

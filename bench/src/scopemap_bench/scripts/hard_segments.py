@@ -62,7 +62,7 @@ def veiled(folder: Path) -> list[str]:
         write_phantom(PhantomSpec(scene=scene, frames=200, seed=11, events=parse_events(EVENTS)), spoilt)
         for name, changes in VARIANTS.items():
             before, after = run(clean, changes), run(spoilt, changes)
-            lost = np.array([record.T_world_camera is None for record in after.records])
+            lost = ~after.frames.tracked
             after_each = [lost[end + 1 :] for end in (69, 104, 139)]
             waits = ["never" if still.all() else int(np.argmin(still)) for still in after_each]
             one, other = ate_mm(before, clean), ate_mm(after, spoilt)
@@ -111,11 +111,11 @@ def cut(folder: Path) -> list[str]:
             result = run(source, changes)
             trajectory, truth = result.trajectory, read_trajectory(source)
             report = pose_report(match(trajectory, truth, "sim3"))
-            tracked = [record.track.map for record in result.records if record.T_world_camera is not None]
+            tracked = result.frames["map"][result.frames.tracked].tolist()
             parts = [without(trajectory, [n for n in range(301) if (n < CUT[0]) != early]) for early in (True, False)]
             scales = [match(part, truth, "sim3").similarity.scale if part.tracked.any() else np.nan for part in parts]
             rows.append(
-                f"| {scene}, {name} | {len(set(tracked))} | {len(tracked)} of {len(result.records)} "
+                f"| {scene}, {name} | {len(set(tracked))} | {len(tracked)} of {len(result.frames)} "
                 f"| {report['ate_rmse_mm']:.3f} "
                 f"| {report['rotation_unaligned_mean_deg']:.2f} / {report['rotation_unaligned_max_deg']:.2f} "
                 f"| {scales[0] / scales[1]:.2f} |".replace("nan", "")
@@ -139,11 +139,11 @@ def bare(folder: Path) -> list[str]:
     source = folder / "tube"
     write_phantom(PhantomSpec(scene="tube", frames=120, seed=13), source)
     result = run(source, {})
-    weak = sum("weakly constrained" in record.track.reason for record in result.records)
+    weak = sum("weakly constrained" in reason for reason in result.frames["reason"])
     return [
         "| phantom | frames | said to be weakly constrained | lost in all |",
         "|---|---|---|---|",
-        f"| straight tube without texture | {len(result.records)} | {weak} | {len(result.lost)} |",
+        f"| straight tube without texture | {len(result.frames)} | {weak} | {len(result.lost)} |",
     ]
 
 

@@ -27,7 +27,7 @@ from scopemap.io.checkpoint import SavedState
 from scopemap.io.opening import open_sequence
 from scopemap.odometry import Step
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 
 PHANTOM_FRAMES, ROWS = 200, 20
 # Until there are 400 keyframes, features of each are kept to find places again.

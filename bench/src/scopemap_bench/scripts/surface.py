@@ -38,8 +38,8 @@ from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.reference import read_reference
-from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import TRACKED
 from scopemap_bench.evaluation.depth import evaluate_depth_sequence

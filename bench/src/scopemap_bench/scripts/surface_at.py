@@ -21,7 +21,7 @@ import trimesh
 from scopemap.actions.inputs import open_truth
 from scopemap.fusion.agreement import compare_with_frame
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.reconstruction import DepthReader
+from scopemap.io.depth_maps import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 
 # Siblings are found where this file runs as a script; here, too, where it is loaded by its path.

@@ -18,7 +18,7 @@ from scopemap.config import Config
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap.trajectory.formats.opening import read_trajectory
 
 FIXED = {"fusion.enabled": "false", "mapping.triangulate_depth": "false"}
@@ -30,8 +30,8 @@ def row(path: Path, frames: slice, config: Config) -> list[str]:
     started = time.process_time()
     result = reconstruct(open_sequence(path, frames=frames), config)
     seconds = time.process_time() - started
-    sizes = Counter(record.map for record in result.records if record.map is not None)
-    count, tracked = len(result.records), sum(record.track.status != "lost" for record in result.records)
+    sizes = Counter(number for number in result.frames["map"].tolist() if number >= 0)
+    count, tracked = len(result.frames), int((result.frames["status"] != "lost").sum())
     large = sum(size for size in sizes.values() if size >= LARGE)
     return [
         path.stem,

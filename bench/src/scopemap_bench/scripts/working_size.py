@@ -55,7 +55,7 @@ def _ms_per_frame(folder: Path, size: tuple[int, int], config: Config) -> float:
     sequence = open_sequence(folder / "clip", size=size)
     started = time.process_time()
     result = reconstruct(sequence, config, out=folder / "result", overwrite=True)
-    return 1e3 * (time.process_time() - started) / len(result.records)
+    return 1e3 * (time.process_time() - started) / len(result.frames)
 
 
 if __name__ == "__main__":
