@@ -11,41 +11,55 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
 
 from scopemap.actions.inputs import open_truth
-from scopemap.config import Config
+from scopemap.frame import Frame
 from scopemap.fusion.agreement import compare_with_frame
-from scopemap.reconstruction import DepthReader
-from scopemap.report.mesh_figures import draw_surface
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.result import read_provenance
+from scopemap.geometry.rendering import Rendering
+from scopemap.io.run_folder import RunFolder
+from scopemap.report.canvas import ESTIMATE_COLOUR
+from scopemap.report.mesh_figures import MeshView, cropped, draw_path, mesh_picture, outside_views
+from scopemap.report.sheet import picture_grid
 
 MOST_BYTES = 200_000
 
 
-def confidence_of(mesh: trimesh.Trimesh) -> np.ndarray | None:
-    """Return the vertex property `confidence` (V,) of a mesh read from PLY; None where it has none."""
-    data = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    return None if data is None or "confidence" not in data.dtype.names else np.ravel(data["confidence"])
+def draw_surface(run: RunFolder, frame: Frame, pose: np.ndarray, rendering: Rendering, file: Path) -> None:
+    """Draw a frame, the surface from there, its confidence (blue 0, yellow 1), and the surface with the path outside.
+
+    pose : (4, 4) of the frame, world mm. rendering : of the mesh from there, in the frame's light.
+    """
+    mesh, camera, positions_mm = run.mesh, frame.camera, run.frames["T_world_camera"][run.frames.tracked, :3, 3]
+    view, outside = MeshView(pose, camera), outside_views(mesh, pose, positions_mm)["from outside"]
+    rendered = np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(255), rendering.rgb)
+    pictures = {"frame": frame.rgb, "surface": rendered}
+    if "confidence" in mesh.vertex_attributes:
+        levels = np.round(255 * np.clip(mesh.vertex_attributes["confidence"].reshape(-1, 1), 0, 1)).astype(np.uint8)
+        colours = cv2.applyColorMap(levels, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
+        certain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+        pictures["confidence, 0 blue to 1 yellow"] = mesh_picture(certain, view)
+    path = mesh_picture(mesh, outside)
+    draw_path(path, outside, positions_mm, ESTIMATE_COLOUR)
+    pictures["from outside"] = cropped(path)
+    picture_grid([pictures], (400, round(400 * camera.height / camera.width))).save(file)
 
 
-def draw_run(run: Path, file: Path, number: int | None = None) -> None:
+def draw_run(folder: Path, file: Path, number: int | None = None) -> None:
     """Draw a run at a frame, by default the middle one of those tracked."""
-    mesh, trajectory = trimesh.load_mesh(run / "mesh.ply", process=False), read_trajectory(run)
-    tracked = np.flatnonzero(trajectory.tracked)
-    row = tracked[len(tracked) // 2] if number is None else int(np.flatnonzero(trajectory.indices == number)[0])
-    sequence = open_truth(run, Path(read_provenance(run)["input"]))
-    frame = next(frame for frame in sequence.frames() if frame.index == trajectory.indices[row])
-    depth_mm = DepthReader(run).read(frame.index)
+    run = RunFolder(folder)
+    tracked = run.frames.rows[run.frames.tracked]
+    row = tracked[len(tracked) // 2] if number is None else tracked[tracked["index"] == number][0]
+    sequence = open_truth(folder, Path(run.provenance["input"]))
+    frame = next(frame for frame in sequence.frames() if frame.index == row["index"])
+    depth_mm, pose = run.depth.read(frame.index), row["T_world_camera"]
     if depth_mm is None:
-        raise SystemExit(f"{run} kept no depth of frame {frame.index}")
-    albedo = Config.load(file=run / "config.toml").fusion.colours == "albedo"
-    pose = trajectory.T_world_camera[row]
-    _, rendering = compare_with_frame(mesh, frame.camera, pose, frame.rgb, depth_mm, albedo=albedo)
-    positions_mm = trajectory.T_world_camera[tracked, :3, 3]
-    draw_surface((frame.rgb, frame.camera, pose), rendering, mesh, positions_mm, file, confidence_of(mesh))
+        raise SystemExit(f"{folder} kept no depth of frame {frame.index}")
+    albedo = run.config.fusion.colours == "albedo"
+    _, rendering = compare_with_frame(run.mesh, frame.camera, pose, frame.rgb, depth_mm, albedo=albedo)
+    draw_surface(run, frame, pose, rendering, file)
     if file.stat().st_size > MOST_BYTES:
         raise SystemExit(f"{file} has {file.stat().st_size} bytes, over {MOST_BYTES}")
 

@@ -16,10 +16,12 @@ from scopemap.config import Config
 from scopemap.frame import Frame
 from scopemap.geometry.rendering import render_mesh
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.io.depth_maps import DepthWriter
 from scopemap.notices import of_input
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction
+from scopemap.reconstruction import Reconstruction
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.tracking.track import Track
+from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
+from scopemap.trajectory.frame_table import LOST as LOST_FRAME
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
@@ -74,9 +76,20 @@ def drawn_result(name: str = "video.mp4", **facts: Any) -> Reconstruction:
     } | facts
     # The pictures are drawn without a lamp.
     config, mesh, second = Config.load(settings={"fusion.colours": "raw"}), tube(), range(IN_RESULT + LOST, FRAMES)
-    other = Reconstruction(CAMERA, [_record(index, 1) for index in second], mesh, config, provenance)
-    records = [_record(index, 0) for index in range(FRAMES)]
-    return Reconstruction(CAMERA, records, mesh, config, provenance, others=[other])
+    other = Reconstruction(CAMERA, FrameTable.of(_row(index, 1) for index in second), mesh, config, provenance)
+    frames = FrameTable.of(_row(index, 0) for index in range(FRAMES))
+    return Reconstruction(CAMERA, frames, mesh, config, provenance, others=[other])
+
+
+def placed_frames(place: list[int], **columns: list[Any]) -> FrameTable:
+    """Frames at 10 a second by the number of their submap, or `LOST`, ...; and further columns of theirs."""
+    outside = {LOST_FRAME: "lost", ELSEWHERE: "other-map", NOT_USED: "skipped", ROTATED: "rotation-only", 0: "ok"}
+    rows = [
+        {"index": n, "time_s": n / 10, "map": max(number, -1), "status": outside.get(number, "other-map")}
+        | {name: values[n] for name, values in columns.items()}
+        for n, number in enumerate(place)
+    ]
+    return FrameTable.of(rows)
 
 
 def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **facts: Any) -> Path:
@@ -105,11 +118,13 @@ def draw_run_of_frames(root: Path) -> Path:
     return draw_run(root / "result", name=str(frames))
 
 
-def _record(index: int, number: int) -> FrameRecord:
-    """The record of a frame in the map with this number."""
-    place = 0 if index < IN_RESULT else None if index < IN_RESULT + LOST else 1
-    pose = pose_of(index) if place == number else None
-    status = "lost" if place is None else "other-map" if place != number else "initial" if index == 0 else "ok"
-    reason = "too blurred" if place is None else f"tracked in maps/{place}" if place != number else ""
-    track = Track(index, status, reason, pose_of(index), 0, 0.5, 0.8 - 0.01 * index, 0.9, 0.9, 3)  # type: ignore[arg - type]
-    return FrameRecord(index, index / 25, "", track, pose, 1 + 0.01 * index, 0.5, place)
+def _row(index: int, number: int) -> dict[str, Any]:
+    """The row of a frame in the table of the submap with this number."""
+    place = -1 if IN_RESULT <= index < IN_RESULT + LOST else int(index >= IN_RESULT)
+    lost, here = {"status": "lost", "reason": "too blurred"}, {"status": "ok" if index else "initial"}
+    facts = lost if place < 0 else here if place == number else {"status": "other-map"}
+    if place == number:
+        facts["T_world_camera"] = pose_of(index)  # type: ignore[assignment]
+    figures = {"residual": 0.5, "inlier_share": 0.8 - 0.01 * index, "correlation": 0.9, "overlap": 0.9, "iterations": 3}
+    depth = {"depth_scale": 1 + 0.01 * index, "warped_share": 0.5}
+    return {"index": index, "time_s": index / 25, "map": place, "keyframe": 0} | facts | figures | depth

@@ -17,7 +17,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.track import FrameTracker, Track
 from scopemap_bench.methods import open3d_odometry
 from scopemap_bench.methods.open3d_odometry import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
@@ -80,8 +80,8 @@ def _follow(tracker: FrameTracker, frames: list[Frame]) -> Iterator[Track]:
 def test_with_true_depth_three_of_four_beat_standing_still(folder: Path, method: str, share: float | None) -> None:
     config = with_true_depth(folder, **PLAIN)
     result = reconstruct(open_sequence(folder), config, tracker=Open3dTracker(method))
-    assert [record.track.status for record in result.records] == ["initial"] + ["ok"] * (len(result.records) - 1)
-    assert [record.track.keyframe for record in result.records] == [0, *range(len(result.records) - 1)]
+    assert result.frames["status"].tolist() == ["initial"] + ["ok"] * (len(result.frames) - 1)
+    assert result.frames["keyframe"].tolist() == [0, *range(len(result.frames) - 1)]
     estimated_mm, true_mm = result.trajectory.T_world_camera[:, :3, 3], true_poses(folder)[:, :3, 3]
     error_mm = np.linalg.norm(estimated_mm - true_mm, axis=1)
     still_mm = np.linalg.norm(true_mm, axis=1)

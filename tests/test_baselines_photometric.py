@@ -16,7 +16,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import rotation_angle_rad
 from scopemap.io.opening import open_sequence
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -54,11 +54,11 @@ def test_with_true_depth_it_beats_standing_still_by_far(folder: Path) -> None:
     errors_mm = {}
     for name, tracker in {"edam": create_endo_depth_and_motion(), "still": StandingStill()}.items():
         result = _run(folder, tracker)
-        assert result.lost == []
+        assert not len(result.lost)
         difference = result.trajectory.T_world_camera[:, :3, 3] - truth[:, :3, 3]
         errors_mm[name] = float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
         if name == "edam":
-            keyframes = [record.track.keyframe for record in result.records]
+            keyframes = result.frames["keyframe"].tolist()
             assert keyframes == [0, *(2 * ((i - 1) // 2) for i in range(1, FRAMES))]
             turned = np.swapaxes(truth[:, :3, :3], 1, 2) @ result.trajectory.T_world_camera[:, :3, :3]
             assert np.degrees(rotation_angle_rad(turned)).max() < 0.7
@@ -83,8 +83,8 @@ def test_a_black_frame_in_a_run_is_lost_and_tracking_goes_on(tmp_path: Path) -> 
     folder = write_tiny(tmp_path / "interrupted", events="black:3-3", frames=6)
     for tracker in (create_endo_depth_and_motion(), StandingStill()):
         result = _run(folder, tracker)
-        assert [record.index for record in result.lost] == [3]
-        assert result.records[-1].track.status == "ok"
+        assert result.lost["index"].tolist() == [3]
+        assert result.frames["status"][-1] == "ok"
 
 
 # ---- standing still

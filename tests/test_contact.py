@@ -11,26 +11,27 @@ import plane_scene
 import pytest
 import trimesh
 from chosen_settings import chosen
+from drawn_run import placed_frames
 from plane_scene import CAMERA, EVERYWHERE
 from test_checkpoint import _through
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import TrackingSettings
+from scopemap.config import Config, TrackingSettings
 from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping.submaps import Submap
-from scopemap.reconstruction import FrameRecord, frame_counts
-from scopemap.report.kept_run import LOST, ROTATED, KeptMap, KeptRun, run_of
+from scopemap.reconstruction import Reconstruction
 from scopemap.report.losses import losses
 from scopemap.report.verdict import verdict
-from scopemap.runner.records import records_of
+from scopemap.runner.submap_frames import frames_of_submap
 from scopemap.tracking.relocalisation import RotationFollower, rotation_by_flow
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.frame_table import LOST, ROTATED, FrameTable
 
 FIRST = plane_scene.pose(turn_rad=(0.3, 0.1, 0.0))
 SECOND = FIRST @ plane_scene.pose(at_mm=(3.0, -1.0, 2.0), turn_rad=(0.03, -0.06, 0.02))
@@ -131,7 +132,9 @@ def _tracked(frames: list[Frame], **changes: object) -> list[Track]:
 def test_after_a_wall_features_confirm_the_pose_and_tell_the_scale_of_depth() -> None:
     tracks = _tracked(_frames(2.0))
     assert all(track.cause is LossCause.CONTACT for track in tracks[6:9])
-    assert causes_of_loss(tracks)[6:9] == ["contact with the wall"] * 3
+    frames = FrameTable.of(track.row for track in tracks)
+    causes = causes_of_loss(frames["status"], frames["cause"], frames["motion"])
+    assert causes[6:9] == ["contact with the wall"] * 3
     assert ADVICE["contact with the wall"]
     assert (tracks[9].status, tracks[9].reason, tracks[9].map) == ("ok", "relocalised", 0)
     assert tracks[9].depth_ratio == pytest.approx(0.5, rel=0.03)
@@ -152,51 +155,47 @@ def test_a_pose_after_a_wall_that_no_features_confirm_begins_a_new_map_later(mon
 # ---- what is written
 
 
-def _records() -> list[FrameRecord]:
+def _frames_at_a_wall() -> FrameTable:
     """Three tracked frames, three lost ones of which a wall fills one, one tracked, one lost to something else."""
     step = plane_scene.pose(turn_rad=(0.0, 0.2, 0.0))
-    records, found = list[FrameRecord](), [None, None, None, step, step @ step, None, None, step]
+    rows, found = [], [None, None, None, step, step @ step, None, None, step]
     for index, rotation in enumerate(found):
         is_lost = index in (3, 4, 5, 7)
         lost_by = LossCause.CONTACT if index == 4 else LossCause.VIEW_CHANGED
-        cause = lost_by if is_lost else LossCause.NONE
         T = plane_scene.pose(at_mm=(float(index), 0.0, 0.0), turn_rad=(0.1 * index, 0.0, 0.0))
-        track = Track(index, "lost" if is_lost else "ok", "", T, 0, cause=cause)
-        track = replace(track, rotation=None if rotation is None else rotation[:3, :3])
-        records.append(FrameRecord(index, index / 30, "", track, None if is_lost else T, 1.0, 1.0))
+        row = {"index": index, "time_s": index / 30, "map": 0, "keyframe": 0, "status": "lost" if is_lost else "ok"}
+        row["cause"] = lost_by if is_lost else LossCause.NONE
+        row["T_world_camera"], row["rotation"] = None if is_lost else T, None if rotation is None else rotation[:3, :3]
+        rows.append(row)
     frames = frozenset({0, 1, 2, 6})
-    return records_of(0, [Submap(0, (0,), frames, frames)], records)
+    return frames_of_submap(0, [Submap(0, (0,), frames, frames)], FrameTable.of(rows))
 
 
 def test_rotations_are_marked_where_a_wall_filled_the_picture_and_not_counted_as_tracked() -> None:
-    records = _records()
-    status = [record.track.status for record in records]
-    assert status == ["ok"] * 3 + ["rotation-only"] * 2 + ["lost", "ok", "lost"]
-    assert frame_counts(records) == {"frames": 8, "tracked": 4, "lost": 4, "rotation_only": 2, "in_other_maps": 0}
-    last, turned = records[2].T_world_camera, plane_scene.pose(turn_rad=(0.0, 0.4, 0.0))
-    assert last is not None
-    np.testing.assert_allclose(records[4].pose[:3, :3], (last @ turned)[:3, :3], atol=1e-12)
-    assert np.isnan(records[4].pose[:3, 3]).all()
-    assert records[4].T_world_camera is None
+    frames = _frames_at_a_wall()
+    assert frames["status"].tolist() == ["ok"] * 3 + ["rotation-only"] * 2 + ["lost", "ok", "lost"]
+    assert frames.counts == {"frames": 8, "tracked": 4, "lost": 4, "rotation_only": 2, "in_other_maps": 0}
+    last, turned = frames["T_world_camera"][2], plane_scene.pose(turn_rad=(0.0, 0.4, 0.0))
+    np.testing.assert_allclose(frames["T_world_camera"][4, :3, :3], (last @ turned)[:3, :3], atol=1e-12)
+    assert np.isnan(frames["T_world_camera"][4, :3, 3]).all()
 
 
 def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=8)
-    result = replace(reconstruct(open_sequence(phantom), with_true_depth(phantom)), records=_records())
-    assert [record.index for record in result.lost] == [3, 4, 5, 7]
+    result = replace(reconstruct(open_sequence(phantom), with_true_depth(phantom)), frames=_frames_at_a_wall())
+    assert result.lost["index"].tolist() == [3, 4, 5, 7]
     result.save(tmp_path / "out")
     found = read_trajectory(tmp_path / "out", kind="run")
     np.testing.assert_array_equal(found.status, result.trajectory.status)
     np.testing.assert_allclose(found.T_world_camera, result.trajectory.T_world_camera, atol=2e-6)
     assert found.tracked.tolist() == [True] * 3 + [False] * 3 + [True, False]
-    assert run_of(result).place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
+    assert result.frames.place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
 
 
 def test_the_report_tells_them_from_other_lost_frames() -> None:
-    place = np.array([0] * 40 + [ROTATED] * 3 + [LOST] * 2 + [0] * 40)
-    rows = [{"index": str(n), "time_s": str(n / 10), "cause": "contact with the wall"} for n in range(len(place))]
-    nothing = KeptMap(np.zeros(0, int), np.zeros((0, 4, 4)), trimesh.Trimesh())
-    run = KeptRun(None, rows, [nothing], place, {"camera": {"source": "file"}, "notes": []})
-    assert [(loss.first, loss.frames) for loss in losses(run)] == [(40, 5)]
+    place = [0] * 40 + [ROTATED] * 3 + [LOST] * 2 + [0] * 40
+    frames = placed_frames(place, cause=["" if number == 0 else "contact with the wall" for number in place])
+    run = Reconstruction(CAMERA, frames, trimesh.Trimesh(), Config(), {"camera": {"source": "file"}})
+    assert [(loss.first, loss.frames) for loss in losses(frames)] == [(40, 5)]
     texts = " ".join(reason.text for reason in verdict(run).reasons)
     assert "In 5 frames the camera could not be followed but for its rotation in 3." in texts

@@ -16,8 +16,9 @@ from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.cli.run import summary_lines
 from scopemap.config import Config
 from scopemap.frame import Frame
+from scopemap.io.depth_maps import DepthReader, DepthWriter
 from scopemap.io.sequence import Sequence
-from scopemap.reconstruction import DepthReader, DepthWriter, scale_words
+from scopemap.notices import scale_words
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 

@@ -16,7 +16,7 @@ from scopemap.cli.app import app
 from scopemap.config import PRESETS, setting_names
 from scopemap.io.opening import readers
 from scopemap.io.weights import REGISTRY
-from scopemap.reconstruction import COLUMNS
+from scopemap.trajectory.frame_table import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")])

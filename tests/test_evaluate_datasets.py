@@ -16,8 +16,8 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.actions.inputs import open_truth
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import CalibrationError, InputError, SettingsError
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.reference import read_reference, reference_trajectory
-from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.trajectory import write_tum
 from scopemap_bench.cli.evaluate import evaluate
 from scopemap_bench.scoring import default_protocol

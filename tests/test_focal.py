@@ -26,7 +26,7 @@ from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import so3_exp
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 
 HALF_PX = 160.0
 ROTATION_DEG, TRANSLATION = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)

@@ -12,7 +12,7 @@ import pytest
 from numba import njit
 
 from scopemap.cli.run import compiling_words
-from scopemap.estimators import compiling_s
+from scopemap.runner.run import compiling_s
 
 _READ_ONLY = """
 import os

@@ -20,9 +20,8 @@ from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.config import Config
 from scopemap.geometry.se3 import so3_exp
 from scopemap.io.opening import open_sequence
-from scopemap.report.kept_run import run_of
 from scopemap.report.verdict import verdict
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 
 HALF_PX, POINTS = 160.0, 150
 FORWARD = {"rotation_deg": (0.0, 0.0, 0.0), "translation": (0.05, -0.03, 0.3)}
@@ -156,6 +155,6 @@ def test_the_default_is_named_where_nothing_is_known(
     assert "assumed: horizontal field of view 70 deg" in warning
     assert words in warning
     assert words in result.provenance["camera"]["source"]
-    reasons = [reason.text for reason in verdict(run_of(result)).reasons]
+    reasons = [reason.text for reason in verdict(result).reasons]
     assert sum("lens is a guess" in text for text in reasons) == 1
     assert not any("amera is unknown" in text for text in reasons)  # said once

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plane_scene
@@ -20,26 +20,18 @@ from scopemap.fusion.frame_store import FrameStore
 from scopemap.mapping import Backend
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.submaps import Mapper
-from scopemap.reconstruction import FrameRecord
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.runner.records import FrameRecords
 from scopemap.tracking.track import Track
+from scopemap.trajectory.frame_table import ROW, FrameTable, GrowingFrameTable
 
 
-def _record(number: int) -> FrameRecord:
+def _row(number: int) -> dict[str, Any]:
     T = plane_scene.pose(at_mm=(float(number), 1.0, 2.0))
-    seen = {
-        "usable": 0.9,
-        "sharpness": 0.8,
-        "motion": 0.01,
-        "quality": 0.7,
-        "nonrigidity": np.full(REGIONS, number, np.float32),
-    }
-    track = Track(
-        number, "ok", f"reason {number} \u00e4", T, number // 10, 0.1, 0.5, 0.25, float("nan"), number, 2, **seen
-    )
+    seen = {"usable": 0.9, "sharpness": 0.8, "nonrigidity": np.full(REGIONS, number, np.float32)}
+    track = Track(number, "ok", f"reason {number} \u00e4", T, number // 10, 0.1, 0.5, iterations=number, map=2, **seen)
     pose = None if number % 3 == 0 else T + 1
-    return FrameRecord(number, number / 30, f"{number}\udcff.png", track, pose, 1.5, 0.75)
+    more = {"time_s": number / 30, "name": f"{number}\udcff.png", "depth_scale": 1.5}
+    return track.row | more | {"T_world_camera": pose}
 
 
 def _bytes_each(put: Callable[[int], object], count: int, warm_up: int) -> float:
@@ -55,41 +47,35 @@ def _bytes_each(put: Callable[[int], object], count: int, warm_up: int) -> float
 
 
 @pytest.mark.parametrize("on_disk", [False, True])
-def test_records_come_back(on_disk: bool, tmp_path: Path) -> None:
-    records = FrameRecords(FrameStore(tmp_path).table if on_disk else rows_in_memory)
-    assert (len(records), records.last_index, records.read()) == (0, -1, [])
+def test_rows_come_back(on_disk: bool, tmp_path: Path) -> None:
+    table = GrowingFrameTable(FrameStore(tmp_path).table if on_disk else rows_in_memory)
+    assert (len(table), table.last_index, len(table.read())) == (0, -1, 0)
     for number in range(40):
-        records.append(_record(number))
-    assert (len(records), records.last_index) == (40, 39)
+        table.append(_row(number))
+    assert (len(table), table.last_index) == (40, 39)
 
-    def same(found: list[FrameRecord], numbers: list[int]) -> None:
-        assert [record.index for record in found] == numbers
-        for record, wanted in zip(found, map(_record, numbers), strict=True):
-            np.testing.assert_array_equal(record.track.T_world_camera, wanted.track.T_world_camera)
-            assert (record.T_world_camera is None) == (wanted.T_world_camera is None)
-            assert wanted.T_world_camera is None or (record.T_world_camera == wanted.T_world_camera).all()
-            assert record.row() == wanted.row()
-            np.testing.assert_array_equal(record.track.nonrigidity, wanted.track.nonrigidity)
-            plain = replace(wanted.track, T_world_camera=record.track.T_world_camera, overlap=0.0, nonrigidity=None)
-            assert replace(record.track, overlap=0.0, nonrigidity=None) == plain
+    def same(found: FrameTable, numbers: list[int]) -> None:
+        wanted = FrameTable.of(map(_row, numbers))
+        for name in ROW.names or ():
+            np.testing.assert_array_equal(found[name], wanted[name])
 
-    same(records.read(), [*range(40)])
-    assert records.thin() == {*range(1, 20, 2)}
-    same(records.read(), [*range(0, 20, 2), *range(20, 40)])
+    same(table.read(), [*range(40)])
+    assert table.thin() == {*range(1, 20, 2)}
+    same(table.read(), [*range(0, 20, 2), *range(20, 40)])
 
 
 def test_a_frame_leaves_little_in_memory(tmp_path: Path) -> None:
     store = FrameStore(tmp_path)
-    records, pictures = FrameRecords(store.table), FramePictures()
+    table, pictures = GrowingFrameTable(store.table), FramePictures()
     mapper = Mapper(MappingSettings(), DisFlow(), store.table)
     small = np.zeros((8, 8, 3), np.uint8)
     camera = CAMERA.resized(8, 8)
 
     def put(number: int) -> None:
-        record = _record(number)
-        records.append(record)
-        mapper.observe(record.track)
-        store.put(Frame(number, 0.0, small, camera, small[..., 0] == 0, small[..., 0] + 1.0, record.T_world_camera))
+        row = _row(number)
+        table.append(row)
+        mapper.observe(Track(number, "ok", "", np.eye(4), number // 10))
+        store.put(Frame(number, 0.0, small, camera, small[..., 0] == 0, small[..., 0] + 1.0, row["T_world_camera"]))
         pictures.put(number, small, small[..., 0] == 0)
 
     # Measures of sharpness, 24 bytes, in an array that grows by a quarter.

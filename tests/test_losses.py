@@ -6,25 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn_run import placed_frames
 
 from scopemap import open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.frame import Frame
-from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptRun
-from scopemap.report.kept_run import run_of as run_of_result
 from scopemap.report.losses import in_words, losses
-from scopemap.tracking.track import Status, Track, unusable
+from scopemap.tracking.track import unusable
 from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
+from scopemap.trajectory.frame_table import ELSEWHERE, LOST, NOT_USED
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
-
-def track(cause: LossCause, motion: float = 0.01, status: Status = "lost") -> Track:
-    return Track(0, status, "", np.eye(4), 0, motion=motion, cause=cause)
+REJECTED = LossCause.VIEW_CHANGED
 
 
-OK, REJECTED = track(LossCause.NONE, status="ok"), LossCause.VIEW_CHANGED
+def causes(*frames: tuple[LossCause, float] | None) -> list[LossCause]:
+    """The causes of frames, lost by what the tracker said and their motion; None: not lost."""
+    status = np.array(["ok" if frame is None else "lost" for frame in frames])
+    judged, motion = zip(*((LossCause.NONE, 0.01) if frame is None else frame for frame in frames), strict=True)
+    return causes_of_loss(status, np.array(judged), np.array(motion))
 
 
 @pytest.mark.parametrize(
@@ -41,7 +43,7 @@ OK, REJECTED = track(LossCause.NONE, status="ok"), LossCause.VIEW_CHANGED
     ],
 )
 def test_the_cause_of_the_first_lost_frame(judged: LossCause, motion: float, cause: LossCause) -> None:
-    assert causes_of_loss([OK, track(judged, motion)]) == [LossCause.NONE, cause]
+    assert causes(None, (judged, motion)) == [LossCause.NONE, cause]
     assert ADVICE[cause]
 
 
@@ -54,23 +56,16 @@ def test_why_hardly_a_pixel_is_usable(level: int, cause: str) -> None:
 
 
 def test_what_follows_a_loss_without_a_fault_of_its_own_is_not_found_again() -> None:
-    tracks = [track(REJECTED, 0.05), track(LossCause.OTHER), track(REJECTED), OK, track(REJECTED)]
-    assert causes_of_loss(tracks) == ["fast motion", "not found again", "not found again", "", "view changed"]
-
-
-def run_of(causes: list[str | int]) -> KeptRun:
-    """A run at 10 frames/s; a number is the place of a frame that is not lost."""
-    rows = [
-        {"index": str(n), "time_s": str(n / 10), "cause": "" if isinstance(cause, int) else cause}
-        for n, cause in enumerate(causes)
-    ]
-    return KeptRun(None, rows, [], np.array([cause if isinstance(cause, int) else LOST for cause in causes]))
+    found = causes((REJECTED, 0.05), (LossCause.OTHER, 0.01), (REJECTED, 0.01), None, (REJECTED, 0.01))
+    assert found == ["fast motion", "not found again", "not found again", "", "view changed"]
 
 
 def test_segments_have_the_cause_that_began_them() -> None:
     again = "not found again"
-    run = run_of([0, "fast motion", NOT_USED, again, again, 0, "too dark", OTHER_MAP, again, 0])
-    found = losses(run)
+    lost_by = ["", "fast motion", "", again, again, "", "too dark", "", again, ""]
+    place = [LOST if cause else 0 for cause in lost_by]
+    place[2], place[7] = NOT_USED, ELSEWHERE
+    found = losses(placed_frames(place, cause=lost_by))
     assert [(loss.first, loss.last, loss.frames, loss.cause) for loss in found] == [
         (1, 4, 3, "fast motion"),
         (6, 6, 1, "too dark"),
@@ -84,8 +79,8 @@ def test_black_frames_of_a_phantom_are_too_dark_and_motion_is_measured(tmp_path:
     spec = PhantomSpec(frames=8, width=96, height=80, seed=3, events=parse_events("black:4-5"))
     write_phantom(spec, tmp_path / "phantom")
     result = reconstruct(open_sequence(tmp_path / "phantom"), Config.load(settings={"mapping.method": "none"}))
-    (loss,) = losses(run_of_result(result))
+    (loss,) = losses(result.frames)
     assert (loss.first, loss.last, loss.cause) == (4, 5, "too dark")
-    seen = [record.track for record in result.records]
-    assert all(0.0 < one.motion < 0.05 and 0.3 < one.sharpness < 3 for one in seen[1:4])
-    assert seen[4].usable < 0.2 < seen[3].usable
+    seen = result.frames.only(np.arange(1, 4))
+    assert all((seen["motion"] > 0.0) & (seen["motion"] < 0.05) & (seen["sharpness"] > 0.3) & (seen["sharpness"] < 3))
+    assert result.frames["usable"][4] < 0.2 < result.frames["usable"][3]

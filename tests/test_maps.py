@@ -25,12 +25,12 @@ from scopemap.frame import Frame
 from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
+from scopemap.io.depth_maps import DepthReader
 from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
 from scopemap.mapping.bundle_problem import BundleProblem
 from scopemap.mapping.map_merging import split_maps
 from scopemap.mapping.submaps import corrected_frame
-from scopemap.reconstruction import DepthReader
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -80,14 +80,14 @@ def result(spliced: Path, out: Path) -> Reconstruction:
 def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_maps(result: Reconstruction) -> None:
     rest = SECOND - LOST_BEFORE_NEW
     other = ["other-map"] * FIRST + ["lost"] * LOST_BEFORE_NEW
-    assert [r.track.status for r in result.records] == [*other, "initial", *["ok"] * (rest - 1)]
-    assert [r.map for r in result.records] == [1] * FIRST + [None] * LOST_BEFORE_NEW + [0] * rest
-    assert [record.index for record in result.lost] == list(range(FIRST, FIRST + LOST_BEFORE_NEW))
+    assert result.frames["status"].tolist() == [*other, "initial", *["ok"] * (rest - 1)]
+    assert result.frames["map"].tolist() == [1] * FIRST + [-1] * LOST_BEFORE_NEW + [0] * rest
+    assert result.lost["index"].tolist() == list(range(FIRST, FIRST + LOST_BEFORE_NEW))
     counts = {name: result.provenance[name] for name in ("frames", "tracked", "lost", "in_other_maps")}
     expected = {"frames": FIRST + SECOND, "tracked": rest, "lost": LOST_BEFORE_NEW, "in_other_maps": FIRST}
     assert counts == expected
-    assert result.records[0].track.reason == "tracked in maps/1"
-    assert "keyframe" in result.records[FIRST].track.reason
+    assert result.frames["reason"][0] == "tracked in maps/1"
+    assert "keyframe" in result.frames["reason"][FIRST]
     assert any(text.startswith("2 submaps") for text in warned(result.provenance))
 
 
@@ -103,8 +103,8 @@ def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstr
 
 def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
     (other,) = result.others
-    assert [record.index for record in other.records] == list(range(FIRST))
-    assert {record.map for record in other.records} == {1}
+    assert other.frames["index"].tolist() == list(range(FIRST))
+    assert set(other.frames["map"].tolist()) == {1}
     off = inverse(other.trajectory.T_world_camera) @ true_poses(spliced)[:FIRST]
     assert rotation_angle_rad(off[:, :3, :3]).max() < np.radians(0.5)
     assert other.provenance["tracked"] == FIRST
@@ -115,7 +115,7 @@ def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: 
     written = read_trajectory(out / "maps" / "1")
     assert written.indices.tolist() == list(range(FIRST))
     assert written.tracked.all()
-    assert read_trajectory(out).tracked.tolist() == [record.map == 0 for record in result.records]
+    assert read_trajectory(out).tracked.tolist() == (result.frames["map"] == 0).tolist()
     with (out / "frames.csv").open(newline="") as file:
         assert [row["map"] for row in csv.DictReader(file)][:FIRST] == ["1"] * FIRST
     mesh = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
@@ -152,7 +152,7 @@ def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: P
 def test_frames_that_are_fused_as_they_come_are_fused_by_map(spliced: Path, result: Reconstruction) -> None:
     at_once = {"mapping__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
     live = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
-    assert [r.track.status for r in live.records] == [r.track.status for r in result.records]
+    assert live.frames["status"].tolist() == result.frames["status"].tolist()
     for part, stored in zip([live, *live.others], [result, *result.others], strict=True):
         np.testing.assert_allclose(part.mesh.bounds, stored.mesh.bounds, atol=6.0)  # of other voxels
         assert part.provenance["surface"]["coverage_mean"] > 0.5
@@ -326,18 +326,18 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: None)
     settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
     result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
-    status = [record.track.status for record in result.records]
+    status = result.frames["status"].tolist()
     assert status == ["initial"] + ["ok"] * 53
-    assert [result.records[10 + n].track.reason for n in range(LOST_BEFORE_NEW + 1)] == [
+    assert result.frames["reason"][10 : 11 + LOST_BEFORE_NEW].tolist() == [
         *["tracked backwards"] * LOST_BEFORE_NEW,
         "new map",
     ]
     assert any("in 2 map(s)" in note for note in said(result.provenance))
     assert not [text for text in warned(result.provenance) if "submaps" in text]
-    np.testing.assert_allclose(result.records[0].T_world_camera, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(result.frames["T_world_camera"][0], np.eye(4), atol=1e-9)
     report = pose_report(match(result.trajectory, read_trajectory(cut), "sim3"))
     assert report["ate_rmse_mm"] < 0.4
-    assert set(fused) == {record.index for record in result.records} - {record.index for record in result.lost}
+    assert set(fused) == set(result.frames["index"].tolist()) - set(result.lost["index"].tolist())
     # Depth is in the same millimetres before the break and after it.
     truth, depth = C3vdFolder(cut), DepthReader(tmp_path / "out")
     ratios = []

@@ -15,12 +15,13 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import MaskSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.estimators import create_estimators, estimators_provenance
+from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles, create_masks
 from scopemap.masking.masker import Masker
 from scopemap.pipeline import Pipeline
+from scopemap.runner.provenance import estimators_provenance
 
 SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)
 RECTIFIER = Rectifier(SOURCE, working_camera(SOURCE, (320, 240)))

@@ -63,7 +63,7 @@ def test_a_user_with_folders_of_weights_gets_the_papers_run(tmp_path: Path, monk
         unmasked = [bool(step.frame.valid.all()) for step in steps]
         assert unmasked.count(True) == (0 if preset == "paper" else FRAMES - 1)
         if preset == "paper-strict":
-            assert [record.index for record in result.lost] == [4]
+            assert result.lost["index"].tolist() == [4]
 
 
 def test_a_range_takes_the_place_of_depth_pro(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,9 @@ from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.estimators import create_estimators
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.io.depth_maps import DepthReader
 from scopemap.odometry import Step
 from scopemap.preprocessing import Estimators
-from scopemap.reconstruction import DepthReader
 
 LOST, FRAMES = 8, 14
 EXPONENT = 1.3
@@ -80,10 +80,11 @@ def test_adjusted_rotations_are_better_than_tracked_ones(run: _Run) -> None:
 
 def test_depth_maps_in_the_folder_have_the_adjusted_scale_and_shape(run: _Run) -> None:
     reader, factors, before_all, after_all = DepthReader(run.out), [], [], []
-    for step, before, after in zip(run.steps, run.tracked.records, run.adjusted.records, strict=True):
+    scales = run.adjusted.frames["depth_scale"] / run.tracked.frames["depth_scale"]
+    for step, factor in zip(run.steps, scales.tolist(), strict=True):
         if step.track.status == "lost":
             continue
-        factors.append(after.depth_scale / before.depth_scale)
+        factors.append(factor)
         known = np.isfinite(step.refined.depth_mm)
         kept = reader.read(step.frame.index)
         scaled = factors[-1] * step.refined.depth_mm[known]

@@ -23,9 +23,10 @@ from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
+from scopemap.io.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
+from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence
 from scopemap.odometry import Step
-from scopemap.reconstruction import DEPTH_SCALE_MM, DepthReader, DepthWriter, FrameRecord
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
@@ -86,7 +87,7 @@ def test_frames_table(run: _Run) -> None:
     expected[LOST] = "lost"
     assert [row["status"] for row in rows] == expected
     assert [row["name"] for row in rows] == [f"{i:04d}_color.png" for i in range(FRAMES)]
-    assert [int(row["keyframe"]) for row in rows] == [record.track.keyframe for record in run.result.records]
+    assert [int(row["keyframe"]) for row in rows] == run.result.frames["keyframe"].tolist()
     np.testing.assert_allclose([float(row["time_s"]) for row in rows], np.arange(FRAMES) / 30, atol=1e-6)
     assert rows[LOST]["reason"]
     assert [row["cause"] for row in rows] == ["too dark" if index == LOST else "" for index in range(FRAMES)]
@@ -94,14 +95,23 @@ def test_frames_table(run: _Run) -> None:
     assert [row["map"] for row in rows] == ["" if index == LOST else "0" for index in range(FRAMES)]
 
 
+def test_the_folder_is_read_back_and_its_table_written_the_same(run: _Run, tmp_path: Path) -> None:
+    folder = RunFolder(run.out).checked()
+    folder.frames.write(tmp_path / "again.csv")
+    assert (tmp_path / "again.csv").read_bytes() == (run.out / "frames.csv").read_bytes()
+    np.testing.assert_allclose(folder.camera.matrix, run.result.camera.matrix)
+    assert (folder.config, folder.scale_known) == (run.result.config, True)
+    assert folder.frames.counts == run.result.frames.counts
+
+
 def test_numbers_that_do_not_exist_are_empty(run: _Run) -> None:
     rows = _rows(run.out)
     for name in ("residual", "inlier_share", "correlation", "overlap"):
         assert rows[0][name] == ""
         told = [float(row[name]) for row in rows if row["status"] == "ok"]
-        known = [getattr(record.track, name) for record in run.result.records if record.track.status == "ok"]
+        known = run.result.frames[name][run.result.frames["status"] == "ok"]
         np.testing.assert_allclose(told, known, rtol=1e-4)
-    assert [int(row["iterations"]) for row in rows] == [record.track.iterations for record in run.result.records]
+    assert [int(row["iterations"]) for row in rows] == run.result.frames["iterations"].tolist()
     assert {float(row["depth_scale"]) for row in rows} == {1.0}
 
 
@@ -204,15 +214,10 @@ def test_without_a_folder_nothing_is_written(run: _Run, tmp_path: Path, monkeypa
     config = with_true_depth(run.phantom, fusion__enabled=False)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
     assert list(tmp_path.iterdir()) == []
+    assert any(text.startswith("frames in the result: 3, too few") for text in said(result.provenance))
+    assert warned(run.result.provenance) == []
     result.save(tmp_path / "empty")
     assert not (tmp_path / "empty" / "mesh.glb").exists()
-
-
-def test_record_of_a_lost_frame_has_no_pose(run: _Run) -> None:
-    assert FrameRecord.of(run.steps[LOST]).T_world_camera is None
-    assert run.result.records[LOST].T_world_camera is None
-    assert np.isnan(run.result.trajectory.T_world_camera[LOST]).all()
-    assert [lost.index for lost in run.result.lost] == [LOST]
 
 
 def test_depth_writer_at_the_ends_of_its_range(run: _Run, tmp_path: Path) -> None:
@@ -270,19 +275,12 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
     result = reconstruct(open_sequence(run.phantom), config, out=out, observers=(ask, told_after))
     last = LOST - 2
     told = json.loads((out / "provenance.json").read_text())
-    assert told["interrupted_at_frame"] == result.records[-1].index == last
+    assert told["interrupted_at_frame"] == result.frames["index"][-1] == last
     assert f"interrupted at frame {last}: the result is of the frames until then" in warned(told)
     assert [int(row["index"]) for row in _rows(out)] == list(range(last + 1))
     assert len(read_trajectory(out)) == last + 1
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) > 100
     assert run.result.provenance["interrupted_at_frame"] is None
-
-
-def test_a_result_of_few_frames_warns(run: _Run) -> None:
-    config = with_true_depth(run.phantom, fusion__enabled=False)
-    result = reconstruct(open_sequence(run.phantom, frames=slice(0, 2)), config)
-    assert any(text.startswith("frames in the result: 2, too few") for text in said(result.provenance))
-    assert warned(run.result.provenance) == []
 
 
 def test_overwrite_takes_away_the_earlier_run_and_nothing_else(run: _Run, tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.mapis import Mapis
 from scopemap.errors import InputError
-from scopemap.estimators import create_estimators, estimators_provenance
+from scopemap.estimators import create_estimators
 from scopemap.io.opening import open_sequence
 from scopemap.pipeline import Pipeline
-from scopemap.runner.run import reconstruct
+from scopemap.runner.provenance import estimators_provenance
+from scopemap.runner.reconstruct import reconstruct
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_without_any_depth_no_frame_counts_as_tracked(folder: Path, tmp_path: Pa
 def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: Path) -> None:
     late = _depth_files(tmp_path / "late", [0.0, 0.0] + [30.0] * (FRAMES - 2))
     result = reconstruct(open_sequence(folder), with_true_depth(late))
-    status = [record.track.status for record in result.records]
+    status = result.frames["status"].tolist()
     assert status == ["lost", "lost", "initial"] + ["ok"] * (FRAMES - 3)
 
 

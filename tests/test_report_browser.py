@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of
 
-from scopemap.report.frame_pictures import picture_file
+from scopemap.io.run_folder import RunFolder
 from scopemap.report.page import write_comparison, write_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -158,7 +158,7 @@ def test_a_lost_frame_says_so(browser: Any, report: Path) -> None:
 def test_a_frame_without_a_picture_shows_one_of_its_own_submap(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     for index in (IN_RESULT, *range(IN_RESULT - 2, IN_RESULT)):
-        picture_file(folder, index).unlink()  # then the nearest to the last of the result is of a lost frame
+        RunFolder(folder).picture_file(index).unlink()  # then the nearest to the last of the result is of a lost frame
     opened = Opened(browser, write_report(folder)[0])
     opened.slide(IN_RESULT - 1)
     assert opened.text("#video-note") == f"of frame {IN_RESULT - 3}"

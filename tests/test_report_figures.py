@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.errors import SettingsError
-from scopemap.geometry.rendering import render_mesh
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap.report.depth_figures import DepthScene, colour_depth, draw_depth_change, draw_depths
@@ -21,14 +20,13 @@ from scopemap.report.mesh_figures import (
     draw_mesh,
     draw_path,
     draw_reconstruction,
-    draw_surface,
     draw_trajectories,
     inside_view,
     mesh_picture,
     outside_views,
     view_from_behind,
 )
-from scopemap.report.sheet import Plot, Sheet, ticks
+from scopemap.report.sheet import Plot, Sheet
 
 NAN = float("nan")
 
@@ -69,11 +67,6 @@ def test_trajectories_show_estimate_green_and_truth_red(tmp_path: Path) -> None:
     assert count_colour(alone, TRUTH_COLOUR) == 0
 
 
-def test_a_trajectory_without_any_pose_is_drawn_empty(tmp_path: Path) -> None:
-    draw_trajectories(np.full((5, 3), np.nan), None, tmp_path / "lost.png")
-    assert count_colour(read(tmp_path / "lost.png"), ESTIMATE_COLOUR) < 200
-
-
 def test_only_figures_of_benchmarks_need_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
@@ -82,11 +75,6 @@ def test_only_figures_of_benchmarks_need_matplotlib(tmp_path: Path, monkeypatch:
     draw_mesh(BALL, tmp_path / "m.png")
     with pytest.raises(SettingsError, match=r"pip install -e bench"):
         draw_depth_change(DepthScene("s", (np.zeros((4, 4, 3), np.uint8),) * 2, {}), tmp_path / "d.png")
-
-
-def test_round_numbers_are_marked() -> None:
-    assert ticks(0.0, 1.0) == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
-    assert ticks(-130.0, 90.0) == [-100.0, -50.0, 0.0, 50.0]
 
 
 def test_a_plot_puts_values_where_its_axes_say_and_leaves_gaps() -> None:
@@ -150,16 +138,6 @@ def test_a_ball_is_painted_where_it_projects() -> None:
     brightest = picture[miss_mm < 7.8].max(axis=0)
     assert brightest[0] > 190
     assert brightest[2] < 35
-
-
-def test_near_things_hide_far_things() -> None:
-    near, far = coloured_ball((0, 0, 40.0), 5.0, (0, 200, 0)), coloured_ball((0, 0, 80.0), 30.0, (200, 0, 0))
-    for meshes in ((near, far), (far, near)):
-        view = inside_view(np.eye(4))
-        picture = mesh_picture(trimesh.util.concatenate(meshes), view)
-        middle = picture[view.camera.height // 2, view.camera.width // 2]
-        assert middle[1] > 100
-        assert middle[0] == 0
 
 
 def test_outside_views_hold_the_whole_mesh() -> None:
@@ -228,14 +206,6 @@ def test_a_path_is_drawn_where_it_projects() -> None:
     assert (rows.min(), rows.max()) == pytest.approx((pixels[3, 1], pixels[0, 1] + 4), abs=3)
 
 
-def test_the_mesh_does_not_hide_the_path() -> None:
-    view = inside_view(np.eye(4))
-    picture = mesh_picture(BALL, view)
-    draw_path(picture, view, np.array([[-5.0, 0.0, 90.0], [5.0, 0.0, 90.0]]), TRUTH_COLOUR)
-    middle = picture[view.camera.height // 2, view.camera.width // 2]
-    assert is_colour(middle[None], TRUTH_COLOUR).all()
-
-
 def test_outside_views_hold_the_path_too() -> None:
     path = np.array([[0.0, 0.0, -200.0], [NAN] * 3, [50.0, 0.0, 0.0]])
     for view in outside_views(BALL, np.eye(4), path).values():
@@ -282,24 +252,3 @@ def test_a_reconstruction_of_nothing_is_white(tmp_path: Path) -> None:
     lost = np.full((4, 3), NAN)
     draw_reconstruction(trimesh.Trimesh(), lost, lost, tmp_path / "nothing.png", np.eye(4))
     assert (read(tmp_path / "nothing.png") > 250).mean() > 0.95
-
-
-def test_a_surface_is_drawn_beside_its_frame(tmp_path: Path) -> None:
-    view = inside_view(np.eye(4))
-    rgb = np.full((view.camera.height, view.camera.width, 3), (250, 0, 250), np.uint8)
-    frame, path = (rgb, view.camera, np.eye(4)), np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
-    confidence = (BALL.vertices[:, 0] > 0).astype(np.float32)
-    rendering = render_mesh(BALL, view.camera, np.eye(4))
-    draw_surface(frame, rendering, BALL, path, tmp_path / "bare.png")
-    draw_surface(frame, rendering, BALL, path, tmp_path / "certain.png", confidence)
-    draw_surface(frame, rendering, BALL, path, tmp_path / "certain.jpg", confidence)
-    bare, certain = read(tmp_path / "bare.png"), read(tmp_path / "certain.png")
-    assert certain.shape[1] == pytest.approx(bare.shape[1] * 4 / 3, abs=4)
-    for picture in (bare, certain):
-        assert count_colour(picture, "#fa00fa") > 300 * 300
-        assert count_colour(picture, "#7878dc") > 1000
-        assert count_colour(picture, ESTIMATE_COLOUR) > 50
-    yellow = (certain[..., 0] > 180) & (certain[..., 2] < 120)
-    assert yellow.sum() > 500
-    assert not ((bare[..., 0] > 180) & (bare[..., 2] < 120)).any()
-    assert (tmp_path / "certain.jpg").stat().st_size < 200_000

@@ -17,8 +17,8 @@ import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, draw_run, drawn_result, pose_of, tube
 
 from scopemap.errors import InputError
-from scopemap.report.frame_pictures import FramePictures, picture_file, pictured_frames, read_measures
-from scopemap.report.kept_run import read_run
+from scopemap.io.run_folder import RunFolder
+from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
@@ -64,7 +64,7 @@ def test_every_frame_is_on_the_page_with_its_pose_and_place(page: str) -> None:
 def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
     maps = shown(page)["maps"]
     assert [one["frames"] for one in maps] == [IN_RESULT, IN_FIRST_MAP]
-    mesh = read_run(folder).maps[0].mesh
+    mesh = RunFolder(folder).mesh
     low, high = np.array(maps[0]["low"]), np.array(maps[0]["high"])
     positions = low + numbers(maps[0]["positions"], "u2").reshape(-1, 3) / 65535 * (high - low)
     np.testing.assert_allclose(positions, mesh.vertices, atol=1e-3)
@@ -75,10 +75,10 @@ def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
 
 def test_pictures_and_depth_are_those_of_the_frames(page: str, folder: Path) -> None:
     data = shown(page)
-    assert [picture["row"] for picture in data["pictures"]] == pictured_frames(folder) == list(range(FRAMES))
+    assert [picture["row"] for picture in data["pictures"]] == RunFolder(folder).pictured == list(range(FRAMES))
     near, far = data["depth_range"]
     code = cv2.imdecode(np.frombuffer(b64decode(data["pictures"][3]["depth"]), np.uint8), cv2.IMREAD_UNCHANGED)
-    depth = read_run(folder).depth_mm(3)
+    depth = RunFolder(folder).depth.read(3)
     assert depth is not None
     inside = (code > 1) & (code < 255)
     assert inside.mean() > 0.5
@@ -108,11 +108,11 @@ def test_a_name_may_be_no_utf8(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "kept_name"), [(b'"\xe4\n, .png', '"?\n, .png'), (b"\xe2\x80\xa8.png", "\u2028.png")])
 def test_frames_names_may_be_anything_that_files_names_are(tmp_path: Path, name: bytes, kept_name: str) -> None:
     result = drawn_result()
-    records = [replace(record, name=os.fsdecode(name)) for record in result.records]
-    replace(result, records=records).save(tmp_path)
-    kept = read_run(tmp_path)
-    assert [row["name"] for row in kept.rows] == [kept_name] * FRAMES
-    assert (kept.place == 0).sum() == IN_RESULT
+    result.frames.rows["name"] = os.fsdecode(name)
+    result.save(tmp_path)
+    frames = RunFolder(tmp_path).frames
+    assert frames["name"].tolist() == [kept_name] * FRAMES
+    assert (frames.place == 0).sum() == IN_RESULT
 
 
 def test_a_long_run_stays_small(tmp_path: Path) -> None:
@@ -120,22 +120,21 @@ def test_a_long_run_stays_small(tmp_path: Path) -> None:
     for index in range(450):
         pictures.put(index, noise, np.ones((256, 320), bool))
     pictures.save(tmp_path)
-    kept = pictured_frames(tmp_path)
+    kept = RunFolder(tmp_path).pictured
     assert kept == list(range(0, 450, 8))
     fewer = FramePictures()
     fewer.put(3, noise, np.ones((256, 320), bool))
     fewer.save(tmp_path / "again")
     pictures.save(tmp_path / "again")
-    assert pictured_frames(tmp_path / "again") == kept
-    assert len(read_measures(tmp_path)) == 450
-    run = read_run(draw_run(tmp_path / "run"))
+    assert RunFolder(tmp_path / "again").pictured == kept
+    assert len(RunFolder(tmp_path).measures) == 450
+    run = RunFolder(draw_run(tmp_path / "run"))
     for index in range(FRAMES):  # the heaviest pictures that there are
-        run.pictures[index].write_bytes(picture_file(tmp_path, 0).read_bytes())
+        run.picture_file(index).write_bytes(RunFolder(tmp_path).picture_file(0).read_bytes())
     share = page_data(run, shown_meshes(run, 1000), share=0.05)
     assert 0 < len(share["pictures"]) < FRAMES
     assert len(json.dumps(share["pictures"])) < 0.05 * 12e6
     assert len(page_data(run, shown_meshes(run, 1000), share=1e-6)["pictures"]) == 1
-    assert run.indices is run.indices  # made once: the page asks for each frame's
 
 
 def test_a_fine_mesh_is_simplified_and_keeps_its_colours() -> None:
@@ -186,7 +185,7 @@ def test_truth_is_shown_where_it_is_known(tmp_path: Path) -> None:
         row[1, 3] += 0.3 * i**1.5
     # C3VD's form: one pose a line, column by column.
     (truth / "pose.txt").write_text("\n".join(" ".join(f"{v:.9f}" for v in row.T.ravel()) for row in rows))
-    run = read_run(draw_run(tmp_path / "run", name=str(truth)))
+    run = RunFolder(draw_run(tmp_path / "run", name=str(truth)))
     found = page_data(run, shown_meshes(run, 1000))["truth"]
     assert found is not None
     assert numbers(found["positions"], "f4").size == 3 * IN_RESULT
@@ -211,7 +210,7 @@ def test_summary_picture_has_the_verdicts_colour_frames_and_the_mesh(page: str, 
     picture = cv2.imread(str(folder / "summary.png"))[..., ::-1].astype(int)
     assert picture.shape[1] == 1596
     assert np.abs(picture[2, 100] - (163, 90, 0)).max() < 3  # doubtful: 14 of 24 frames
-    frame = cv2.imread(str(picture_file(folder, 0)))[..., ::-1].astype(int)
+    frame = cv2.imread(str(RunFolder(folder).picture_file(0)))[..., ::-1].astype(int)
     corner = picture[104 + 26 : 104 + 26 + 307, 12 : 12 + 384]
     assert np.abs(corner.mean((0, 1)) - frame.mean((0, 1))).max() < 6
     mesh_row = picture[-400 - 410 : -410]

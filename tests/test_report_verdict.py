@@ -11,26 +11,31 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import GOOD_SURFACE, tube
+from drawn_run import CAMERA, GOOD_SURFACE, placed_frames, tube
 
+from scopemap.config import Config
 from scopemap.notices import KINDS, Notice, fields_of_kind, notices_of
+from scopemap.reconstruction import Reconstruction
 from scopemap.report import verdict as rules
-from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, KeptMap, KeptRun
 from scopemap.report.submap_summaries import doubt_words, most_doubtful, submaps_in_time
 from scopemap.report.verdict import longest_segment, scale_is_known, verdict
+from scopemap.trajectory.frame_table import ELSEWHERE, LOST, NOT_USED
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
 
-def run_of(place: list[int], *, mesh: trimesh.Trimesh | None = None, **facts: Any) -> KeptRun:
+def run_of(
+    place: list[int], *, mesh: trimesh.Trimesh | None = None, shares: list[float] | None = None, **facts: Any
+) -> Reconstruction:
     provenance = {
         "camera": {"source": "calibration file camera.yaml", "origin": "calibrated"},
         "surface": GOOD_SURFACE,
     } | facts
-    maps = [KeptMap(np.arange(3), np.tile(np.eye(4), (3, 1, 1)), tube() if mesh is None else mesh)]
-    return KeptRun(
-        None, [{"index": str(i), "time_s": str(i / 10)} for i in range(len(place))], maps, np.array(place), provenance
+    columns = {} if shares is None else {"inlier_share": shares}
+    one = Reconstruction(
+        CAMERA, placed_frames(place, **columns), tube() if mesh is None else mesh, Config(), provenance
     )
+    return replace(one, others=[one] * max(*place, 0))
 
 
 def surface(**figures: float) -> dict[str, float]:
@@ -125,24 +130,21 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
 
 
 def test_lost_frames_and_other_maps_are_told_apart() -> None:
-    texts = " ".join(reason.text for reason in verdict(run_of([0] * 90 + [LOST] * 4 + [OTHER_MAP] * 6)).reasons)
+    texts = " ".join(reason.text for reason in verdict(run_of([0] * 90 + [LOST] * 4 + [ELSEWHERE] * 6)).reasons)
     assert "6 more frames form submaps of their own" in texts
     assert "In 4 frames the camera could not be followed" in texts
     assert "Longest gap: 10 frames" in texts
 
 
-def run_of_submaps(*submaps: tuple[int, int, float]) -> KeptRun:
+def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:
     """A run of submaps: number of the map, its frames, and their inlier share; in the order of the frames."""
     place = [number for number, frames, _ in submaps for _ in range(frames)]
-    shares = [share for _, frames, share in submaps for _ in range(frames)]
-    run = run_of(place)
-    rows = [row | {"inlier_share": f"{share}"} for row, share in zip(run.rows, shares, strict=True)]
-    return replace(run, rows=rows, maps=run.maps * (max(place) + 1))
+    return run_of(place, shares=[share for _, frames, share in submaps for _ in range(frames)])
 
 
 def test_submaps_are_in_order_of_time_and_the_worst_is_named() -> None:
     run = run_of_submaps((2, 20, 0.7), (0, 50, 0.9), (1, 30, 0.55))
-    submaps = submaps_in_time(run)
+    submaps = submaps_in_time(run.frames)
     assert [(submap.name, submap.first, submap.last) for submap in submaps] == [
         ("maps/2", 0, 19),
         ("the result", 20, 69),
@@ -154,8 +156,8 @@ def test_submaps_are_in_order_of_time_and_the_worst_is_named() -> None:
 
 
 def test_one_submap_is_not_compared() -> None:
-    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2)))) == ""
-    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2), (1, 20, float("nan"))))) == ""
+    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2)).frames)) == ""
+    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2), (1, 20, float("nan"))).frames)) == ""
     assert "doubtful" not in " ".join(reason.text for reason in verdict(run_of([0] * 50)).reasons)
 
 

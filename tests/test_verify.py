@@ -13,8 +13,9 @@ import pytest
 from front_door import call, refused
 from tiny_phantom import write_tiny
 
+from scopemap.actions.verifying import verify_result
 from scopemap.io import checksums
-from scopemap.io.checksums import SUMS, input_checksum, verify_result
+from scopemap.io.checksums import SUMS, input_checksum
 from scopemap.report.page import write_report
 
 Capture = pytest.CaptureFixture[str]

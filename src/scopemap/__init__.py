@@ -81,8 +81,8 @@ if TYPE_CHECKING:
     from scopemap.frame import Frame, Truth
     from scopemap.io.opening import open_sequence
     from scopemap.reconstruction import Reconstruction
+    from scopemap.runner.reconstruct import reconstruct
     from scopemap.runner.reconstructor import Reconstructor
-    from scopemap.runner.run import reconstruct
     from scopemap.trajectory.formats.opening import read_trajectory
     from scopemap.trajectory.trajectory import Trajectory
 
@@ -112,7 +112,7 @@ _HOMES = {
     "Truth": "frame",
     "open_sequence": "io.opening",
     "read_trajectory": "trajectory.formats.opening",
-    "reconstruct": "runner.run",
+    "reconstruct": "runner.reconstruct",
 }
 
 

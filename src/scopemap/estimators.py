@@ -1,21 +1,16 @@
-"""Creates the estimators that the settings name, and reports what they depend on."""
+"""Creates the estimators that the settings name."""
 
 from __future__ import annotations
 
 import math
-import platform
 from dataclasses import dataclass
-from functools import cache, partial
-from importlib.metadata import version
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
-
-from numba.core.event import TimingListener, register
 
 from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
 from scopemap.depth.create import create_anchor, create_depth, files_folder
-from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
+from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.depth.perceptual import create_perceptual
@@ -29,12 +24,7 @@ from scopemap.masking.mask_files import create_masks
 from scopemap.preprocessing import Estimators
 from scopemap.tracking.alike import AlikeFeatures
 from scopemap.tracking.at_rest import CameraAtRest
-from scopemap.tracking.features import FeatureDetector, SiftFeatures
-
-_VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
-_COMPILING = TimingListener()
-register("numba:compile", _COMPILING)
-_VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
+from scopemap.tracking.features import SiftFeatures
 
 
 @dataclass(frozen=True)
@@ -104,42 +94,3 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
     if config.mapping.method != "none":
         log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
     return math.exp(log_factor) * max_depth_mm(config.depth)
-
-
-def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
-    """Return `known`, whether the scale of a run is measured or anchored, `measured`, and its `source` in words."""
-    depth, anchor = estimators.depth, estimators.anchor
-    guessed = isinstance(depth, FilesDepth) and anchor.is_measured and not depth.scale_is_known
-    source = anchor.description + (" of unknown unit" if guessed else "")
-    known = anchor.scale_is_known and not guessed
-    return {"known": known, "measured": known and anchor.is_measured, "source": source}
-
-
-def estimators_provenance(estimators: Estimators) -> dict[str, str]:
-    """Return names, versions and hashes of the estimators, and the source of the depth scale."""
-    parts = estimators.depth.provenance()
-    others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance | FeatureDetector] = {
-        "flow": estimators.flow,
-        "perceptual": estimators.perceptual,
-        "features": estimators.features,
-    }
-    if estimators.anchor.reference.name == "depth-pro":
-        others["anchor"] = estimators.anchor.reference
-    for role, part in others.items():
-        # Several parts have weights and hashes: the key names the part.
-        facts = part.provenance()
-        parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
-    masks = {} if estimators.masks is None else estimators.masks.provenance()
-    return parts | masks | {"keyframe_flow": estimators.keyframe_flow.name, "anchor": estimators.anchor.description}
-
-
-@cache
-def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that a result depends on; of `networks` if present."""
-    installed = [name for name in _VERSIONS_OF_NETWORKS if find_spec(name) is not None]
-    return {name: version(name) for name in (*_VERSIONS, *installed)} | {"python": platform.python_version()}
-
-
-def compiling_s() -> float:
-    """Return how long this process has compiled kernels that no cache held, s."""
-    return float(_COMPILING.duration) if _COMPILING.done else 0.0

@@ -201,3 +201,12 @@ def notices_of(provenance: Mapping[str, Any]) -> list[Notice]:
     """Return the notices in a run's provenance, each once."""
     found = (Notice.from_json(one) for one in provenance.get("notices", []))
     return list({(notice.code, notice.text): notice for notice in found}.values())
+
+
+def scale_words(scale: Mapping[str, Any]) -> str:
+    """Return what is known of a result's scale in words, from "scale" of its provenance; "" where that is empty."""
+    if not scale:
+        return ""
+    if scale["known"]:
+        return f"scale: {scale['source']}"
+    return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"

@@ -6,7 +6,7 @@ The preset `paper` refines before it tracks.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,6 +33,16 @@ class Step:
     track: Track
     raw_mm: np.ndarray
     refined: RefinedDepth
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The frame's row of a `FrameTable`, as tracked."""
+        frame, refined = self.frame, self.refined
+        pose = np.nan if frame.T_world_camera is None else frame.T_world_camera
+        some_mm = refined.depth_mm[::4, ::4]
+        depth = {"depth_scale": refined.scale, "warped_share": refined.warped_share}
+        depth["median_depth_mm"] = float(np.nanmedian(some_mm)) if np.isfinite(some_mm).any() else np.nan
+        return self.track.row | depth | {"time_s": frame.time_s, "name": frame.name, "T_world_camera": pose}
 
 
 class Odometry:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from scopemap.actions.inputs import open_truth
 from scopemap.errors import InputError
-from scopemap.io.provenance import read_provenance
 from scopemap.io.reference import read_reference
+from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Unit
@@ -88,7 +88,7 @@ def _frames(path: Path, truth: Path) -> Frames | None:
 def _timing(path: Path) -> dict[str, float]:
     """Return the times of a run's provenance; {} where there are none."""
     try:
-        seconds = read_provenance(path)["seconds"].items()
+        seconds = RunFolder(path).provenance["seconds"].items()
         return {f"seconds_{stage.replace(' ', '_')}": float(s) for stage, s in seconds}
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (InputError, ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -22,10 +22,10 @@ from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.poses import match
 from scopemap.frame import Frame, Truth
 from scopemap.geometry.se3 import inverse, se3, transform
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.masking.masker import Masker
-from scopemap.reconstruction import DepthReader
 from scopemap.report.depth_figures import DepthScene, draw_depth_change
 from scopemap.report.mesh_figures import draw_reconstruction, draw_registered_clouds
 from scopemap.trajectory.formats.opening import read_trajectory

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scopemap.errors import InputError
-from scopemap.io.provenance import without_nan
+from scopemap.io.json_numbers import without_nan
 
 FILE_NAME = "result.json"
 Figures = dict[str, dict[str, Any]]

@@ -16,11 +16,11 @@ from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, lo
 from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.geometry.align import AlignMode, Similarity
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence
 from scopemap.masking.masker import Masker
-from scopemap.reconstruction import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 from scopemap_bench.evaluation.consistency import ConsistencyMeter

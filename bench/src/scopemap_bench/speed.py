@@ -27,7 +27,7 @@ import numpy as np
 from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.io.opening import open_sequence
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 
@@ -60,7 +60,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "feature tracks": ("mapping.feature_tracks:FeatureTracks.add",),
     "depth triangulation": ("mapping.multiview_depth:triangulate_depth", "mapping.multiview_depth:propagate_depth"),
     "fusion": ("fusion.volume:TsdfVolume.integrate",),
-    "writing": ("reconstruction:DepthWriter.__call__", "reconstruction:Reconstruction.save"),
+    "writing": ("io.depth_maps:DepthWriter.__call__", "reconstruction:Reconstruction.save"),
 }
 """Functions, "module:name" in the package, whose processor time is a stage's; the rest is that of the run's parts."""
 
@@ -168,7 +168,7 @@ def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Spee
     started, cpu_started = time.perf_counter(), time.process_time()
     with clock.attached():
         result = reconstruct(sequence, config, out=out, overwrite=True)
-    count = len(result.records)
+    count = len(result.frames)
     cpu_ms = 1e3 * (time.process_time() - cpu_started) / count
     passed_ms = 1e3 * (time.perf_counter() - started) / count
     calibration_ms = float(np.median(calibrations + _calibrations_ms()))

@@ -28,12 +28,10 @@ from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import transform
 from scopemap.io import weights
 from scopemap.io.device import missing_packages
-from scopemap.io.provenance import read_provenance
+from scopemap.io.run_folder import RunFolder
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
-from scopemap.reconstruction import DepthReader
 from scopemap.report.depth_figures import draw_renderings
-from scopemap.trajectory.formats.opening import read_trajectory
 
 HELD_OUT_EVERY = 10
 _WORST = 3  # frames that are drawn
@@ -91,7 +89,7 @@ class RunFrames:
     """
 
     def __init__(self, run: Path, fusion: FusionSettings | None = None) -> None:
-        config = Config.load(file=run / "config.toml")
+        config = RunFolder(run).config
         fusion = fusion or config.fusion
         if config.fusion.voxel_mm is None or not config.fusion.enabled:
             raise InputError(f"the run {run} has no surface that could be compared with its video")
@@ -182,14 +180,15 @@ def _usable_depth(frame: Frame) -> np.ndarray:
 
 def _frames(run: Path, config: Config) -> Iterator[Frame]:
     """Yield the run's tracked frames that are fused, with valid pixels, depth and pose."""
-    source = Path(read_provenance(run).get("input", ""))
+    folder = RunFolder(run)
+    source = Path(folder.provenance.get("input", ""))
     if not source.exists():
         raise InputError(f"the input {source} of the run {run} is not there any more")
-    depth, trajectory, sequence = DepthReader(run), read_trajectory(run), open_truth(run, source)
+    depth, sequence = folder.depth, open_truth(run, source)
     if not depth.present or not is_camera_of(run, sequence):
         raise InputError(f"the run {run} kept no depth maps, or its input gives another camera now")
-    tracked = np.flatnonzero(trajectory.tracked)
-    pose_of = {int(trajectory.indices[k]): trajectory.T_world_camera[k] for k in tracked[:: config.fusion.every]}
+    tracked = folder.frames.rows[folder.frames.tracked][:: config.fusion.every]
+    pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
     mask = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
     for frame in sequence.frames():
         masked = mask(frame)

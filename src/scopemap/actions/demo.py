@@ -28,8 +28,8 @@ from scopemap.report.depth_figures import draw_depths
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.mesh_figures import draw_mesh, draw_trajectories
 from scopemap.report.page import write_report
-from scopemap.runner.preparation import Progress
-from scopemap.runner.run import Observer, reconstruct
+from scopemap.runner.reconstruct import reconstruct
+from scopemap.runner.run import Observer, Progress
 from scopemap.trajectory.formats.opening import read_trajectory
 
 CLIP, CAMERA, TRUTH = "colon.mp4", "camera.yaml", "pose.txt"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, InputSettings
 from scopemap.errors import CalibrationError, InputError, SettingsError
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import OF_UNKNOWN_VIEWS
-from scopemap.io.provenance import read_provenance
+from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence
 
 _SAME_CAMERA_PX = 0.01
@@ -22,17 +23,17 @@ def open_truth(run: Path, truth: Path) -> Sequence:
     from the data set. Raises as `open_sequence`.
     """
     camera, settings = _camera_of(run), _input_settings(run)
-    size = None if camera is None else (int(camera["width"]), int(camera["height"]))
+    size = None if camera is None else (camera.width, camera.height)
     if settings.stereo != "auto" and open_source(truth).name not in OF_UNKNOWN_VIEWS:
         settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader chooses the view
-    kept = run / "source_camera.yaml"
+    kept = RunFolder(run).source_camera_file
     try:
         sequence = open_sequence(truth, size=size, settings=settings)
     except CalibrationError:
-        if not kept.is_file():
+        if kept is None:
             raise
     else:
-        if not kept.is_file() or (sequence.calibrated and is_camera_of(run, sequence)):
+        if kept is None or (sequence.calibrated and is_camera_of(run, sequence)):
             return sequence
     exact = settings.model_copy(update={"camera_fit": "exact"})
     return open_sequence(truth, camera=kept, size=size, settings=exact)
@@ -44,16 +45,16 @@ def is_camera_of(run: Path, sequence: Sequence) -> bool:
     if camera is None:
         raise InputError(f"cannot read the camera of the run {run} from its provenance.json")
     return all(
-        abs(camera[name] - getattr(sequence.camera, name)) <= _SAME_CAMERA_PX for name in ("fx", "fy", "cx", "cy")
+        abs(getattr(camera, name) - getattr(sequence.camera, name)) <= _SAME_CAMERA_PX
+        for name in ("fx", "fy", "cx", "cy")
     )
 
 
-def _camera_of(run: Path) -> dict[str, float] | None:
+def _camera_of(run: Path) -> PinholeCamera | None:
     """Return the working camera of a run, whose size its depth maps have; None where it is unknown."""
     try:
-        camera = read_provenance(run)["camera"]
-        return {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    except (ValueError, KeyError, TypeError):
+        return RunFolder(run).camera
+    except InputError:
         return None
 
 

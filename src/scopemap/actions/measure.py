@@ -16,7 +16,6 @@ import numpy as np
 from scopemap.actions.export.exported_run import ExportedRun, read_exported
 from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
-from scopemap.report.kept_run import read_run
 
 _DRAWS, _TAIL_PERCENT = 2000, 2.5
 _PIXEL_ERROR_PX = 1.0
@@ -85,8 +84,8 @@ def measure(
             f"{folder}: {run.scale}; give two points as a reference: measures are then multiples of their distance, "
             "and millimetres where that is given, too"
         )
-    pose = _pose(run, folder, frame)
-    picked, errors = _picked(run, frame, pose, pixels), _drawn(folder, run)
+    pose = _pose(run, frame)
+    picked, errors = _picked(run, frame, pose, pixels), _drawn(run)
     unit, divisor, draws = "mm", 1.0, errors.scale
     if reference is not None:
         known = _picked(run, frame, pose, reference)
@@ -110,14 +109,13 @@ def measure(
     return [_measure(what, value / divisor, relative, unit) for what, value in found.items()]
 
 
-def _pose(run: ExportedRun, folder: Path, frame: int) -> np.ndarray:
+def _pose(run: ExportedRun, frame: int) -> np.ndarray:
     row = np.flatnonzero(run.trajectory.indices == frame)
     if len(row):
         return np.asarray(run.trajectory.T_world_camera[row[0]])
-    kept = read_run(folder)
-    place = kept.place[kept.indices == frame]
+    place = run.frames.place[run.frames["index"] == frame]
     where = f"it is in maps/{place[0]}, a folder of its own" if len(place) and place[0] > 0 else "it has no pose"
-    raise InputError(f"frame {frame} is not in the result {folder}: {where}")
+    raise InputError(f"frame {frame} is not in the result {run.path}: {where}")
 
 
 def _picked(run: ExportedRun, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
@@ -137,8 +135,7 @@ def _picked(run: ExportedRun, frame: int, pose: np.ndarray, pixels: np.ndarray) 
 
 def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
     """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
-    reader = run.depth()
-    own, sigma = (None, None) if reader is None else (reader.read(frame), reader.read_sigma(frame))
+    own, sigma = run.depth.read(frame), run.depth.read_sigma(frame)
     column, row = np.round(pixels).astype(int).T
     errors = np.full(len(pixels), np.nan)
     for image in () if own is None else (sigma, np.abs(own - _at(depth_mm, row, column, own.shape))):
@@ -153,9 +150,8 @@ def _at(values: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[in
     return image
 
 
-def _drawn(folder: Path, run: ExportedRun) -> _Errors:
-    facts: dict[str, Any] = read_run(folder).provenance
-    camera, scale = facts["camera"], facts.get("scale") or {}
+def _drawn(run: ExportedRun) -> _Errors:
+    camera, scale = run.provenance["camera"], run.provenance.get("scale") or {}
     focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
     if camera.get("origin") == "assumed":
         focal = max(focal, _ASSUMED_FOCAL_ERROR)

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scopemap.actions.inputs import is_camera_of, open_truth
-from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.io.provenance import read_provenance
+from scopemap.io.run_folder import RunFolder
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.report.kept_run import NOT_USED, read_run
+from scopemap.trajectory.trajectory import SKIPPED
 
 
 def frames_again(run: Path, indices: set[int]) -> Iterator[Frame]:
@@ -21,10 +20,10 @@ def frames_again(run: Path, indices: set[int]) -> Iterator[Frame]:
 
     Raises `InputError` where the input is gone or gives another camera.
     """
-    source = Path(read_provenance(run).get("input", ""))
+    source = Path(RunFolder(run).provenance.get("input", ""))
     if not source.exists():
         raise InputError(f"the input {source} of the run {run} is not there any more")
-    config, sequence = Config.load(file=run / "config.toml"), open_truth(run, source)
+    config, sequence = RunFolder(run).config, open_truth(run, source)
     if not is_camera_of(run, sequence):
         raise InputError(f"the input {source} of the run {run} gives another camera now")
     mask = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
@@ -35,7 +34,7 @@ def frames_again(run: Path, indices: set[int]) -> Iterator[Frame]:
 
 def keep_pictures_again(run: Path) -> None:
     """Write the pictures of a run that kept none, from its input. Raises `InputError` where that is not possible."""
-    kept, pictures = read_run(run), FramePictures(timed=False)
-    for frame in frames_again(run, set(kept.indices[kept.place != NOT_USED].tolist())):
+    frames, pictures = RunFolder(run).checked().frames, FramePictures(timed=False)
+    for frame in frames_again(run, set(frames["index"][frames["status"] != SKIPPED].tolist())):
         pictures.put(frame.index, frame.rgb, frame.valid)
     pictures.save(run)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import typer
 
-from scopemap.io.provenance import without_nan
+from scopemap.io.json_numbers import without_nan
 
 _LABELS = {
     "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",

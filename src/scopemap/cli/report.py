@@ -19,10 +19,10 @@ def report(
     """Write report.html and summary.png of a run into its folder."""
     from scopemap.actions.pictures import keep_pictures_again
     from scopemap.errors import InputError
-    from scopemap.report.frame_pictures import pictured_frames
+    from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import write_report
 
-    if pictures or not pictured_frames(run):
+    if pictures or not RunFolder(run).pictured:
         try:
             keep_pictures_again(run)
         except InputError as fault:

@@ -17,7 +17,7 @@ from scopemap.notices import notices_of
 if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.reconstruction import Reconstruction
-    from scopemap.report.kept_run import KeptRun
+    from scopemap.trajectory.frame_table import FrameTable
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
 _MOST_LOSSES = 5
@@ -179,8 +179,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
-    from scopemap.reconstruction import scale_words
-    from scopemap.report.kept_run import run_of
+    from scopemap.notices import scale_words
     from scopemap.report.losses import losses
 
     facts, known = result.provenance, result.provenance["scale"]["known"]
@@ -198,10 +197,9 @@ def summary_lines(result: Reconstruction) -> list[str]:
         _time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
-    run = run_of(result)
     if result.others:
-        lines += _map_lines(run)
-    lost = losses(run)
+        lines += _map_lines(result.frames)
+    lost = losses(result.frames)
     longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
     lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
     if len(lost) > _MOST_LOSSES:
@@ -209,10 +207,10 @@ def summary_lines(result: Reconstruction) -> list[str]:
     return lines + [f"note: {notice}" for notice in notices_of(facts) if notice.level == "info"]
 
 
-def _map_lines(run: KeptRun) -> list[str]:
+def _map_lines(frames: FrameTable) -> list[str]:
     from scopemap.report.submap_summaries import doubt_words, submaps_in_time
 
-    submaps, maps = submaps_in_time(run), []
+    submaps, maps = submaps_in_time(frames), []
     for submap in submaps:
         facts = ", ".join(filter(None, (f"{submap.first} to {submap.last}", submap.inliers)))
         maps.append(f"{submap.name} with {submap.frames} frames ({facts})")
@@ -223,7 +221,7 @@ def _map_lines(run: KeptRun) -> list[str]:
 def _time_words(result: Reconstruction) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
     seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
-    done = len(result.records) if after is None else sum(record.index > after for record in result.records)
+    done = len(result.frames) if after is None else int((result.frames["index"] > after).sum())
     since = "" if after is None else f" since it was resumed after frame {after}"
     return f"time: {seconds:.1f} s{since}, {done / seconds:.1f} frames/s"
 

@@ -21,7 +21,7 @@ def verify(
 
     Exit code 1 where a file is damaged or missing. `sha256sum -c SHA256SUMS` in the folder checks the same.
     """
-    from scopemap.io.checksums import verify_result
+    from scopemap.actions.verifying import verify_result
 
     found = verify_result(run)
     if as_json:

@@ -1,7 +1,6 @@
 """Perceptual distance between two images: LPIPS with AlexNet, or structural similarity, which needs no weights.
 
 LPIPS: Zhang et al., CVPR 2018; heads from the `lpips` package, backbone from the weights registry.
-SSIM: Wang et al., IEEE TIP 2004.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import numpy as np
 
 from scopemap.depth.estimate import PerceptualDistance, PerceptualResult
 from scopemap.errors import SettingsError, WeightsError, check_shape
+from scopemap.geometry.similarity import structural_similarity
 from scopemap.io import weights
 from scopemap.io.device import choose_device, need_packages
 
@@ -23,9 +23,6 @@ PACKAGES = ("torch", "torchvision", "lpips")
 
 # lpips cuts torchvision's features at the ReLUs; each slice keeps the number a layer had among the features.
 _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "10": "slice5"}
-_WINDOW_PX = 7
-_SAMPLE = _WINDOW_PX**2 / (_WINDOW_PX**2 - 1)  # of a sample's covariance
-_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang, section III.B
 
 
 def create_perceptual(name: str, device: str = "auto") -> PerceptualDistance:
@@ -39,21 +36,6 @@ def create_perceptual(name: str, device: str = "auto") -> PerceptualDistance:
         case "structure":
             return StructureDistance()
     raise SettingsError(f"unknown perceptual distance '{name}': choose one of lpips, structure")
-
-
-def structural_similarity(grey_a: np.ndarray, grey_b: np.ndarray) -> np.ndarray:
-    """Return the structural similarity (H, W) float64, -1..1, of two (H, W) uint8 images in 7 x 7 px (Wang, eq. 13)."""
-    a, b = grey_a.astype(np.float64), grey_b.astype(np.float64)
-    mean_a, mean_b, square_a, square_b, product = (_box_mean(image) for image in (a, b, a * a, b * b, a * b))
-    variances = _SAMPLE * (square_a + square_b - mean_a**2 - mean_b**2)
-    covariance = _SAMPLE * (product - mean_a * mean_b)
-    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
-    similarity: np.ndarray = luminance * (2 * covariance + _C2) / (variances + _C2)
-    return similarity
-
-
-def _box_mean(image: np.ndarray) -> np.ndarray:
-    return cv2.blur(image, (_WINDOW_PX, _WINDOW_PX), borderType=cv2.BORDER_REFLECT)
 
 
 class StructureDistance:

@@ -12,10 +12,10 @@ import trimesh
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
 from scopemap.depth.estimate import PerceptualDistance
-from scopemap.depth.perceptual import structural_similarity
 from scopemap.frame import Frame
 from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
+from scopemap.geometry.similarity import structural_similarity
 
 
 class FrameAgreement(NamedTuple):

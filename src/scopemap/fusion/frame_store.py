@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -198,17 +198,6 @@ class FrameStore:
         """Return the frame with this number; any thread may call it."""
         entries, place = self._index()
         return self._read(entries[place[index]])
-
-    def locate(self, poses: Mapping[int, np.ndarray]) -> None:
-        """Set the poses (4, 4) of stored frames, by number, after the last was put in; the file keeps the old ones."""
-        entries, place = self._index()
-        for index, T_world_camera in poses.items():
-            entries[place[index]]["has_pose"], entries[place[index]]["T_world_camera"] = True, T_world_camera
-
-    def poses(self, among: Collection[int]) -> dict[int, np.ndarray]:
-        """Return the poses (4, 4) of the frames with the given numbers that have one, by number."""
-        some = [entry for entry in self._index()[0] if entry["has_pose"] and int(entry["index"]) in among]
-        return {int(entry["index"]): entry["T_world_camera"] for entry in some}
 
     def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
         """Yield the frames, or those with the given numbers, in order; depth to 0.015 %, colours to a few levels."""

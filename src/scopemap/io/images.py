@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.decoding import by_number, decoded, frame_number, read_decoded
 from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
@@ -71,7 +73,7 @@ class ImageFolder(Source):
         self.notes = [f"time stamps: frame number / {self.rate_hz:g} s (the folder holds none)"]
         self.height, self.width = self._size()
         with self._making_camera():
-            self._use_first_calibration(path / OWN_CALIBRATION, self.files[0].with_name(OWN_CALIBRATION))
+            use_first_calibration(self, path / OWN_CALIBRATION, self.files[0].with_name(OWN_CALIBRATION))
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -146,3 +148,17 @@ def _numbers(files: list[Path]) -> list[int]:
     known = [number for number in numbers if number is not None]
     increase = len(known) == len(files) and all(a < b for a, b in pairwise(known))
     return known if increase else list(range(len(files)))
+
+
+def use_first_calibration(source: Source, *files: Path) -> bool:
+    """Have a source use the first of these files beside the frames that exists; return whether there is one.
+
+    It comes before a data set's own constants; opening fits it.
+    """
+    file = next((file for file in files if file.is_file()), None)
+    if file is not None:
+        stated = stated_calibration(file, (source.width, source.height))
+        source.calibration = replace(stated, source=f"{stated.source} beside the frames")
+        source.camera, source.camera_source = stated.camera, source.calibration.source
+        source.depth_scale_mm = stated.depth_scale_mm
+    return file is not None

@@ -16,7 +16,7 @@ import numpy as np
 from scopemap.config import InputSettings
 from scopemap.config.input import Box
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.images import ImageFolder
+from scopemap.io.images import ImageFolder, use_first_calibration
 from scopemap.io.source import Source, SourceFrame
 from scopemap.io.video import VideoFile
 from scopemap.io.video_format.interlacing import deinterlaced, is_interlaced
@@ -91,7 +91,7 @@ class PreparedSource(Source):
         elif source.calibration is not None and source.calibration.file is not None:
             # Without a size of its own, the file beside the images is for one view; any other camera is of both.
             try:
-                self._use_first_calibration(Path(source.calibration.file))
+                use_first_calibration(self, Path(source.calibration.file))
             except CalibrationError as fault:
                 self.camera_fault = fault
         elif isinstance(source, ImageFolder):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import Calibration, fitted
-from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.cameras.rectification import DepthSensor
 from scopemap.errors import InputError, ScopemapError
 from scopemap.frame import TruthQuality
@@ -145,19 +144,6 @@ class Source:
         """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
         calibration = fitted(Calibration(camera, None, source, file=name), (self.width, self.height), "scale")
         self.camera, self.camera_source = calibration.camera, calibration.source
-
-    def _use_first_calibration(self, *files: Path) -> bool:
-        """Use the first of these files beside the frames that exists; return whether there is one.
-
-        It comes before a data set's own constants; opening fits it.
-        """
-        file = next((file for file in files if file.is_file()), None)
-        if file is not None:
-            stated = stated_calibration(file, (self.width, self.height))
-            self.calibration = replace(stated, source=f"{stated.source} beside the frames")
-            self.camera, self.camera_source = stated.camera, self.calibration.source
-            self.depth_scale_mm = stated.depth_scale_mm
-        return file is not None
 
 
 def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:

@@ -108,13 +108,14 @@ class Mapper:
         )
         self._extended.add(track.map)
 
-    def join(self, start: Track, last: Track, T_earlier_own: np.ndarray) -> None:
-        """Make the map of `start` a part of an earlier one: tracking leads back from `start` to its frame `last`.
+    def join(self, start: int, last: int, T_earlier_own: np.ndarray) -> None:
+        """Make the map of the frame `start` a part of an earlier one: tracking leads back from it to its frame `last`.
 
         T_earlier_own : (4, 4), from its world to that of the earlier map.
         """
-        own, poses = start.map, self._poses()
-        earlier, after = poses[last.index], poses[start.index]
+        poses = self._poses()
+        earlier, after = poses[last], poses[start]
+        own = after.map
 
         def joined(pose: TrackedPose) -> TrackedPose:
             moved = pose._replace(map=earlier.map, T_world_camera=T_earlier_own @ pose.T_world_camera)
@@ -237,7 +238,7 @@ class FinalFrames:
 
     def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
-        self._read, self._correction = read, submap.correction
+        self._stored, self._tracked, self._correction = read, T_world_camera, submap.correction
         rigid = submap.correction is not None and not submap.correction.refused
         correct = submap.correction.pose if submap.correction is not None else lambda _, pose: pose
         self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
@@ -255,6 +256,9 @@ class FinalFrames:
                 depth_mm = np.asarray(frame.depth_mm) * np.exp(log_factor)
                 frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
             yield frame
+
+    def _read(self, index: int) -> Frame:
+        return replace(self._stored(index), T_world_camera=self._tracked[index])
 
     def view(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return picture (H, W, 3) and corrected usable depth (H, W) mm of a frame, from any thread."""

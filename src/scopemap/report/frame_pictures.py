@@ -16,6 +16,7 @@ import numpy as np
 
 from scopemap.errors import reporting
 from scopemap.frame import Frame, Rows
+from scopemap.io.run_folder import RunFolder
 
 FOLDER = "frames"
 _MOST = 64
@@ -85,43 +86,19 @@ class FramePictures:
         folder = run / FOLDER
         with reporting(f"cannot write to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
-            for index in pictured_frames(run):
-                picture_file(run, index).unlink()
-                mask_of(picture_file(run, index)).unlink(missing_ok=True)
+            place = RunFolder(run)
+            for index in place.pictured:
+                place.picture_file(index).unlink()
+                place.mask_file(index).unlink(missing_ok=True)
             for index, (picture, mask) in self._pictures.items():
-                picture_file(run, index).write_bytes(picture)
-                mask_of(picture_file(run, index)).write_bytes(mask)
+                place.picture_file(index).write_bytes(picture)
+                place.mask_file(index).write_bytes(mask)
             with (folder / "measures.csv").open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file)
                 writer.writerow(_COLUMNS)
                 writer.writerows(
                     (index, f"{sharp:.4g}", f"{ms:.4g}") for index, sharp, ms in self._measures.read().tolist()
                 )
-
-
-def picture_file(run: Path, index: int) -> Path:
-    """Return the file of a frame's picture."""
-    return run / FOLDER / f"{index:06d}.jpg"
-
-
-def mask_of(picture: Path) -> Path:
-    """Return the file of the mask of a frame, by that of its picture."""
-    return picture.with_name(f"{picture.stem}_mask.png")
-
-
-def pictured_frames(run: Path) -> list[int]:
-    """Return the numbers of the frames that have a picture, ascending."""
-    return sorted(int(file.stem) for file in (run / FOLDER).glob("*.jpg") if file.stem.isdecimal())
-
-
-def read_measures(run: Path) -> dict[int, tuple[float, float]]:
-    """Return sharpness and milliseconds by frame number; {} where a run kept none."""
-    file = run / FOLDER / "measures.csv"
-    if not file.is_file():
-        return {}
-    with reporting(f"cannot read {file}"):
-        rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
-        return {int(row["index"]): (float(row["sharpness"]), float(row["ms"])) for row in rows}
 
 
 def _shrunk(image: np.ndarray, interpolation: int) -> np.ndarray:

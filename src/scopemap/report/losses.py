@@ -6,8 +6,11 @@ from collections import Counter
 from dataclasses import dataclass
 from itertools import groupby
 
-from scopemap.report.kept_run import LOST, NOT_USED, ROTATED, KeptRun
+import numpy as np
+
 from scopemap.trajectory.causes import ADVICE, LossCause
+from scopemap.trajectory.frame_table import FrameTable
+from scopemap.trajectory.trajectory import SKIPPED
 
 
 @dataclass(frozen=True)
@@ -37,15 +40,15 @@ class LostSegment:
         return f"{self.begin_s:.2f} s" if self.first == self.last else f"{self.begin_s:.2f} to {self.end_s:.2f} s"
 
 
-def losses(run: KeptRun) -> list[LostSegment]:
+def losses(frames: FrameTable) -> list[LostSegment]:
     """Return the segments of lost frames of a run, in order; frames that were not used do not end one."""
-    used = [row for row in range(len(run.rows)) if run.place[row] != NOT_USED]
-    found = []
-    for is_lost, group in groupby(used, lambda row: run.place[row] in (LOST, ROTATED)):
+    found, is_lost = [], frames.lost
+    for lost, group in groupby(np.flatnonzero(frames["status"] != SKIPPED).tolist(), lambda row: is_lost[row]):
         rows = list(group)
-        if is_lost:
-            begin_s, end_s = (float(run.rows[row]["time_s"]) for row in (rows[0], rows[-1]))
-            found.append(LostSegment(rows[0], rows[-1], begin_s, end_s, len(rows), _main_cause(run, rows)))
+        if lost:
+            begin_s, end_s = (float(frames["time_s"][row]) for row in (rows[0], rows[-1]))
+            cause = _main_cause(frames["cause"][rows])
+            found.append(LostSegment(rows[0], rows[-1], begin_s, end_s, len(rows), cause))
     return found
 
 
@@ -61,8 +64,8 @@ def in_words(found: list[LostSegment]) -> str:
     return f"Mostly by this: {cause}. Next time: {ADVICE[cause]}."
 
 
-def _main_cause(run: KeptRun, rows: list[int]) -> LossCause:
+def _main_cause(causes: np.ndarray) -> LossCause:
     """Return the cause of most frames; what began the loss counts, not that the camera is not found again later."""
-    causes = Counter(LossCause(run.rows[row].get("cause", "")) for row in rows)
-    began = {cause: count for cause, count in causes.items() if cause is not LossCause.NOT_FOUND_AGAIN}
-    return max(began or causes, key=lambda cause: causes[cause])
+    counts = Counter(map(LossCause, causes.tolist()))
+    began = {cause: count for cause, count in counts.items() if cause is not LossCause.NOT_FOUND_AGAIN}
+    return max(began or counts, key=lambda cause: counts[cause])

@@ -21,7 +21,6 @@ from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap.report.sheet import SOFT, Plot, Sheet, picture_grid
 
 _SIDE_PX = 480
-_SUBPIXEL_BITS = 4
 _AMBIENT = 0.35
 _UNPAINTED = 190
 _PLOT_PX = 400
@@ -122,34 +121,6 @@ def draw_reconstruction(
     if reference_positions_mm is None:
         sheet.text((14, 62), "no true poses are known", 12, SOFT)
     sheet.save(file)
-
-
-def draw_surface(
-    frame: tuple[np.ndarray, PinholeCamera, np.ndarray],
-    rendering: Rendering,
-    mesh: trimesh.Trimesh,
-    positions_mm: np.ndarray,
-    file: Path,
-    confidence: np.ndarray | None = None,
-) -> None:
-    """Draw a mesh beside one of its frames as a PNG or JPEG: the frame, the mesh from there, and from outside.
-
-    frame : picture (H, W, 3) uint8, camera, pose (4, 4), world mm. rendering : of the mesh from there, in the frame's
-    light. positions_mm : (N, 3) of the camera, drawn outside.
-    confidence : (V,) 0..1 of the vertices; drawn from the frame's pose, too, blue (0) to yellow (1), where it is given.
-    """
-    rgb, camera, T_world_camera = frame
-    view, outside = MeshView(T_world_camera, camera), outside_views(mesh, T_world_camera, positions_mm)["from outside"]
-    pictures = {"frame": rgb, "surface": _on_white(rendering)}
-    if confidence is not None:
-        levels = np.round(255 * np.clip(confidence, 0, 1)).astype(np.uint8)
-        colours = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
-        certain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
-        pictures["confidence, 0 blue to 1 yellow"] = mesh_picture(certain, view)
-    pictures["from outside"] = mesh_picture(mesh, outside)
-    draw_path(pictures["from outside"], outside, positions_mm, ESTIMATE_COLOUR)
-    pictures["from outside"] = cropped(pictures["from outside"])
-    picture_grid([pictures], (400, round(400 * camera.height / camera.width))).save(file)
 
 
 def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
@@ -256,21 +227,12 @@ def draw_path(
 
     `colour` is "#rrggbb". The mesh does not hide the path. Rows of NaN, and positions behind the view, are gaps.
     """
-    rgb = tuple(int(colour[place : place + 2], 16) for place in (1, 3, 5))
     points, pixels = view.project(positions_mm)
-    shown = points[:, 2] > 0
-    ends = _fixed_point(np.where(shown[:, None], pixels, 0)).tolist()
-    for row in np.flatnonzero(shown[:-1] & shown[1:]):
-        cv2.line(picture, ends[row], ends[row + 1], rgb, thickness_px, cv2.LINE_AA, _SUBPIXEL_BITS)
-    if shown.any():
-        start = ends[int(np.argmax(shown))]
-        for radius_px, filling in ((3 + thickness_px, (0, 0, 0)), (2 + thickness_px, rgb)):
-            cv2.circle(picture, start, radius_px << _SUBPIXEL_BITS, filling, cv2.FILLED, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _fixed_point(pixels: np.ndarray) -> np.ndarray:
-    """Return pixels in OpenCV's fixed point, limited so that they do not overflow."""
-    return np.round(np.clip(pixels, -1e6, 1e6) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+    places = np.where(points[:, 2:] > 0, pixels, np.nan)
+    sheet, start = Sheet.over(picture), places[np.isfinite(places).all(axis=1)][:1]
+    sheet.line(places, colour, thickness_px)
+    sheet.dots(start, "#000000", 3 + thickness_px)
+    sheet.dots(start, colour, 2 + thickness_px)
 
 
 def cropped(picture: np.ndarray) -> np.ndarray:

@@ -14,8 +14,9 @@ import numpy as np
 
 from scopemap.errors import reporting
 from scopemap.io.checksums import SUMS, write_checksums
+from scopemap.io.json_numbers import without_nan
+from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FOLDER as PICTURES
-from scopemap.report.kept_run import read_run
 from scopemap.report.page_data import MOST_FACES, page_data, shown_meshes
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
@@ -33,7 +34,7 @@ def write_report(folder: Path | str) -> list[Path]:
 
     Raises `InputError` where it holds no finished run, or cannot be written.
     """
-    run = read_run(folder)
+    run = RunFolder(folder).checked()
     meshes = shown_meshes(run, MOST_FACES)
     page, picture = Path(folder) / PAGE, Path(folder) / PICTURE
     with reporting(f"cannot write {page}"):
@@ -53,7 +54,7 @@ def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) 
     Raises `InputError` where a folder holds no finished run, or the file cannot be written.
     """
     share = 1 / len(folders)
-    runs = [read_run(folder) for folder in folders]
+    runs = [RunFolder(folder).checked() for folder in folders]
     data = [
         page_data(run, shown_meshes(run, int(share * MOST_FACES)), name=name, share=share)
         for run, name in zip(runs, names, strict=True)
@@ -68,7 +69,7 @@ def full_page(folder: Path | str) -> str:
 
     Raises `InputError` where the folder holds no finished run.
     """
-    run = read_run(folder)
+    run = RunFolder(folder).checked()
     return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))])
 
 
@@ -77,7 +78,7 @@ def page_html(runs: list[dict[str, Any]]) -> str:
     levels = np.arange(256, dtype=np.uint8)
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
-    content = _plain({"runs": runs, "licences": _LICENCES} | colours)
+    content = without_nan({"runs": runs, "licences": _LICENCES} | colours)
     parts = {
         "title": _escaped(", ".join(run["name"] for run in runs)),
         "style": _asset("page.css"),
@@ -96,12 +97,3 @@ def _escaped(text: str) -> str:
     # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
     text = text.encode("utf-8", "replace").decode("utf-8")
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-def _plain(tree: Any) -> Any:
-    """Return nested dictionaries and lists with None for numbers that are not finite."""
-    if isinstance(tree, dict):
-        return {str(key): _plain(value) for key, value in tree.items()}
-    if isinstance(tree, list | tuple):
-        return [_plain(value) for value in tree]
-    return None if isinstance(tree, float) and not abs(tree) < float("inf") else tree

@@ -16,13 +16,13 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
 from scopemap.geometry.align import align_trajectories
 from scopemap.io.reference import read_reference
+from scopemap.io.run_folder import RunFolder
 from scopemap.notices import notices_of
-from scopemap.report.frame_pictures import mask_of
-from scopemap.report.kept_run import NOT_USED, KeptRun
 from scopemap.report.losses import losses
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import scale_is_known, scale_source, verdict
+from scopemap.report.verdict import Result, scale_is_known, scale_source, verdict
+from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
 
 MOST_FACES = 100_000
@@ -46,23 +46,23 @@ class _Picture:
     depth_mm: np.ndarray | None
 
 
-def shown_meshes(run: KeptRun, most_faces: int | None) -> list[trimesh.Trimesh]:
+def shown_meshes(run: Result, most_faces: int | None) -> list[trimesh.Trimesh]:
     """Return the meshes of the maps that the page shows, the result's first, with most faces; None: all of their faces.
 
     Others are simplified.
     """
     if most_faces is None:
-        return [kept.mesh for kept in run.maps[:_MOST_MAPS]]
+        return [submap.mesh for submap in run.submaps[:_MOST_MAPS]]
     most = [most_faces] + [min(most_faces, _FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
-    return [simplified(kept.mesh, faces) for kept, faces in zip(run.maps, most, strict=False)]
+    return [simplified(submap.mesh, faces) for submap, faces in zip(run.submaps, most, strict=False)]
 
 
-def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
+def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
     """Return what the page shows of a run.
 
     meshes : from `shown_meshes`. name : by default that of the input. share : of the page's size that is the run's.
     """
-    camera = _camera(run)
+    camera = run.camera
     pictures = _within_budget(_pictures(run), share * _MOST_BYTES)
     near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
     source = str(run.provenance.get("input", ""))
@@ -81,60 +81,58 @@ def page_data(run: KeptRun, meshes: list[trimesh.Trimesh], *, name: str = "", sh
         "maps": _maps(run, meshes, camera, pictures),
         "losses": [
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
-            for loss in losses(run)
+            for loss in losses(run.frames)
         ],
-        "not_shown_maps": max(len(run.maps) - _MOST_MAPS, 0),
-        "albedo": tomllib.loads(run.config).get("fusion", {}).get("colours") != "raw",
+        "not_shown_maps": max(len(run.submaps) - _MOST_MAPS, 0),
+        "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
-        "config": run.config,
+        "config": run.config_text,
         "provenance": run.provenance,
     }
 
 
-def _camera(run: KeptRun) -> PinholeCamera:
-    facts = run.provenance["camera"]
-    fx, fy, cx, cy = (float(facts[name]) for name in ("fx", "fy", "cx", "cy"))
-    return PinholeCamera(fx, fy, cx, cy, int(facts["width"]), int(facts["height"]))
-
-
-def _frames(run: KeptRun) -> dict[str, Any]:
+def _frames(run: RunFolder) -> dict[str, Any]:
     """Return the columns of all frames; a pose is (3, 4), row by row, NaN where there is none."""
-    poses = np.full((len(run.rows), 3, 4), np.nan)
-    for number, kept in enumerate(run.maps):
-        pose_of = dict(zip(kept.indices.tolist(), kept.T_world_camera, strict=True))
-        for row in np.flatnonzero(run.place == number):
-            poses[row] = pose_of[int(run.indices[row])][:3]
-    sharpness, ms = run.measures()
-    curves = {name: run.column(column) for name, column in _CURVES.items()}
+    frames, place = run.frames, run.frames.place
+    poses = np.full((len(frames), 3, 4), np.nan)
+    for number, submap in enumerate(run.submaps):
+        pose_of = _pose_of(submap)
+        for row in np.flatnonzero(place == number):
+            poses[row] = pose_of[int(frames["index"][row])][:3]
+    curves = {name: frames[column] for name, column in _CURVES.items()}
     # A lost frame has no scale of its own.
     curves["scale"] = np.where(np.isnan(poses[:, 0, 0]), np.nan, curves["scale"])
-    curves |= {"sharpness": sharpness, "ms": ms}
+    measures = [run.measures.get(index, (np.nan, np.nan)) for index in frames["index"].tolist()]
+    curves["sharpness"], curves["ms"] = np.array(measures).reshape(-1, 2).T
+    # The different reasons why frames are not in a map, and for each frame the number of its own, or -1.
+    reasons = np.where(place < 0, frames["reason"], "")
+    different = sorted({reason for reason in reasons if reason})
+    number_of = {reason: number for number, reason in enumerate(different)} | {"": -1}
     return {
-        "count": len(run.rows),
-        "index": base64_of(run.indices, "i4"),
-        "time_s": base64_of(run.column("time_s"), "f4"),
-        "place": base64_of(run.place, "i2"),
+        "count": len(frames),
+        "index": base64_of(frames["index"], "i4"),
+        "time_s": base64_of(frames["time_s"], "f4"),
+        "place": base64_of(place, "i2"),
         "pose": base64_of(poses, "f4"),
         "curves": {name: base64_of(values, "f4") for name, values in curves.items()},
-    } | _reasons(run)
+        "reasons": different,
+        "reason": base64_of(np.array([number_of[reason] for reason in reasons]), "i2"),
+    }
 
 
-def _reasons(run: KeptRun) -> dict[str, Any]:
-    """Return the different reasons why frames are not in a map, and for each frame the number of its own, or -1."""
-    reasons = [row["reason"] if place < 0 else "" for row, place in zip(run.rows, run.place, strict=True)]
-    different = sorted({reason for reason in reasons if reason})
-    number = {reason: place for place, reason in enumerate(different)} | {"": -1}
-    return {"reasons": different, "reason": base64_of(np.array([number[reason] for reason in reasons]), "i2")}
+def _pose_of(submap: RunFolder) -> dict[int, np.ndarray]:
+    frames = submap.frames.only(submap.frames.tracked)
+    return dict(zip(frames["index"].tolist(), frames["T_world_camera"], strict=True))
 
 
-def _pictures(run: KeptRun) -> list[_Picture]:
-    row_of = {int(index): row for row, index in enumerate(run.indices)}
+def _pictures(run: RunFolder) -> list[_Picture]:
+    used = {index: row for row, index in enumerate(run.frames["index"].tolist()) if run.frames.place[row] != NOT_USED}
     found = []
-    for index, file in run.pictures.items():
-        row, mask = row_of.get(index), mask_of(file)
-        if row is not None and run.place[row] != NOT_USED and mask.is_file():
-            depth_mm = _small_depth(run.depth_mm(index))
-            found.append(_Picture(row, file.read_bytes(), mask.read_bytes(), depth_mm))
+    for index in run.pictured:
+        picture, mask = run.picture_file(index), run.mask_file(index)
+        if index in used and mask.is_file():
+            depth_mm = _small_depth(run.depth.read(index))
+            found.append(_Picture(used[index], picture.read_bytes(), mask.read_bytes(), depth_mm))
     return found
 
 
@@ -177,29 +175,30 @@ def _picture_data(picture: _Picture, near_mm: float, far_mm: float) -> dict[str,
 
 
 def _maps(
-    run: KeptRun, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
+    run: RunFolder, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
 ) -> list[dict[str, Any]]:
     """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers."""
-    found, submaps = [], submaps_in_time(run)
-    turn, worst = {submap.number: k for k, submap in enumerate(submaps)}, most_doubtful(submaps)
-    inliers = {submap.number: submap.inliers + ", most doubtful" * (submap is worst) for submap in submaps}
-    for number, (kept, mesh) in enumerate(zip(run.maps, meshes, strict=False)):
-        pose_of = dict(zip(kept.indices.tolist(), kept.T_world_camera, strict=True))
-        looking = [p for p in pictures if run.place[p.row] == number and p.depth_mm is not None]
+    found, submaps = [], submaps_in_time(run.frames)
+    turn, worst = {one.number: k for k, one in enumerate(submaps)}, most_doubtful(submaps)
+    inliers = {one.number: one.inliers + ", most doubtful" * (one is worst) for one in submaps}
+    place, indices = run.frames.place, run.frames["index"].tolist()
+    for number, (submap, mesh) in enumerate(zip(run.submaps, meshes, strict=False)):
+        pose_of = _pose_of(submap)
+        looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
-        seen = [SeenFrame(pose_of[int(run.indices[p.row])], p.depth_mm) for p in looking if p.depth_mm is not None]
+        seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
         data = mesh_data(mesh, seen, camera)
-        facts = {"frames": len(kept.indices), "all_faces": len(kept.mesh.faces)}
+        facts = {"frames": len(pose_of), "all_faces": len(submap.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found
 
 
-def _truth(run: KeptRun) -> dict[str, Any] | None:
+def _truth(run: RunFolder) -> dict[str, Any] | None:
     """Return the true camera positions of the result's frames, moved and scaled onto it; None where none are known."""
-    source, kept = run.provenance.get("input", ""), run.maps[0]
+    source, frames = run.provenance.get("input", ""), run.frames.only(run.frames.tracked)
     try:
         reference = read_reference(Path(source)) if source and Path(source).is_dir() else None
-        return None if reference is None else _aligned(reference, kept.indices, kept.T_world_camera)
+        return None if reference is None else _aligned(reference, frames["index"], frames["T_world_camera"])
     except ScopemapError:  # no poses, or too few or too straight a path to be aligned
         return None
 

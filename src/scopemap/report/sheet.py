@@ -33,6 +33,13 @@ class Sheet:
     def __init__(self, width: float, height: float) -> None:
         self.rgb = np.full((round(height), round(width), 3), 255, np.uint8)
 
+    @classmethod
+    def over(cls, rgb: np.ndarray) -> Sheet:
+        """Return a sheet that draws on a picture (H, W, 3) uint8, in place."""
+        sheet = cls(0, 0)
+        sheet.rgb = rgb
+        return sheet
+
     def picture(self, rgb: np.ndarray, box: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
         """Draw a picture (h, w, 3) uint8 as large as fits in the middle of a box: left, top, width, height.
 

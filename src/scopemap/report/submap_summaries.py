@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.report.kept_run import KeptRun
+from scopemap.trajectory.frame_table import FrameTable
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,14 @@ class SubmapSummary:
         return "" if np.isnan(self.inlier_share) else f"{self.inlier_share:.0%} inliers"
 
 
-def submaps_in_time(run: KeptRun) -> list[SubmapSummary]:
+def submaps_in_time(frames: FrameTable) -> list[SubmapSummary]:
     """Return the maps of a run in the order of their first frames."""
-    shares, found = run.column("inlier_share"), []
-    for number in range(len(run.maps)):
-        inside = run.place == number
-        if inside.any():
-            indices, known = run.indices[inside], shares[inside & np.isfinite(shares)]
-            share = float(np.median(known)) if len(known) else float("nan")
-            found.append(SubmapSummary(number, len(indices), int(indices.min()), int(indices.max()), share))
+    shares, place, found = frames["inlier_share"], frames.place, []
+    for number in np.unique(place[place >= 0]).tolist():
+        inside = place == number
+        indices, known = frames["index"][inside], shares[inside & np.isfinite(shares)]
+        share = float(np.median(known)) if len(known) else float("nan")
+        found.append(SubmapSummary(number, len(indices), int(indices.min()), int(indices.max()), share))
     return sorted(found, key=lambda submap: submap.first)
 
 

@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from scopemap.geometry.rendering import vertex_colours
 from scopemap.io.decoding import read_decoded
+from scopemap.io.run_folder import RunFolder
 from scopemap.report.canvas import ESTIMATE_COLOUR
-from scopemap.report.kept_run import KeptRun
 from scopemap.report.mesh_figures import (
     MeshView,
     cropped,
@@ -25,7 +25,7 @@ from scopemap.report.mesh_figures import (
     view_from_behind,
 )
 from scopemap.report.submap_summaries import SubmapSummary, most_doubtful, submaps_in_time
-from scopemap.report.verdict import Verdict, verdict
+from scopemap.report.verdict import Result, Verdict, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
 _COLUMNS = 4
@@ -35,13 +35,15 @@ _INK, _SOFT, _GROUND = "#17202b", "#566373", "#ffffff"
 _UNKNOWN = 32
 
 
-def summary_picture(run: KeptRun, meshes: Sequence[trimesh.Trimesh]) -> Image.Image:
+def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Image:
     """Return the summary of a run as a picture.
 
     meshes : of its maps, the result's first, world mm, or some with fewer faces; maps beyond them are not drawn.
     """
-    frames = _spread(run)
-    rows = [_frames_row(run, frames), _depth_row(run, frames), _mesh_row(run, meshes[0]), *_piece_rows(run, meshes)]
+    folder = run if isinstance(run, RunFolder) else None
+    frames = [] if folder is None else _spread(folder)
+    seen = [] if folder is None else [_frames_row(folder, frames), _depth_row(folder, frames)]
+    rows = [*seen, _mesh_row(run, meshes[0]), *_piece_rows(run, meshes)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
@@ -69,21 +71,21 @@ def _write_head(draw: ImageDraw.ImageDraw, found: Verdict, width_px: int) -> Non
         draw.text((left, 42 + 18 * place), line, _SOFT, ImageFont.load_default(14))
 
 
-def _spread(run: KeptRun) -> list[int]:
+def _spread(run: RunFolder) -> list[int]:
     """Return the numbers of at most four frames of the result, spread over it, that have a picture."""
-    inside = set(run.maps[0].indices.tolist())
-    known = [index for index in run.pictures if index in inside]
+    inside = set(run.frames["index"][run.frames.tracked].tolist())
+    known = [index for index in run.pictured if index in inside]
     return sorted({known[round(place)] for place in np.linspace(0, len(known) - 1, _COLUMNS)}) if known else []
 
 
-def _frames_row(run: KeptRun, frames: list[int]) -> dict[str, np.ndarray]:
-    pictures = {f"frame {index}": read_decoded(run.pictures[index], cv2.IMREAD_COLOR) for index in frames}
+def _frames_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
+    pictures = {f"frame {index}": read_decoded(run.picture_file(index), cv2.IMREAD_COLOR) for index in frames}
     return {title: _fitted(picture[..., ::-1]) for title, picture in pictures.items() if picture is not None}
 
 
-def _depth_row(run: KeptRun, frames: list[int]) -> dict[str, np.ndarray]:
+def _depth_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
     """Return the depths in turbo, red near, blue far, of one range."""
-    depths = [depth for index in frames if (depth := run.depth_mm(index)) is not None]
+    depths = [depth for index in frames if (depth := run.depth.read(index)) is not None]
     known = np.concatenate([np.empty(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
     if not known.size:
         return {}
@@ -99,10 +101,10 @@ def _turbo(depth_mm: np.ndarray, near: float, far: float) -> np.ndarray:
     return np.where(np.isnan(depth_mm)[..., None], np.uint8(_UNKNOWN), coloured)
 
 
-def _mesh_row(run: KeptRun, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     if not len(mesh.faces):
         return {}
-    poses = run.maps[0].T_world_camera
+    poses = run.frames["T_world_camera"][run.frames.tracked]
     path = poses[:, :3, 3]
     outside, other = outside_views(mesh, poses[0], path).values()
     views = {"surface and camera path": outside, "from the other side": other}
@@ -117,15 +119,16 @@ def _mesh_row(run: KeptRun, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     return pictures | {"from the middle of the path": _fitted(inside)}
 
 
-def _piece_rows(run: KeptRun, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
+def _piece_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
     """Return the submaps of a run that has several, in order of time, in rows: each from outside with its path."""
-    submaps = submaps_in_time(run)
+    submaps = submaps_in_time(run.frames)
     if len(submaps) < 2:
         return []
     worst, shown = most_doubtful(submaps), {}
     for submap in submaps:
         if submap.number < len(meshes) and len(meshes[submap.number].faces):
-            poses = run.maps[submap.number].T_world_camera
+            frames = run.submaps[submap.number].frames
+            poses = frames["T_world_camera"][frames.tracked]
             view = outside_views(meshes[submap.number], poses[0], poses[:, :3, 3])["from outside"]
             picture = mesh_picture(_opened(meshes[submap.number], view), view, smooth=False)
             draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR, thickness_px=2)

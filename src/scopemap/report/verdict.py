@@ -7,11 +7,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from scopemap.io.run_folder import RunFolder
 from scopemap.notices import notices_of
-from scopemap.report.kept_run import LOST, NOT_USED, OTHER_MAP, ROTATED, KeptRun
+from scopemap.reconstruction import Reconstruction
 from scopemap.report.losses import in_words, losses
 from scopemap.report.submap_summaries import doubt_words, submaps_in_time
+from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, FrameTable
 
+Result = Reconstruction | RunFolder
+"""A result in memory, or in its folder."""
 Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
 
@@ -52,7 +56,7 @@ class Verdict:
         return WORDS[self.level]
 
 
-def verdict(run: KeptRun) -> Verdict:
+def verdict(run: Result) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
     found = [*_of_end(run), *_of_notices(run), _of_frames(run), *_of_maps(run), *_of_surface(run), *_of_camera(run)]
     order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
@@ -61,9 +65,9 @@ def verdict(run: KeptRun) -> Verdict:
     return Verdict(level, _advice(run, level), _sentence(run), reasons)
 
 
-def frames_in_result(run: KeptRun) -> tuple[int, int]:
+def frames_in_result(frames: FrameTable) -> tuple[int, int]:
     """Return how many frames are in the result, and of how many that were used."""
-    return int(np.sum(run.place == 0)), int(np.sum(run.place != NOT_USED))
+    return int(np.sum(frames.place == 0)), int(np.sum(frames.place != NOT_USED))
 
 
 def scale_is_known(provenance: dict[str, Any]) -> bool:
@@ -82,7 +86,7 @@ def longest_segment(outside: np.ndarray) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _advice(run: KeptRun, level: Level) -> str:
+def _advice(run: Result, level: Level) -> str:
     if level == "bad":
         return "Do not use this result."
     use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
@@ -91,52 +95,52 @@ def _advice(run: KeptRun, level: Level) -> str:
     return f"{use} Sizes are unknown: compare shapes, do not measure."
 
 
-def _sentence(run: KeptRun) -> str:
-    inside, used = frames_in_result(run)
+def _sentence(run: Result) -> str:
+    inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
     parts = [f"{inside} of {used} frames in one map"]
     parts.append("scale known" if scale_is_known(run.provenance) else "scale unknown")
-    if not len(run.maps[0].mesh.faces):
+    if not len(run.mesh.faces):
         parts.append("no surface")
     elif "coverage_mean" in surface:
         parts.append(f"surface covers {_percent(surface['coverage_mean'])} of what was seen")
     return "; ".join(parts)
 
 
-def _of_frames(run: KeptRun) -> Reason:
-    inside, used = frames_in_result(run)
+def _of_frames(run: Result) -> Reason:
+    inside, used = frames_in_result(run.frames)
     share = inside / max(used, 1)
     if inside < LEAST_FRAMES:
         return Reason("frames-too-few", "bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
-    lost_in_a_row = longest_segment(run.place[run.place != NOT_USED] != 0)
+    place = run.frames.place
+    lost_in_a_row = longest_segment(place[place != NOT_USED] != 0)
     longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
     until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
     text = f"{_percent(share)} of the frames{until} are in the result ({inside} of {used}).{longest}"
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 
-def _of_maps(run: KeptRun) -> list[Reason]:
-    other = int(np.sum((run.place > 0) | (run.place == OTHER_MAP)))
-    rotated = int(np.sum(run.place == ROTATED))
-    lost = rotated + int(np.sum(run.place == LOST))
-    found = []
+def _of_maps(run: Result) -> list[Reason]:
+    frames, found = run.frames, []
+    other = int(np.sum((frames.place > 0) | (frames.place == ELSEWHERE)))
+    lost, rotated = frames.counts["lost"], frames.counts["rotation_only"]
     if other:
-        kept = len(run.maps) - 1
+        kept = len(run.submaps) - 1
         shown = f"; {kept} {'submap is' if kept == 1 else 'submaps are'} shown below" if kept else ""
         text = f"After losses {other} more frames form submaps of their own: where they belong is unknown{shown}."
         found.append(Reason("submaps", "note", text))
-    doubt = doubt_words(submaps_in_time(run))
+    doubt = doubt_words(submaps_in_time(frames))
     if doubt:
         found.append(Reason("submap-doubtful", "note", f"Most doubtful of the submaps is {doubt}."))
     if lost:
         how = f" but for its rotation in {rotated}" if rotated else " at all"
-        words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(run))}"
+        words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(frames))}"
         found.append(Reason("frames-lost", "note", words.rstrip()))
     return found
 
 
-def _of_surface(run: KeptRun) -> list[Reason]:
-    if not len(run.maps[0].mesh.faces):
+def _of_surface(run: Result) -> list[Reason]:
+    if not len(run.mesh.faces):
         return [Reason("surface-missing", "bad", "There is no surface.")]
     surface, found = run.provenance.get("surface") or {}, []
     if "coverage_mean" in surface:
@@ -153,14 +157,14 @@ def _of_surface(run: KeptRun) -> list[Reason]:
     return found
 
 
-def _of_camera(run: KeptRun) -> list[Reason]:
+def _of_camera(run: Result) -> list[Reason]:
     if run.provenance.get("camera", {}).get("origin") != "assumed":
         return []
     text = "The lens is a guess (no calibration): depth against width may be wrong."
     return [Reason("camera-assumed", "doubtful", text)]
 
 
-def _of_notices(run: KeptRun) -> list[Reason]:
+def _of_notices(run: Result) -> list[Reason]:
     """Return what the run says about itself, each once, unless another reason says the same."""
     found = [notice for notice in notices_of(run.provenance) if notice.level != "info" and notice.plain]
     codes = {notice.code for notice in notices_of(run.provenance)}
@@ -177,7 +181,7 @@ def _moving_words(codes: set[str]) -> str:
     return f" There the surface is {shown}.{whole}"
 
 
-def _of_end(run: KeptRun) -> list[Reason]:
+def _of_end(run: Result) -> list[Reason]:
     last = run.provenance.get("interrupted_at_frame")
     return (
         []

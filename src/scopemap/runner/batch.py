@@ -24,9 +24,9 @@ from scopemap.config import Config
 from scopemap.errors import reporting
 from scopemap.io.inputs import NamedInput, RemoteFile
 from scopemap.io.opening import open_sequence
+from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.report.batch_page import BatchRow, write_at_once, write_batch_page, write_batch_table
-from scopemap.report.kept_run import read_run
 from scopemap.report.page import write_report
 from scopemap.report.verdict import frames_in_result, verdict
 from scopemap.runner.engines import Engine
@@ -181,8 +181,8 @@ def _run(task: _Task) -> dict[str, Any]:
         reconstruct_with_report(frames, video.config, folder, overwrite=task.before is not None)
     else:  # the process ended while it wrote the report
         write_report(folder)
-    run = read_run(folder)
-    found, (tracked, of) = verdict(run), frames_in_result(run)
+    run = RunFolder(folder).checked()
+    found, (tracked, of) = verdict(run), frames_in_result(run.frames)
     return {"verdict": found.word, "sentence": found.sentence, "tracked": tracked, "frames": of}
 
 

@@ -9,17 +9,17 @@ from typing import Any, Protocol
 
 from scopemap.config import Config
 from scopemap.errors import InputError, reporting
-from scopemap.estimators import package_versions
 from scopemap.io.checkpoint import CHECKPOINT, SavedState, is_committed
 from scopemap.io.checksums import input_checksum
 from scopemap.io.result_folder import UNFINISHED
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
+from scopemap.runner.provenance import package_versions
 
 # A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
 _LEAST_S, _SHARE = 5.0, 0.02
-_RUN = ("records", "median_depths_mm", "checked", "forgotten", "map", "frames_of_map", "write")
+_RUN = ("frames", "checked", "kept_maps", "writers")
 _SHOWN_DIFFERENCES = 4
 
 

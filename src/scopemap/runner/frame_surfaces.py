@@ -7,12 +7,12 @@ from pathlib import Path
 from scopemap.config import Config
 from scopemap.depth.anchor import depth_downscale
 from scopemap.errors import reporting
-from scopemap.estimators import scale_facts
 from scopemap.frame import Frame
 from scopemap.fusion.depth_mesh import depth_mesh
 from scopemap.fusion.mesh_files import save_mesh
+from scopemap.notices import scale_words
 from scopemap.preprocessing import Estimators
-from scopemap.reconstruction import scale_words
+from scopemap.runner.provenance import scale_facts
 
 SURFACES = "surfaces"
 """Folder of a result with a PLY per frame, named by its number."""
@@ -24,11 +24,16 @@ class SurfaceWriter:
     Raises `InputError` where nothing can be written.
     """
 
+    NOT_IN_CHECKPOINT = ("_folder", "_config", "_estimators")
+    """Not in a checkpoint: nothing changes."""
+
     def __init__(self, folder: Path, config: Config, estimators: Estimators) -> None:
         self._folder, self._config, self._estimators = folder / SURFACES, config, estimators
 
     def __call__(self, frame: Frame) -> None:
-        """Write the surface of a frame; without any usable pixel it has no vertex."""
+        """Write the surface of a frame that has a pose; without any usable pixel it has no vertex."""
+        if frame.T_world_camera is None:
+            return
         step_px = depth_downscale(self._config.depth, max(frame.valid.shape))
         mesh = depth_mesh(frame, step_px, max(self._config.fusion.advanced.min_incidence, 0.05))
         with reporting(f"cannot write to {self._folder}"):

@@ -21,12 +21,12 @@ from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner.preparation import Progress
 from scopemap.runner.provenance import Limits
 from scopemap.runner.reconstructor import Reconstructor
+from scopemap.runner.run import Progress
 
 LIMITS = Limits(frames=50_000, maps=8, blocks=80_000)
-"""Of a session: about 60 MB of records and 1 GB of surfaces."""
+"""Of a session: about 60 MB of rows and 1 GB of surfaces."""
 _REMEMBERED = 300  # latencies
 _MOST_POSITIONS = 500
 _AHEAD = 1

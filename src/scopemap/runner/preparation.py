@@ -13,9 +13,8 @@ from scopemap.frame import is_constant
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.preprocessing import Estimators
+from scopemap.runner.run import Progress
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
 Timed = Callable[..., Any]
 """Takes the name of a part, a function and its arguments; returns what the function returns."""
 

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from scopemap.config import Config
+from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.errors import InputError
-from scopemap.estimators import estimators_provenance, package_versions, scale_facts
+from scopemap.flow.estimator import FlowEstimator
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice, of_input
 from scopemap.preprocessing import Estimators
-from scopemap.reconstruction import FrameRecord, frame_counts
+from scopemap.tracking.features import FeatureDetector
+from scopemap.trajectory.frame_table import FrameTable
 
+_VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
+_VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
+_FEW_FRAMES = 5
 _MOVING_SHARE = 0.1  # of the picture: less may be chance, such as a few false matches
 
 
@@ -24,9 +31,9 @@ _MOVING_SHARE = 0.1  # of the picture: less may be chance, such as a few false m
 class Limits:
     """What a run without an end may keep; None: no limit.
 
-    frames : records; beyond it every second one of the older half is forgotten, again and again. maps : those of most
-    frames, beside the present one, keep a surface. blocks : of 8^3 voxels in all surfaces, 12 KiB each; beyond it all
-    maps but the present one lose theirs, and then nothing more is fused.
+    frames : in the table; beyond it every second one of the older half is forgotten, again and again. maps : those of
+    most frames, beside the present one, keep a surface. blocks : of 8^3 voxels in all surfaces, 12 KiB each; beyond it
+    all maps but the present one lose theirs, and then nothing more is fused.
     """
 
     frames: int | None = None
@@ -34,17 +41,27 @@ class Limits:
     blocks: int | None = None
 
 
-def motion_notices(records: list[FrameRecord], config: Config) -> list[Notice]:
+def motion_notices(frames: FrameTable, config: Config) -> list[Notice]:
     """Return whether the camera was stated to be at rest, and where and how often tissue moves on its own."""
     found = [Notice("camera-at-rest-stated")] if config.tracking.camera_at_rest else []
-    measured = [(record.index, *record.track.moving) for record in records if record.T_world_camera is not None]
-    measured = [one for one in measured if not math.isnan(one[1])]
-    moving = [one for one in measured if one[1] > _MOVING_SHARE]
+    measured = frames.only(frames.tracked & (frames["moving_share"] >= 0))
+    moving = int((measured["moving_share"] > _MOVING_SHARE).sum())
     if not moving:
         return found
-    index, share, x, y = max(moving, key=lambda one: one[1])
-    counts = {"frames": len(moving), "measured": len(measured), "threshold": _MOVING_SHARE}
-    return [*found, Notice("tissue-moves", counts | {"most": index, "share": share, "x": x, "y": y})]
+    most = measured.rows[measured["moving_share"].argmax()]
+    place = {"share": float(most["moving_share"]), "x": float(most["moving_x"]), "y": float(most["moving_y"])}
+    counts = {"frames": moving, "measured": len(measured), "threshold": _MOVING_SHARE, "most": int(most["index"])}
+    return [*found, Notice("tissue-moves", counts | place)]
+
+
+def notices_of_end(frames: FrameTable, interrupted_at: int | None, forgotten: int, limits: Limits) -> list[Notice]:
+    """Return notices where the run was interrupted, by the last frame's number, where few frames are tracked, and where
+    some were forgotten.
+    """
+    tracked = int(frames.tracked.sum())
+    found = [] if interrupted_at is None else [Notice("input-interrupted", {"frame": interrupted_at})]
+    found += [Notice("frames-few", {"frames": tracked})] if tracked < _FEW_FRAMES else []
+    return found + ([Notice("frames-forgotten", {"frames": forgotten, "kept": limits.frames})] if forgotten else [])
 
 
 def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
@@ -56,14 +73,14 @@ def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
 
 
 def provenance_of(
-    sequence: Sequence, estimators: Estimators, seconds: dict[str, float], records: list[FrameRecord]
+    sequence: Sequence, estimators: Estimators, seconds: dict[str, float], frames: FrameTable
 ) -> dict[str, Any]:
     """Return what a result of a sequence was made from, and how; `seconds` of each part so far."""
     camera = sequence.camera
     return {
         "input": str(sequence.path),
         "dataset": sequence.source.name,
-        **frame_counts(records),
+        **frames.counts,
         "skipped": dict(Counter(frame.kind for frame in sequence.skipped)),
         "camera": {
             "source": sequence.camera_source,
@@ -84,3 +101,37 @@ def provenance_of(
         "versions": package_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",
     }
+
+
+def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
+    """Return `known`, whether the scale of a run is measured or anchored, `measured`, and its `source` in words."""
+    depth, anchor = estimators.depth, estimators.anchor
+    guessed = anchor.is_measured and not getattr(depth, "scale_is_known", True)
+    source = anchor.description + (" of unknown unit" if guessed else "")
+    known = anchor.scale_is_known and not guessed
+    return {"known": known, "measured": known and anchor.is_measured, "source": source}
+
+
+def estimators_provenance(estimators: Estimators) -> dict[str, str]:
+    """Return names, versions and hashes of the estimators, and the source of the depth scale."""
+    parts = estimators.depth.provenance()
+    others: dict[str, DepthEstimator | FlowEstimator | PerceptualDistance | FeatureDetector] = {
+        "flow": estimators.flow,
+        "perceptual": estimators.perceptual,
+        "features": estimators.features,
+    }
+    if estimators.anchor.reference.name == "depth-pro":
+        others["anchor"] = estimators.anchor.reference
+    for role, part in others.items():
+        # Several parts have weights and hashes: the key names the part.
+        facts = part.provenance()
+        parts |= {key if key == role else f"{role} {key}": value for key, value in facts.items()}
+    masks = {} if estimators.masks is None else estimators.masks.provenance()
+    return parts | masks | {"keyframe_flow": estimators.keyframe_flow.name, "anchor": estimators.anchor.description}
+
+
+@cache
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on; of `networks` if present."""
+    installed = [name for name in _VERSIONS_OF_NETWORKS if find_spec(name) is not None]
+    return {name: version(name) for name in (*_VERSIONS, *installed)} | {"python": platform.python_version()}

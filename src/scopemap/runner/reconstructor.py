@@ -14,18 +14,20 @@ from scopemap.cameras.rectification import Rectifier, working_camera, working_si
 from scopemap.config import Config
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.errors import SettingsError
-from scopemap.estimators import OwnEstimators, scale_facts
+from scopemap.estimators import OwnEstimators
 from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
+from scopemap.io.checksums import input_checksum
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import ASSUMED_RATE_HZ, Source
 from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
-from scopemap.runner.preparation import Progress, prepare
-from scopemap.runner.provenance import Limits
-from scopemap.runner.run import Clock, Run, overlapped
+from scopemap.runner.memory import memory_plan
+from scopemap.runner.preparation import prepare
+from scopemap.runner.provenance import Limits, scale_facts
+from scopemap.runner.run import Clock, KeptMaps, Progress, Run, overlapped
 
 
 class Reconstructor:
@@ -68,8 +70,8 @@ class Reconstructor:
         self._sequence, self.config, estimators, self._notices = prepare(sequence, config, clock.timed, progress, own)
         self._store = FrameStore()
         self._pipeline = Pipeline(self.config, estimators, self._store)
-        self._run = Run(self._sequence, self.config, self._pipeline, clock, None, progress)
-        self._run.limits = limits or Limits()
+        plan, kept = memory_plan(self.config, self._sequence), KeptMaps(limits or Limits())
+        self._run = Run(self._sequence, self._pipeline, clock, (), progress, plan, kept)
         self._last, self._closed = -1, False
 
     @property
@@ -113,7 +115,7 @@ class Reconstructor:
 
         At once fuse the presets that need no back end, such as `realtime`; not while `steps` waits for a picture.
         """
-        return self._pipeline.fusion.surface(self._run.map)
+        return self._pipeline.fusion.surface(self._run.kept_maps.map)
 
     @property
     def surface_is_full(self) -> bool:
@@ -126,14 +128,16 @@ class Reconstructor:
         return bool(scale_facts(self._pipeline.estimators)["known"])
 
     def result(self) -> Reconstruction:
-        """Return poses, surface and records of all frames, adjusted by the back end; the last call.
+        """Return poses, surface and the table of all frames, adjusted by the back end; the last call.
 
         `trajectory.T_world_camera` holds the poses (N, 4, 4), NaN where lost; `mesh` vertices, faces and colours;
         `save(folder)` writes it. Raises `InputError` where no frame was tracked.
         """
         self._refuse_closed()
         try:
-            return self._run.result(self._notices)
+            result = self._run.result(self._notices)
+            result.provenance["input_content"] = input_checksum(self._sequence.path)
+            return result
         finally:
             self.close()
 

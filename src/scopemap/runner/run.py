@@ -1,4 +1,4 @@
-"""The runner: passes a sequence through the pipeline and collects the result.
+"""One run: the loop that passes the frames of a sequence through the pipeline, and the result.
 
 The stages of the pipeline overlap: while a frame is fused in this thread, later ones are read and go through the
 networks, are matched, and tracked, each in a thread of its own. So do the stages after the last frame.
@@ -13,196 +13,145 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numba.core.event import TimingListener, register
 
-from scopemap.config import Config
-from scopemap.estimators import compiling_s, largest_depth_mm
-from scopemap.frame import Frame, Rows
+from scopemap.frame import Frame
 from scopemap.fusion.agreement import surface_agreement
 from scopemap.fusion.finish import finished
-from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
 from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
-from scopemap.io.checksums import input_checksum, write_checksums
-from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.multiview_depth import KeyframeDepths
 from scopemap.mapping.submaps import FinalFrames, Submap
 from scopemap.notices import Notice
 from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
-from scopemap.reconstruction import DepthWriter, FrameRecord, Reconstruction, notices_of_frames
+from scopemap.reconstruction import Reconstruction
 from scopemap.runner.backwards import track_backwards
-from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
-from scopemap.runner.frame_surfaces import SurfaceWriter
-from scopemap.runner.memory import MemoryPlan, memory_plan
-from scopemap.runner.preparation import Progress, prepare
-from scopemap.runner.provenance import Limits, motion_notices, provenance_of, refuse_own_input
-from scopemap.runner.records import FrameRecords, check_tracked, records_of
-from scopemap.tracking.track import FrameTracker, Track
+from scopemap.runner.memory import MemoryPlan
+from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
+from scopemap.runner.submap_frames import check_tracked, frames_of_submap
+from scopemap.tracking.track import Track
+from scopemap.trajectory.frame_table import FrameTable, GrowingFrameTable
 
 Observer = Callable[[Step], bool | None]
 """Called with each step; True: no further frame is read, and the result is of the frames until then."""
+Progress = Callable[[str, int, int], None]
+"""Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
+FrameWriter = Callable[[Frame], None]
+"""Writes something of a frame whose depth is final."""
+_CHECKED_FRAMES = 16  # most frames of a submap at which its surface is rendered again
 _Item = TypeVar("_Item")
 _END = object()
-_CHECKED_FRAMES = 16  # most frames of a submap at which its surface is rendered again
-_NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
+_COMPILING = TimingListener()
+register("numba:compile", _COMPILING)
 
 
-def reconstruct(
-    sequence: Sequence,
-    config: Config | None = None,
-    *,
-    out: Path | str | None = None,
-    overwrite: bool = False,
-    observers: tuple[Observer, ...] = (),
-    progress: Progress = lambda doing, done, total: None,
-    tracker: FrameTracker | None = None,
-) -> Reconstruction:
-    """Turn a sequence into poses, depth and a surface.
+class RunStates(Protocol):
+    """Writes the state of a run as it goes, that of each stage after the same frame, as `Checkpoints` does."""
 
-    A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result. Observers that are methods of an object with an attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
+    @property
+    def exist(self) -> bool:
+        """Whether there is a state to resume from."""
 
-    The settings in the result are the resolved ones: the TSDF parameters are numbers.
-    Of several submaps the one with most frames is the result, and `others` holds the others.
-    Raises `InputError` where no frame could be tracked, and what the estimators raise for missing weights.
+    def restore(self) -> tuple[int, bool]:
+        """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
 
-    Parameters
-    ----------
-    sequence : from `open_sequence`.
-    config : settings, by default the preset `default`.
-    out : folder for the result; None keeps it in memory, without depth maps. Where the run fails it stays as it was.
-    overwrite : replace an earlier run there, once the new one is whole.
-    observers : called with each `Step`, whose pose and depth are as tracked, before the back end; one that returns
-        True ends the run early, with the frames that were read until then.
-    tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
-        "none".
-    progress : called before the first frame and after the last one.
-    """
-    clock = Clock()
-    config = config or Config()
-    if out is not None:
-        memory_plan(config, sequence)  # that it is refused early
-        refuse_own_input(Path(out), sequence, config)
-        check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
-    identity = {} if out is None else identity_of(sequence, config, tracker)
-    with result_folder(out, overwrite=overwrite, can_resume=partial(can_resume, identity=identity)) as folder:
-        store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
-        sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
-        write = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
-        with closing(store):
-            run = Run(sequence, config, Pipeline(config, estimators, store, tracker), clock, write, progress)
-            if folder is not None and config.tracking.camera_at_rest:
-                run.write_surface = SurfaceWriter(folder, config, estimators)
-            if folder is None:
-                run.track(observers)
-            else:
-                _track_with_checkpoints(run, observers, folder, identity)
-            result = run.result(notices)
-        changes = input_changes(identity, result.provenance["input_content"], sequence.path)
-        result.provenance["notices"] += [notice.as_json() for notice in changes]
-        del run  # with its keyframes and volumes: a long run has none to spare when it writes
-        if folder is not None and write is not None:
-            progress("writing", 0, 0)
-            write.finish(scale_known=result.provenance["scale"]["known"])
-            result.save(folder)
-            for owner in _kept_with(observers):
-                owner.save(folder)
-            write_checksums(folder, without=NOT_OF_THE_RESULT)
-    return result
+    def due(self) -> bool:
+        """Return whether the frame that is read now should be one after which the state is written."""
+
+    def keep(self, stage: str) -> None:
+        """Write the state of a stage, called in its thread."""
+
+    def commit(self, last: int) -> None:
+        """Write the rest; the state is now that after the frame `last`."""
+
+    def commit_all(self, last: int) -> None:
+        """Write the state after all frames, when no stage is at work."""
 
 
-def _track_with_checkpoints(run: Run, observers: tuple[Observer, ...], folder: Path, identity: dict[str, Any]) -> None:
-    with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
-        run.track(observers, checkpoints)
+@dataclass
+class KeptMaps:
+    """Which maps and frames a run without an end keeps, by its limits; `forgotten` counts frames."""
 
+    limits: Limits = field(default_factory=Limits)
+    map: int = 0
+    frames_of_map: Counter[int] = field(default_factory=Counter)
+    forgotten: int = 0
 
-def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:
-    """Return the objects that observe a run by a method, and are resumed and saved with it."""
-    owners = (getattr(observer, "__self__", None) for observer in observers)
-    return tuple(owner for owner in owners if hasattr(owner, "NOT_IN_CHECKPOINT"))
+    def beyond(self, track: Track, *, is_full: bool) -> list[int]:
+        """Count a frame, and return the numbers of the maps whose surface is to be forgotten."""
+        self.frames_of_map[track.map] += track.status != "lost"
+        left, self.map = track.map != self.map, track.map
+        if not ((left and self.limits.maps is not None) or is_full):
+            return []
+        others = [number for number, _ in self.frames_of_map.most_common() if number != self.map]
+        return others[0 if is_full else self.limits.maps :]
 
 
 @dataclass
 class Run:
-    """One run: the pipeline, and the results collected from it."""
+    """One run, and what is collected from it.
+
+    writers : of the final depth, or the surface, of each frame; none where the result stays in memory. checked : frames
+    of each map at which its surface is checked.
+    """
 
     sequence: Sequence
-    config: Config
     pipeline: Pipeline
     clock: Clock
-    write: DepthWriter | None
-    progress: Progress
-    write_surface: SurfaceWriter | None = None
+    writers: tuple[FrameWriter, ...] = ()
+    progress: Progress = lambda doing, done, total: None
+    plan: MemoryPlan = field(default_factory=MemoryPlan)
+    kept_maps: KeptMaps = field(default_factory=KeptMaps)
     stopped: bool = False
     interrupted: bool = False
-    records: FrameRecords = field(init=False)
-    plan: MemoryPlan = field(init=False)
-    median_depths_mm: Rows = field(default_factory=lambda: Rows(np.dtype(np.float64)))
-    limits: Limits = field(default_factory=Limits)
     resumed_after: int | None = None
-    forgotten: int = 0
-    map: int = 0
-    frames_of_map: Counter[int] = field(default_factory=Counter)
-    final_frames: int = 0
-    final_done: int = 0
-    checked: dict[int, _SpreadFrames] = field(default_factory=lambda: defaultdict(_SpreadFrames))
+    frames: GrowingFrameTable = field(init=False)
+    checked: dict[int, SpreadFrames] = field(default_factory=lambda: defaultdict(SpreadFrames))
 
     def __post_init__(self) -> None:
-        self.records = FrameRecords(self.pipeline.fusion.store.table)
-        self.plan = memory_plan(self.config, self.sequence)
+        self.frames = GrowingFrameTable(self.pipeline.fusion.store.table)
         self.pipeline.fusion.coarser_beyond = self.plan.blocks
+        self.pipeline.fusion.most_blocks = self.kept_maps.limits.blocks
         self.pipeline.mapper.limit(self.plan.observations)
 
-    def track(self, observers: tuple[Observer, ...], checkpoints: Checkpoints | None = None) -> None:
+    def track(self, observers: tuple[Observer, ...], states: RunStates | None = None) -> None:
         """Pass all frames through the pipeline, those after the last checkpoint."""
         last, complete = -1, False
-        if checkpoints is not None and checkpoints.exist:
-            last, complete = checkpoints.restore()
+        if states is not None and states.exist:
+            last, complete = states.restore()
             self.resumed_after = last
-            self.progress("resuming", len(self.records), 0)
-        frames = iter(()) if complete else self._frames(last)
-        for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, checkpoints):
+            self.progress("resuming", len(self.frames), 0)
+        frames = iter(()) if complete else self._until_stopped(last)
+        for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, states):
             self.take(step)
             for observer in observers:
                 self.stopped = bool(observer(step)) or self.stopped
-        if checkpoints is not None and len(self.records) and not (complete or self.interrupted):
-            checkpoints.commit_all(self.records.last_index)
+        if states is not None and len(self.frames) and not (complete or self.interrupted):
+            states.commit_all(self.frames.last_index)
 
     def take(self, step: Step) -> None:
-        """Collect the results of a step."""
-        some_mm = step.refined.depth_mm[::4, ::4]
-        if np.isfinite(some_mm).any():
-            self.median_depths_mm.append(np.array([np.nanmedian(some_mm)]))
-        if not self.pipeline.fusion.at_end:
-            self._write_depth(step.frame)
-        if self.pipeline.fusion.at_once:
+        """Collect the results of a step, and forget what is beyond the limits."""
+        fusion, limits = self.pipeline.fusion, self.kept_maps.limits
+        if not fusion.at_end:
+            for write in self.writers:
+                write(step.frame)
+        if fusion.at_once:
             self.checked[step.track.map].put(step.frame)
-        self.records.append(FrameRecord.of(step))
-        self._keep_within_limits(step.track)
-
-    def _keep_within_limits(self, track: Track) -> None:
-        """Forget what is beyond the limits."""
-        fusion, most = self.pipeline.fusion, self.limits
-        fusion.most_blocks = most.blocks
-        self.frames_of_map[track.map] += track.status != "lost"
-        left, self.map = track.map != self.map, track.map
-        if (left and most.maps is not None) or fusion.is_full:
-            others = [number for number, _ in self.frames_of_map.most_common() if number != self.map]
-            for number in others[0 if fusion.is_full else most.maps :]:
-                fusion.forget(number)
-                self.checked.pop(number, None)
-        if most.frames is not None and len(self.records) > most.frames:
-            older = self.records.thin()
-            self.median_depths_mm.keep(np.arange(len(self.median_depths_mm)) % 2 == 0)
+        self.frames.append(step.row)
+        for number in self.kept_maps.beyond(step.track, is_full=fusion.is_full):
+            fusion.forget(number)
+            self.checked.pop(number, None)
+        if limits.frames is not None and len(self.frames) > limits.frames:
+            older = self.frames.thin()
             self.pipeline.mapper.forget(older)
-            self.forgotten += len(older)
+            self.kept_maps.forgotten += len(older)
 
-    def _frames(self, after: int) -> Iterator[Frame]:
+    def _until_stopped(self, after: int) -> Iterator[Frame]:
         """Yield the frames after one until an observer asks for a stop."""
         for frame in self.sequence.frames(after):
             if self.stopped:
@@ -212,105 +161,125 @@ class Run:
 
     def result(self, prepared: list[Notice]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        records = self.records.read()
-        check_tracked(records, self.sequence.path)
-        records = self.clock.timed("track backwards", self._after_going_back, records)
+        outside = (self.sequence, self.pipeline, self.clock, self.writers, self.progress)
+        result = _Finishing(*outside, self.frames.read(), self.checked, prepared + self.plan.notices).result()
+        last = self.frames.last_index if self.interrupted else None
+        facts = {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
+        notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
+        result.provenance.update(facts)
+        result.provenance["notices"] += [notice.as_json() for notice in notices]
+        return result
+
+
+@dataclass
+class _Finishing:
+    """Makes the result from what a run has collected.
+
+    frames : all, as tracked. checked : those of each map that was fused at once, at which its surface is checked.
+    notices : of all submaps.
+    """
+
+    sequence: Sequence
+    pipeline: Pipeline
+    clock: Clock
+    writers: tuple[FrameWriter, ...]
+    progress: Progress
+    frames: FrameTable
+    checked: dict[int, SpreadFrames]
+    notices: list[Notice]
+    _done: int = field(default=0, init=False)
+
+    def result(self) -> Reconstruction:
+        """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
+        frames, pipeline, clock = self.frames, self.pipeline, self.clock
+        check_tracked(frames, self.sequence.path)
+        clock.timed("track backwards", track_backwards, pipeline, frames)
         self.progress("adjusting keyframes", 0, 0)
-        submaps, notices = self.clock.timed("back end", self.pipeline.mapper.submaps)
-        self.final_frames = sum(len(submap.frames) for submap in submaps)
-        results = [
-            self._fuse_submap(records_of(n, submaps, records), submaps[n], prepared) for n in range(len(submaps))
-        ]
+        submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
+        results = [self._fused(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
-        for frame in self.pipeline.fusion.store.frames({r.index for r in records if r.index not in submapped}):
-            self._write_depth(frame)  # as tracked
-        last = self.records.last_index if self.interrupted else None
-        notices = self.pipeline.notices + notices + notices_of_frames(results[0].records, last)
-        results[0].provenance["interrupted_at_frame"] = last
-        results[0].provenance["resumed_after_frame"] = self.resumed_after
-        results[0].provenance["input_content"] = self.clock.timed("hash input", input_checksum, self.sequence.path)
-        if self.forgotten:
-            notices.append(Notice("frames-forgotten", {"frames": self.forgotten, "kept": self.limits.frames}))
-        results[0].provenance["notices"] += [notice.as_json() for notice in notices]
+        for frame in pipeline.fusion.store.frames(set(frames["index"].tolist()) - submapped):
+            self._write(frame)  # as tracked
+        results[0].provenance["notices"] += [notice.as_json() for notice in pipeline.notices + notices]
         return replace(results[0], others=results[1:])
 
-    def _after_going_back(self, records: list[FrameRecord]) -> list[FrameRecord]:
-        """Return the records after lost frames were tracked from the frames after them."""
-        tracks = track_backwards(self.pipeline, [record.track for record in records])
-        return [
-            record if track is record.track else replace(record, track=track, T_world_camera=track.T_world_camera)
-            for record, track in zip(records, tracks, strict=True)
-        ]
-
-    def _fuse_submap(self, records: list[FrameRecord], submap: Submap, notices: list[Notice]) -> Reconstruction:
-        """Correct, write and fuse the frames of a submap, whose records these are."""
-        sequence, pipeline = self.sequence, self.pipeline
-        store = pipeline.fusion.store
-        final = FinalFrames(submap, store.poses(submap.frames), store.frame)
+    def _fused(self, number: int, submaps: list[Submap]) -> Reconstruction:
+        """Correct, write and fuse the frames of a submap."""
+        sequence, pipeline, submap = self.sequence, self.pipeline, submaps[number]
+        config, store = pipeline.config, pipeline.fusion.store
+        final = FinalFrames(submap, self._stored_poses(submap), store.frame)
         depths = self._triangulated_depths(final)
         with closing(depths) if depths is not None else nullcontext():
-            corrected = _ahead(final.frames(None if depths is None else depths.depth), "correct")
+            corrected = in_thread(final.frames(None if depths is None else depths.depth), "correct")
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
             median_mm = store.median_depth_mm(submap.main_frames)
-            moving, at_s = MovingTissue(block_edge_mm(median_mm)), self.config.fusion.surface_at_s
+            moving, at_s = MovingTissue(block_edge_mm(median_mm)), config.fusion.surface_at_s
             seen_at = None if at_s is None else SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
-            written = self._written(corrected, submap.main, moving)
-            frames = _ahead(written if seen_at is None else map(seen_at.weighted, written), "write")
-            with closing(frames):
+            checked = self.checked.pop(submap.main, SpreadFrames())
+            all_frames = sum(len(submap.frames) for submap in submaps)
+            written = self._written(corrected, checked, moving, all_frames)
+            seen = in_thread(written if seen_at is None else map(seen_at.weighted, written), "write")
+            with closing(seen):
                 fused: FusedSurface = self.clock.timed(
-                    "fuse", pipeline.fusion.fuse, frames, submap.main_frames, submap.main
+                    "fuse", pipeline.fusion.fuse, seen, submap.main_frames, submap.main
                 )
         fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
-        checked = self.checked.pop(submap.main, _SpreadFrames()).frames
-        agreement = self.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked)
-        provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, records)
-        found = notices + self.plan.notices + motion_notices(records, self.config)
-        found += [part.notice for part in (seen_at, submap.correction, depths) if part is not None] + fused.notices
-        masks = pipeline.estimators.masks
-        found += [] if masks is None else masks.notices
-        medians_mm = self.median_depths_mm.read().tolist() if median_mm is None else [median_mm]
-        found += depth_notices(medians_mm, fused.settings)
-        provenance["notices"] += [notice.as_json() for notice in found]
+        agreement = self.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked.frames)
+        frames = frames_of_submap(number, submaps, self.frames)
+        provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, frames)
+        notices = self.notices + motion_notices(frames, config)
+        notices += [part.notice for part in (seen_at, submap.correction, depths) if part is not None] + fused.notices
+        masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
+        notices += [] if masks is None else masks.notices
+        medians_mm = known_mm[np.isfinite(known_mm)].tolist() if median_mm is None else [median_mm]
+        notices += depth_notices(medians_mm, fused.settings)
+        provenance["notices"] += [notice.as_json() for notice in notices]
         provenance["surface"] = agreement
-        config = self.config.model_copy(update={"fusion": fused.settings})
+        config = config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
         return Reconstruction(
-            sequence.camera, records, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
+            sequence.camera, frames, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
         )
+
+    def _stored_poses(self, submap: Submap) -> dict[int, np.ndarray]:
+        """Return the poses (4, 4) as tracked, by number, of the submap's frames that wait for fusion."""
+        if not self.pipeline.fusion.at_end:
+            return {}
+        poses = zip(self.frames["index"].tolist(), self.frames["T_world_camera"], strict=True)
+        return {index: T_world_camera for index, T_world_camera in poses if index in submap.frames}
 
     def _triangulated_depths(self, final: FinalFrames) -> KeyframeDepths | None:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
-        flow = self.pipeline.estimators.keyframe_flow
-        used = self.write is not None or self.config.fusion.enabled
-        if not (used and self.config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
+        config, flow = self.pipeline.config, self.pipeline.estimators.keyframe_flow
+        used = bool(self.writers) or config.fusion.enabled
+        if not (used and config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
 
-    def _written(self, frames: Iterator[Frame], main: int, moving: MovingTissue) -> Iterator[Frame]:
-        """Yield the final frames of a submap, their depth written; keep some, at which its surface is checked.
+    def _written(
+        self, frames: Iterator[Frame], checked: SpreadFrames, moving: MovingTissue, count: int
+    ) -> Iterator[Frame]:
+        """Yield the final frames of a submap, written; `checked` keeps some, `moving` counts them all.
 
-        moving : counts them all.
+        count : of the frames of all submaps.
         """
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
                 usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
                 moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
-            self.checked[main].put(frame)
-            yield self._write_depth(frame)
-            self.final_done += 1
-            self.progress("fusing", self.final_done, self.final_frames)
+            checked.put(frame)
+            self._write(frame)
+            yield frame
+            self._done += 1
+            self.progress("fusing", self._done, count)
 
-    def _write_depth(self, frame: Frame) -> Frame:
-        """Write the final depth of a frame, and its surface where each has one of its own."""
-        if self.write is not None:
-            self.write(frame)
-        if self.write_surface is not None and frame.T_world_camera is not None:
-            self.write_surface(frame)
-        return frame
+    def _write(self, frame: Frame) -> None:
+        for write in self.writers:
+            write(frame)
 
 
-class _SpreadFrames:
+class SpreadFrames:
     """Every n-th of the frames with a pose that are put in, at most `_CHECKED_FRAMES`; n doubles as they grow more."""
 
     def __init__(self) -> None:
@@ -352,7 +321,12 @@ class Clock:
             self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - started
 
 
-def _ahead(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_Item, None, None]:
+def compiling_s() -> float:
+    """Return how long this process has compiled kernels that no cache held, s."""
+    return float(_COMPILING.duration) if _COMPILING.done else 0.0
+
+
+def in_thread(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_Item, None, None]:
     """Yield items in order, computed in a thread of their own, at most `count` ahead of their use.
 
     thread : its name. An error of an item is raised where the item would come. Closed early, the thread ends after the
@@ -372,7 +346,7 @@ def _ahead(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_It
 
 
 def overlapped(
-    frames: Iterator[Frame], pipeline: Pipeline, clock: Clock, ahead: int = 2, states: Checkpoints | None = None
+    frames: Iterator[Frame], pipeline: Pipeline, clock: Clock, ahead: int = 2, states: RunStates | None = None
 ) -> Iterator[Step]:
     """Yield the steps of all frames; each stage but the last runs in a thread of its own, `ahead` frames ahead."""
 
@@ -384,7 +358,7 @@ def overlapped(
                     states.keep(part)
                 yield result, due
 
-        return _ahead(results(), part, ahead)
+        return in_thread(results(), part, ahead)
 
     read = iter(partial(clock.timed, "read", next, frames, None), None)
     marked = ((frame, states is not None and states.due()) for frame in read)

@@ -9,8 +9,8 @@ from scopemap.io.sequence import Sequence
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
-from scopemap.runner.preparation import Progress
-from scopemap.runner.run import Observer, reconstruct
+from scopemap.runner.reconstruct import reconstruct
+from scopemap.runner.run import Observer, Progress
 
 
 def reconstruct_with_report(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.causes import LossCause
 
-Status = Literal["initial", "ok", "lost", "other-map", "rotation-only"]
+Status = Literal["initial", "ok", "lost"]
 
 _DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image with few usable pixels
 MOVING_SIGMAS = 2.0
@@ -29,8 +29,7 @@ class TrackingLoss(NamedTuple):
 class Track:
     """Tracking result of one frame: its pose, or the reason why it is lost.
 
-    status : "initial" for the frame that fixes the world of its map, "ok", or "lost". In the records of a result, also
-        "other-map", tracked in another submap, and "rotation-only", lost and its rotation followed.
+    status : "initial" for the frame that fixes the world of its map, "ok", or "lost".
     reason : one phrase; for a lost frame, what was wrong. cause : of the loss, as the tracker judged it.
     relocalised : whether features found the lost camera in this frame.
     T_world_camera : (4, 4) float64; a lost frame repeats the last tracked pose. keyframe : number of its reference.
@@ -64,6 +63,11 @@ class Track:
     rotation: np.ndarray | None = None
     cause: LossCause = LossCause.NONE
     relocalised: bool = False
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """Its columns of a `FrameTable`, and others."""
+        return vars(self) | dict(zip(("moving_share", "moving_x", "moving_y"), self.moving, strict=True))
 
     @property
     def moving(self) -> tuple[float, float, float]:

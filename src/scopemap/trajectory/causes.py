@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import StrEnum
-from typing import Protocol
+
+import numpy as np
 
 FAST_MOTION = 0.03
 """Median flow between two frames, share of the width, beyond which a frame is lost for its motion."""
@@ -48,33 +48,17 @@ _OF_ITS_OWN = {
 }
 
 
-class TrackedFrame(Protocol):
-    """What is known of a frame: its status, the cause that the tracker gave, and the flow since the frame before."""
-
-    @property
-    def status(self) -> str:
-        """As in `Trajectory`."""
-
-    @property
-    def cause(self) -> LossCause:
-        """`NONE` where it is not lost."""
-
-    @property
-    def motion(self) -> float:
-        """Median flow, share of the width; NaN where it is not known."""
-
-
-def causes_of_loss(frames: Sequence[TrackedFrame]) -> list[LossCause]:
+def causes_of_loss(status: np.ndarray, cause: np.ndarray, motion: np.ndarray) -> list[LossCause]:
     """Return for each frame, in order, why it is lost; `NONE` where it is not.
 
-    Motion tells blur from smoke, and explains a rejected pose. A frame without a fault of its own that follows lost
-    ones is not found again.
+    status : (N,) as in `Trajectory`. cause : (N,) as the tracker judged it. motion : (N,) median flow since the frame
+    before, share of the width, NaN = unknown: it tells blur from smoke, and explains a rejected pose. A frame without a
+    fault of its own that follows lost ones is not found again.
     """
     found: list[LossCause] = []
-    for frame in frames:
+    for lost, judged, is_fast in zip(status == "lost", cause.tolist(), motion > FAST_MOTION, strict=True):
         before = found[-1] if found else LossCause.NONE
-        is_fast = frame.motion > FAST_MOTION
-        found.append(_cause(frame.cause, is_fast, before) if frame.status == "lost" else LossCause.NONE)
+        found.append(_cause(LossCause(judged), bool(is_fast), before) if lost else LossCause.NONE)
     return found
 
 

@@ -35,7 +35,7 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Measure runs against one truth, and print and write their tables and figures."""
-    from scopemap.report.kept_run import is_run
+    from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import PAGE, write_comparison
     from scopemap_bench.comparison import compare as compare_runs
     from scopemap_bench.figures import write_results
@@ -47,7 +47,7 @@ def compare(
     runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
-    finished = [run for run in runs if is_run(run.folder)]
+    finished = [run for run in runs if RunFolder(run.folder).is_finished]
     if out is not None and finished:
         names_shown = [f"{run.result.method}, {run.result.sequence}" for run in finished]
         files.append(write_comparison([run.folder for run in finished], names_shown, out / PAGE))

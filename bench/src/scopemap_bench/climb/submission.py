@@ -6,7 +6,6 @@ submap; RUN is 1 to 5. Source: EndoCartoScope/climb-challenge, submission_instru
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 import trimesh
 
 from scopemap.errors import InputError
+from scopemap.io.run_folder import RunFolder
 from scopemap.trajectory.formats.folders import read_run, submap_folders
 from scopemap.trajectory.trajectory import Trajectory
 from scopemap_bench.trajectories.climb import write_submap
@@ -32,12 +32,12 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     the clip's runs is there already.
     """
     try:
-        facts = json.loads((run / "provenance.json").read_text(encoding="utf-8"))
+        facts = RunFolder(run).provenance
         seconds, clip = facts["seconds"], clip or Path(facts["input"]).stem
         prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0) + seconds.get("check surface", 0.0)
         # The time up to the last pose, the back end included; the mesh comes after it.
         times = zip(RUNTIME_KEYS, (prepare_s, seconds["total"] - prepare_s - fuse_s), strict=True)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"exporting {run}: it is not the folder of a finished run ({error})") from None
     first, *others = (out / clip / number for number in RUNS)
     try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
+from scopemap.io.images import use_first_calibration
 from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
 from scopemap.io.video import VideoFile
 
@@ -46,7 +47,7 @@ class PosedVideo(Source):
             self.warnings.append(f"{video.name} claims {self.count} frames, for which it has no room: count unknown")
             self.count = self._video.count = None
         self.numbers = None if self.count is None else range(self.count)
-        self._use_first_calibration(path / OWN_CALIBRATION)
+        use_first_calibration(self, path / OWN_CALIBRATION)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames of the view, decoded in order."""

@@ -27,7 +27,7 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.frame import TruthQuality
 from scopemap.io.decoding import decoded
-from scopemap.io.images import ImageFolder, decoded_image, frame_number, image_files
+from scopemap.io.images import ImageFolder, decoded_image, frame_number, image_files, use_first_calibration
 from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
 from scopemap.io.video import VideoFile
 from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered
@@ -138,7 +138,7 @@ class ScaredKeyframe(Source):
         return common
 
     def _calibrate(self) -> None:
-        self._use_first_calibration(*(self.path / name for name in (OWN_CALIBRATION, *_CALIBRATIONS)))
+        use_first_calibration(self, *(self.path / name for name in (OWN_CALIBRATION, *_CALIBRATIONS)))
 
     def _assumptions(self, stacked: bool) -> list[str]:
         numbers = [int(n) for part in self.path.absolute().parts[-3:] for n in re.findall(r"dataset_?(\d+)", part)]
@@ -194,7 +194,7 @@ class ScaredCKeyframe(ScaredKeyframe):
 
     def _calibrate(self) -> None:
         file = self.path / _INTRINSICS
-        if self._use_first_calibration(self.path / OWN_CALIBRATION):
+        if use_first_calibration(self, self.path / OWN_CALIBRATION):
             return
         if not file.is_file():
             missing = f"reading {self.path}: {_INTRINSICS} is not there; give a calibration (--camera)"

@@ -14,7 +14,7 @@ from scopemap.errors import SettingsError
 from scopemap.estimators import missing_weights
 from scopemap.io.sequence import Sequence
 from scopemap.odometry import Step
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.track import FrameTracker
 from scopemap_bench.methods.endo_depth_and_motion import create_endo_depth_and_motion
 from scopemap_bench.methods.imported import ImportedTrajectory
@@ -85,7 +85,7 @@ class PipelineMethod:
 
         config = self.config(settings)
         result = reconstruct(sequence, config, out=out, overwrite=True, observers=(note,), tracker=tracker)
-        frames, seconds = len(result.records), result.provenance["seconds"]
+        frames, seconds = len(result.frames), result.provenance["seconds"]
         # Work after the last frame counts for all frames.
         afterwards = sum(seconds.get(part, 0.0) for part in ("back end", "depth corrected", "fuse"))
         return {

@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
-from scopemap.calibration.focal_length.estimate import with_focal_from_motion
 
+from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
 from scopemap.calibration.focal_length.trial import KINDS
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration

@@ -30,16 +30,17 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
+from scopemap.actions.verifying import verify_result
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.config import Config, DepthSettings
 from scopemap.depth.files import FilesDepth
 from scopemap.errors import ScopemapError
-from scopemap.io.checksums import verify_result, write_checksums
+from scopemap.io.checksums import write_checksums
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import reference_trajectory
+from scopemap.io.run_folder import RunFolder
 from scopemap.masking.mask_files import MaskFiles
-from scopemap.reconstruction import DepthReader
-from scopemap.report.kept_run import read_run
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.datasets.checking import check
 from scopemap_bench.datasets.survey import survey
@@ -220,7 +221,7 @@ def read_result(folder: Path) -> None:
     depth = DepthReader(folder)
     for index in range(3):
         depth.read_sigma(index)
-    read_run(folder)
+    RunFolder(folder).checked()
     verify_result(folder)
 
 

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import av
 import numpy as np
-from scopemap.io.live import LiveSource
 
 from scopemap.config import Config
+from scopemap.io.live_source import LiveSource
 from scopemap.io.opening import open_sequence, sequence_of
 from scopemap.odometry import Step
 from scopemap.runner.live import LiveSession, finished

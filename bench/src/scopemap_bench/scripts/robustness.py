@@ -29,7 +29,7 @@ import scopemap.runner.checkpoints as checkpoints
 from scopemap.config import Config
 from scopemap.errors import ScopemapError
 from scopemap.io.opening import open_sequence
-from scopemap.runner.run import reconstruct
+from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.scripts import batch, fuzz, measuring
 
 PRESETS = ("default", "realtime")

@@ -25,7 +25,7 @@ import trimesh
 from scopemap.actions.inputs import open_truth
 from scopemap.fusion.agreement import compare_with_frame
 from scopemap.geometry.se3 import inverse, transform
-from scopemap.reconstruction import DepthReader
+from scopemap.io.depth_maps import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import PHANTOMS, Clip, clips, drawn

@@ -3,87 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 
 from scopemap.actions.pictures import frames_again
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError, reporting
 from scopemap.frame import Frame
 from scopemap.geometry.rendering import vertex_colours
 from scopemap.io.decoding import write_encoded
-from scopemap.reconstruction import DepthReader, scale_words
-from scopemap.report.kept_run import read_run
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.io.run_folder import RunFolder
 from scopemap.trajectory.trajectory import Trajectory
 
-_SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a guess, compare shapes"
 
+class ExportedRun(RunFolder):
+    """The folder of a run to be exported, or of one of its submaps."""
 
-@dataclass(frozen=True)
-class ExportedRun:
-    """A run to be exported.
-
-    folder : of the run, or of one of its submaps. trajectory : its tracked frames alone, poses in mm. mesh : world mm,
-    may be empty. camera : working camera of all frames. scale : what is known of the scale, in words; scale_known :
-    whether sizes were measured or anchored.
-    """
-
-    folder: Path
-    trajectory: Trajectory
-    mesh: trimesh.Trimesh
-    camera: PinholeCamera
-    scale: str
-    scale_known: bool
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Its tracked frames alone, poses in mm."""
+        return self.frames.only(self.frames.tracked).trajectory
 
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The vertices of the mesh, (V, 3) float64, world mm, and their colours, (V, 3) uint8 sRGB."""
         return np.asarray(self.mesh.vertices, np.float64).reshape(-1, 3), vertex_colours(self.mesh)[:, :3]
 
-    def frames(self) -> Iterator[Frame]:
+    def tracked_frames(self) -> Iterator[Frame]:
         """Yield the tracked frames in order, rectified and masked, read from the run's input again.
 
         Raises `InputError` where the input is gone, or has not all of them any more.
         """
         missing = set(self.trajectory.indices.tolist())
-        for frame in frames_again(self.folder, missing.copy()):
+        for frame in frames_again(self.path, missing.copy()):
             missing.discard(frame.index)
             yield frame
         if missing:
-            raise InputError(f"the input of the run {self.folder} has no frame {min(missing)} any more")
+            raise InputError(f"the input of the run {self.path} has no frame {min(missing)} any more")
 
-    def depth(self) -> DepthReader | None:
-        """Return a reader of the final depth; None unless every tracked frame has it. The depth of submaps is the
-        run's.
-        """
-        for folder in (self.folder, self.folder.parent.parent):
-            files = (folder / "depth" / f"{index:06d}.png" for index in self.trajectory.indices)
-            if all(file.is_file() for file in files) and (reader := DepthReader(folder)).present:
-                return reader
-        return None
+    @property
+    def has_all_depth(self) -> bool:
+        """Whether every tracked frame has its depth."""
+        return self.depth.present and all(map(self.depth.has, self.trajectory.indices.tolist()))
 
 
 def read_exported(folder: Path) -> ExportedRun:
     """Read a run's folder, or that of a submap, `maps/N`. Raises `InputError` where it is none or has no pose."""
-    kept, trajectory = read_run(folder), read_trajectory(folder, kind="run")
-    tracked = trajectory.rows(trajectory.tracked)
-    if not len(tracked):
+    run = ExportedRun(folder)
+    run.checked()
+    if not len(run.trajectory):
         raise InputError(f"{folder}: no frame was tracked, so there is nothing to export")
-    with reporting(f"{folder}/provenance.json does not state the camera"):
-        camera = _camera(kept.provenance["camera"])
-    scale = scale_words(kept.provenance.get("scale", {})) or _SCALE_NOT_STATED
-    known = bool(kept.provenance.get("scale", {}).get("known"))
-    return ExportedRun(folder, tracked, kept.maps[0].mesh, camera, scale, known)
-
-
-def _camera(facts: dict[str, Any]) -> PinholeCamera:
-    fx, fy, cx, cy = (float(facts[name]) for name in ("fx", "fy", "cx", "cy"))
-    return PinholeCamera(fx, fy, cx, cy, int(facts["width"]), int(facts["height"]))
+    assert run.camera is not None
+    return run
 
 
 def write_image(file: Path, image: np.ndarray) -> None:

@@ -36,7 +36,7 @@ def write_nerfstudio(run: ExportedRun, folder: Path) -> None:
     Depth is float32, mm, 0 = unknown: nerfstudio multiplies it by 0.001, its default, and has metres. Depth is left out
     unless every frame has it, because nerfstudio takes all or none.
     """
-    depth, names = run.depth(), [f"{index:06d}" for index in run.trajectory.indices]
+    depth, names = run.depth if run.has_all_depth else None, [f"{index:06d}" for index in run.trajectory.indices]
     for frame in _with_images(run, folder, mask_ending=".png"):
         if depth is not None:
             (folder / "depth").mkdir(exist_ok=True)
@@ -99,10 +99,10 @@ def write_endogslam(run: ExportedRun, folder: Path) -> None:
     `pose.txt` is C3VD's: camera-to-world, 16 numbers a line, transposed. `camera.yaml` has the `camera_params` of
     EndoGSLAM's configuration; `png_depth_scale` is levels per mm.
     """
-    depth = run.depth()
-    if depth is None:
-        raise InputError(f"{run.folder}: not every tracked frame has its depth, which EndoGSLAM needs")
-    for frame in run.frames():
+    depth = run.depth
+    if not run.has_all_depth:
+        raise InputError(f"{run.path}: not every tracked frame has its depth, which EndoGSLAM needs")
+    for frame in run.tracked_frames():
         write_image(folder / "color" / f"{frame.index:06d}_color.png", frame.rgb[..., ::-1])
         levels = np.nan_to_num(_required(depth.read(frame.index), frame) / depth.scale_mm)
         write_image(folder / "depth" / f"{frame.index:06d}_depth.tiff", np.round(levels).astype(np.uint16))
@@ -124,16 +124,16 @@ def write_endonerf(run: ExportedRun, folder: Path) -> None:
     masks and depth are resampled to that; the first camera is the world, since its readers take other first rotations
     for LLFF's axes.
     """
-    depth = run.depth()
-    if depth is None:
-        raise InputError(f"{run.folder}: not every tracked frame has its depth, which EndoNeRF needs")
+    depth = run.depth
+    if not run.has_all_depth:
+        raise InputError(f"{run.path}: not every tracked frame has its depth, which EndoNeRF needs")
     camera, size = run.camera, (run.camera.width, run.camera.height)
     stretch, middle = camera.fx / camera.fy, ((camera.width - 1) / 2, (camera.height - 1) / 2)
     centred = np.array([[1.0, 0.0, middle[0] - camera.cx], [0.0, stretch, middle[1] - stretch * camera.cy]])
     poses = inverse(run.trajectory.T_world_camera[0]) @ run.trajectory.T_world_camera
     pose_of = dict(zip(run.trajectory.indices.tolist(), poses, strict=True))
     rows = []
-    for frame in run.frames():
+    for frame in run.tracked_frames():
         depth_mm = np.nan_to_num(_required(depth.read(frame.index), frame))
         levels = cv2.warpAffine(depth_mm, centred, size, flags=cv2.INTER_NEAREST)
         hidden = 1 - cv2.warpAffine(frame.valid.astype(np.uint8), centred, size, flags=cv2.INTER_NEAREST)
@@ -151,7 +151,7 @@ def write_endonerf(run: ExportedRun, folder: Path) -> None:
 
 def _with_images(run: ExportedRun, folder: Path, *, mask_ending: str) -> Iterator[Frame]:
     """Write `images/000000.png` and `masks/000000` + ending (white: usable) of each frame, and yield it."""
-    for frame in run.frames():
+    for frame in run.tracked_frames():
         write_image(folder / "images" / f"{frame.index:06d}.png", frame.rgb[..., ::-1])
         write_image(folder / "masks" / f"{frame.index:06d}{mask_ending}", frame.valid.astype(np.uint8) * 255)
         yield frame

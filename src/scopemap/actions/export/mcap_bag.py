@@ -65,7 +65,7 @@ def write_mcap(run: ExportedRun, file: Path) -> None:
         writer.add_metadata("scopemap", {"unit": "m", "scale": run.scale})
         path = run.trajectory
         for number, (frame, time_s, pose) in enumerate(
-            zip(run.frames(), path.times_s, path.T_world_camera, strict=True)
+            zip(run.tracked_frames(), path.times_s, path.T_world_camera, strict=True)
         ):
             time_ns = round(time_s * _NS_PER_S)
             stamp = {"timestamp": {"sec": time_ns // _NS_PER_S, "nsec": time_ns % _NS_PER_S}}

@@ -64,7 +64,7 @@ def _points_of(run: ExportedRun, unit: Unit) -> tuple[np.ndarray, np.ndarray, np
     """Return positions (V, 3) in a unit, normals (V, 3) and colours (V, 3) uint8 of the vertices."""
     points_mm, colours = run.points
     if not len(points_mm):
-        raise InputError(f"{run.folder}: the run has no surface to export")
+        raise InputError(f"{run.path}: the run has no surface to export")
     return points_mm / MM_PER_UNIT[unit], np.asarray(run.mesh.vertex_normals, np.float64), colours
 
 

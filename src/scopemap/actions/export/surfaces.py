@@ -102,6 +102,6 @@ def _about(run: ExportedRun, unit: Unit, axes: Axes) -> list[str]:
 
 def _surface_of(run: ExportedRun, unit: Unit, axes: Axes) -> trimesh.Trimesh:
     if not len(run.mesh.faces):
-        raise InputError(f"{run.folder}: the run has no surface to export")
+        raise InputError(f"{run.path}: the run has no surface to export")
     vertices = run.mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
     return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=vertex_colours(run.mesh), process=False)

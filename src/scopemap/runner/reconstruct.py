@@ -1,0 +1,105 @@
+"""`reconstruct`, what users call: prepares a run, resumes it where one was killed, and writes its result."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from scopemap.config import Config
+from scopemap.estimators import largest_depth_mm
+from scopemap.fusion.frame_store import FrameStore
+from scopemap.io.checksums import input_checksum, write_checksums
+from scopemap.io.depth_maps import DepthWriter
+from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
+from scopemap.io.sequence import Sequence
+from scopemap.pipeline import Pipeline
+from scopemap.reconstruction import Reconstruction
+from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
+from scopemap.runner.frame_surfaces import SurfaceWriter
+from scopemap.runner.memory import memory_plan
+from scopemap.runner.preparation import prepare
+from scopemap.runner.provenance import refuse_own_input
+from scopemap.runner.run import Clock, FrameWriter, Observer, Progress, Run
+from scopemap.tracking.track import FrameTracker
+
+_NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
+
+
+def reconstruct(
+    sequence: Sequence,
+    config: Config | None = None,
+    *,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    observers: tuple[Observer, ...] = (),
+    progress: Progress = lambda doing, done, total: None,
+    tracker: FrameTracker | None = None,
+) -> Reconstruction:
+    """Turn a sequence into poses, depth and a surface.
+
+    A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
+    result. Observers that are methods of an object with an attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
+
+    The settings in the result are the resolved ones: the TSDF parameters are numbers.
+    Of several submaps the one with most frames is the result, and `others` holds the others.
+    Raises `InputError` where no frame could be tracked, and what the estimators raise for missing weights.
+
+    Parameters
+    ----------
+    sequence : from `open_sequence`.
+    config : settings, by default the preset `default`.
+    out : folder for the result; None keeps it in memory, without depth maps. Where the run fails it stays as it was.
+    overwrite : replace an earlier run there, once the new one is whole.
+    observers : called with each `Step`, whose pose and depth are as tracked, before the back end; one that returns
+        True ends the run early, with the frames that were read until then.
+    tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
+        "none".
+    progress : called before the first frame and after the last one.
+    """
+    clock = Clock()
+    config = config or Config()
+    plan = memory_plan(config, sequence)
+    if out is not None:
+        refuse_own_input(Path(out), sequence, config)
+        check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
+    identity = {} if out is None else identity_of(sequence, config, tracker)
+    with result_folder(out, overwrite=overwrite, can_resume=partial(can_resume, identity=identity)) as folder:
+        store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
+        sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
+        write_depth = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
+        writers: tuple[FrameWriter, ...] = () if write_depth is None else (write_depth,)
+        if folder is not None and config.tracking.camera_at_rest:
+            writers += (SurfaceWriter(folder, config, estimators),)
+        with closing(store):
+            pipeline = Pipeline(config, estimators, store, tracker)
+            run = Run(sequence, pipeline, clock, writers, progress, plan)
+            if folder is None:
+                run.track(observers)
+            else:
+                _track_with_checkpoints(run, observers, folder, identity)
+            result = run.result(notices)
+        content = result.provenance["input_content"] = input_checksum(sequence.path)
+        changes = input_changes(identity, content, sequence.path)
+        result.provenance["notices"] += [notice.as_json() for notice in changes]
+        del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
+        if folder is not None and write_depth is not None:
+            progress("writing", 0, 0)
+            write_depth.finish(scale_known=result.provenance["scale"]["known"])
+            result.save(folder)
+            for owner in _kept_with(observers):
+                owner.save(folder)
+            write_checksums(folder, without=NOT_OF_THE_RESULT)
+    return result
+
+
+def _track_with_checkpoints(run: Run, observers: tuple[Observer, ...], folder: Path, identity: dict[str, Any]) -> None:
+    with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
+        run.track(observers, checkpoints)
+
+
+def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:
+    """Return the objects that observe a run by a method, and are resumed and saved with it."""
+    owners = (getattr(observer, "__self__", None) for observer in observers)
+    return tuple(owner for owner in owners if hasattr(owner, "NOT_IN_CHECKPOINT"))
