@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Collection, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ class SurfaceAgreement:
             folder.mkdir(parents=True, exist_ok=True)
             kinds = ((self.held_out, False), (self.fused, True))
             rows = [
-                {"index": index, **asdict(agreement), "fused": int(fused)}
+                {"index": index, **agreement._asdict(), "fused": int(fused)}
                 for kind, fused in kinds
                 for index, agreement in kind.items()
             ]

@@ -132,8 +132,8 @@ class LoopFinder:
 
     def _of(self, keyframe: int) -> Features:
         rows = self._rows.read(*self._features[keyframe][1:])
-        arrays = (np.ascontiguousarray(rows[name]) for name in ("pixel", "descriptor", "point_mm"))
-        return Features(*arrays, self._detector.max_ratio)
+        pixels, descriptors, points = (np.ascontiguousarray(rows[n]) for n in ("pixel", "descriptor", "point_mm"))
+        return Features(pixels, descriptors, points, self._detector.max_ratio)
 
     def between(self, map_of: Sequence[int]) -> list[Loop]:
         """Return further loops between maps, after the last keyframe, of the most similar keyframes of each two maps.
