@@ -27,10 +27,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.scripts import measuring
@@ -120,35 +120,47 @@ def wait_for(results: int, out: Path, process: subprocess.Popen[bytes]) -> None:
 
 def kill(process: int) -> None:
     """Kill a process of ours, and give those that end with it time to do so."""
-    os.kill(process, signal.SIGKILL)
+    with suppress(ProcessLookupError):  # it has just ended
+        os.kill(process, signal.SIGKILL)
     time.sleep(2)
 
 
-def by_processes(videos: Path, out: Path) -> str:
-    """Run a batch of which the whole command is killed."""
-    process = subprocess.Popen(command(videos, out))
-    wait_for(2, out, process)
-    kill(process.pid)
-    process.wait()
-    subprocess.run(command(videos, out), check=False)
-    return "the command"
+def children(process: int) -> list[int]:
+    """Return the processes that a process has begun."""
+    try:
+        return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+    except OSError:
+        return []
 
 
-def by_parts(videos: Path, out: Path) -> str:
-    """Run three parts at once, of which one is killed."""
-    parts = [command(videos, out, "--part", f"{number}/3", workers=1) for number in (1, 2, 3)]
-    running = [subprocess.Popen(part) for part in parts]
-    wait_for(2, out, running[1])
-    kill(running[1].pid)
-    for process in running:
-        process.wait()
-    subprocess.run(parts[1], check=False)
-    return "part 2"
+@dataclass(frozen=True)
+class Disturbed:
+    """The command of a batch, what is killed beside processes of its videos, and how, given the process."""
+
+    command: list[str]
+    what: str
+    kill: Callable[[subprocess.Popen[bytes]], object]
 
 
 @contextmanager
-def ray_cluster() -> Any:
-    """Yield the options for a Ray of a head without workers and two nodes, and what kills a node."""
+def by_processes(videos: Path, out: Path) -> Iterator[Disturbed]:
+    """Yield a batch of which the whole command is killed."""
+    yield Disturbed(command(videos, out), "the command", lambda process: kill(process.pid))
+
+
+@contextmanager
+def by_parts(videos: Path, out: Path) -> Iterator[Disturbed]:
+    """Yield the second of three parts that run at once; it is killed."""
+    parts = [command(videos, out, "--part", f"{number}/3", workers=1) for number in (1, 2, 3)]
+    others = [subprocess.Popen(part) for part in (parts[0], parts[2])]
+    yield Disturbed(parts[1], "part 2", lambda process: kill(process.pid))
+    for process in others:
+        process.wait()
+
+
+@contextmanager
+def by_ray(videos: Path, out: Path) -> Iterator[Disturbed]:
+    """Yield a batch on a Ray of a head without workers and two nodes, of which it loses one."""
     # A node that is killed refuses at once; one that a loaded machine delays is not dead.
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_health_check_timeout_ms": "60000"}
     from ray.cluster_utils import Cluster
@@ -158,34 +170,21 @@ def ray_cluster() -> Any:
     try:
         nodes = [cluster.add_node(num_cpus=1, memory=2 << 30, **given) for _ in range(2)]
         options = ("--engine", "ray", "--address", cluster.address, "--worker-cores", "1", "--worker-memory", "1GB")
-        yield options, lambda: nodes[0].kill_raylet(check_alive=False)
+        yield Disturbed(
+            command(videos, out, *options), "a node", lambda process: nodes[0].kill_raylet(check_alive=False)
+        )
     finally:
         cluster.shutdown()
 
 
-def by_ray(videos: Path, out: Path) -> str:
-    """Run a batch on a Ray that loses a node."""
-    with ray_cluster() as (options, kill_node):
-        process = subprocess.Popen(command(videos, out, *options))
-        wait_for(2, out, process)
-        kill_node()
-        process.wait()
-    return "a node"
+@contextmanager
+def by_slurm(videos: Path, out: Path) -> Iterator[Disturbed]:
+    """Yield a batch as jobs of submitit on this machine, of which one is killed."""
 
+    def kill_job(process: subprocess.Popen[bytes]) -> None:
+        kill(next(job for controller in children(process.pid) for job in children(controller)))
 
-def by_slurm(videos: Path, out: Path) -> str:
-    """Run a batch as jobs, of which one is killed."""
-    process = subprocess.Popen(slurm_command(videos, out))
-    wait_for(2, out, process)
-    jobs = [job for controller in children(process.pid) for job in children(controller)]
-    kill(jobs[0])
-    process.wait()
-    return "a job"
-
-
-def slurm_command(videos: Path, out: Path) -> list[str]:
-    """Return the command that runs a batch as jobs of submitit on this machine."""
-    return [sys.executable, __file__, "--local-jobs", str(videos), str(out)]
+    yield Disturbed([sys.executable, __file__, "--local-jobs", str(videos), str(out)], "a job", kill_job)
 
 
 def local_jobs(videos: str, out: Path) -> None:
@@ -202,17 +201,9 @@ def local_jobs(videos: str, out: Path) -> None:
     run_batch(chosen, out, ProcessLimits(2, seconds=120.0, retries=RETRIES), engine=engine)
 
 
-def children(process: int) -> list[int]:
-    """Return the processes that a process has begun."""
-    try:
-        return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
-    except OSError:
-        return []
-
-
 @contextmanager
-def s3_address(videos: Path) -> Any:
-    """Yield the address of a folder of these videos on an S3 server at this machine's loopback address."""
+def by_s3(videos: Path, out: Path) -> Iterator[Disturbed]:
+    """Yield a batch of videos on an S3 server at this machine's loopback address; nothing more is killed."""
     import fsspec
     from moto.server import ThreadedMotoServer
 
@@ -227,33 +218,12 @@ def s3_address(videos: Path) -> Any:
         if not store.exists("archive"):
             store.mkdir("archive")
         store.put(str(videos) + "/", "archive/2026/", recursive=True)
-        yield "s3://archive/2026"
+        yield Disturbed(command("s3://archive/2026/*.mp4", out), "nothing more", lambda process: None)
     finally:
         server.stop()
 
 
-def by_s3(videos: Path, out: Path) -> str:
-    """Run a batch of videos at an address."""
-    with s3_address(videos) as address:
-        subprocess.run(command(f"{address}/*.mp4", out), check=False)
-    return "nothing more"
-
-
-def again(engine: str, videos: Path, out: Path) -> None:
-    """Give the command of an engine again."""
-    with ExitStack() as stack:
-        if engine == "slurm":
-            words = slurm_command(videos, out)
-        elif engine == "ray":
-            words = command(videos, out, *stack.enter_context(ray_cluster())[0])
-        elif engine == "s3":
-            words = command(f"{stack.enter_context(s3_address(videos))}/*.mp4", out)
-        else:
-            words = command(videos, out)
-        subprocess.run(words, check=False)
-
-
-ENGINES: dict[str, Callable[[Path, Path], str]] = {
+ENGINES: dict[str, Callable[[Path, Path], AbstractContextManager[Disturbed]]] = {
     "processes": by_processes,
     "parts": by_parts,
     "ray": by_ray,
@@ -265,23 +235,27 @@ ENGINES: dict[str, Callable[[Path, Path], str]] = {
 def trial(engine: str, videos: Path, out: Path, wanted: Wanted) -> tuple[list[str], bool]:
     """Return the row of an engine, and whether all is as it must be."""
     begun = time.monotonic()
-    with Killer(out, once=True) as killer:
-        further = ENGINES[engine](videos, out)
+    with Killer(out, once=True) as killer, ENGINES[engine](videos, out) as batch:
+        process = subprocess.Popen(batch.command)
+        wait_for(2, out, process)
+        batch.kill(process)
+        if process.wait() < 0:
+            subprocess.run(batch.command, check=False)
     seconds, before, found = time.monotonic() - begun, times(out), statuses(out)
     others_of = {name: dict(content(out / name).items() ^ files.items()) for name, files in wanted.items()}
     differ = [f"{name}/{file}" for name, differing in others_of.items() for file in differing]
     equal = sum(not differing for differing in others_of.values())
     failed = [f"{name}: {status}" for name, status in found.items() if status != "done"]
     others = sum(len(processes) for name, processes in killer.killed.items() if name != POISONED)
-    with Killer(out, once=False):
-        again(engine, videos, out)
+    with Killer(out, once=False), ENGINES[engine](videos, out) as batch:
+        subprocess.run(batch.command, check=False)
     after = times(out)
     touched = sum(after.get(file) != when for file, when in before.items())
     left = [path.name for path in out.iterdir() if path.name.startswith(".")]
     attempts = len(killer.killed.get(POISONED, []))
     is_right = equal == len(wanted) and len(failed) == 1 and failed[0].startswith(f"{POISONED}: failed")
     is_right &= (touched, left, others) == (0, [], 1) and statuses(out).keys() == found.keys()
-    killed = f"the poisoned {attempts} times, another process once, {further}" if others else "NOBODY"
+    killed = f"the poisoned {attempts} times, another process once, {batch.what}" if others else "NOBODY"
     equals = " but ".join([f"{equal} of {len(wanted)}", *differ[:3]])
     cells = [engine, equals, "; ".join(failed), killed, str(touched), f"{seconds:.0f}"]
     return cells, is_right
