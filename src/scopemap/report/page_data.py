@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from base64 import b64encode
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -51,10 +52,11 @@ def shown_meshes(run: Result, most_faces: int | None) -> list[trimesh.Trimesh]:
 
     Others are simplified.
     """
+    submaps: Sequence[Result] = run.submaps[:_MOST_MAPS]
     if most_faces is None:
-        return [submap.mesh for submap in run.submaps[:_MOST_MAPS]]
+        return [submap.mesh for submap in submaps]
     most = [most_faces] + [min(most_faces, _FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
-    return [simplified(submap.mesh, faces) for submap, faces in zip(run.submaps, most, strict=False)]
+    return [simplified(submap.mesh, faces) for submap, faces in zip(submaps, most, strict=False)]
 
 
 def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:

@@ -161,8 +161,7 @@ class Run:
 
     def result(self, prepared: list[Notice]) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        outside = (self.sequence, self.pipeline, self.clock, self.writers, self.progress)
-        result = _Finishing(*outside, self.frames.read(), self.checked, prepared + self.plan.notices).result()
+        result = _Finishing(self, self.frames.read(), prepared + self.plan.notices).result()
         last = self.frames.last_index if self.interrupted else None
         facts = {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
         notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
@@ -173,28 +172,19 @@ class Run:
 
 @dataclass
 class _Finishing:
-    """Makes the result from what a run has collected.
+    """Makes the result of a run from the table of all its frames, as tracked; `notices` are of all submaps."""
 
-    frames : all, as tracked. checked : those of each map that was fused at once, at which its surface is checked.
-    notices : of all submaps.
-    """
-
-    sequence: Sequence
-    pipeline: Pipeline
-    clock: Clock
-    writers: tuple[FrameWriter, ...]
-    progress: Progress
+    run: Run
     frames: FrameTable
-    checked: dict[int, SpreadFrames]
     notices: list[Notice]
     _done: int = field(default=0, init=False)
 
     def result(self) -> Reconstruction:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        frames, pipeline, clock = self.frames, self.pipeline, self.clock
-        check_tracked(frames, self.sequence.path)
+        frames, pipeline, clock = self.frames, self.run.pipeline, self.run.clock
+        check_tracked(frames, self.run.sequence.path)
         clock.timed("track backwards", track_backwards, pipeline, frames)
-        self.progress("adjusting keyframes", 0, 0)
+        self.run.progress("adjusting keyframes", 0, 0)
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
         results = [self._fused(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
@@ -205,7 +195,7 @@ class _Finishing:
 
     def _fused(self, number: int, submaps: list[Submap]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
-        sequence, pipeline, submap = self.sequence, self.pipeline, submaps[number]
+        sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
         config, store = pipeline.config, pipeline.fusion.store
         final = FinalFrames(submap, self._stored_poses(submap), store.frame)
         depths = self._triangulated_depths(final)
@@ -215,19 +205,19 @@ class _Finishing:
             median_mm = store.median_depth_mm(submap.main_frames)
             moving, at_s = MovingTissue(block_edge_mm(median_mm)), config.fusion.surface_at_s
             seen_at = None if at_s is None else SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
-            checked = self.checked.pop(submap.main, SpreadFrames())
+            checked = self.run.checked.pop(submap.main, SpreadFrames())
             all_frames = sum(len(submap.frames) for submap in submaps)
             written = self._written(corrected, checked, moving, all_frames)
             seen = in_thread(written if seen_at is None else map(seen_at.weighted, written), "write")
             with closing(seen):
-                fused: FusedSurface = self.clock.timed(
+                fused: FusedSurface = self.run.clock.timed(
                     "fuse", pipeline.fusion.fuse, seen, submap.main_frames, submap.main
                 )
-        fused = replace(fused, mesh=self.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
+        fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
-        agreement = self.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked.frames)
+        agreement = self.run.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked.frames)
         frames = frames_of_submap(number, submaps, self.frames)
-        provenance = provenance_of(sequence, pipeline.estimators, self.clock.seconds, frames)
+        provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         notices = self.notices + motion_notices(frames, config)
         notices += [part.notice for part in (seen_at, submap.correction, depths) if part is not None] + fused.notices
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
@@ -244,18 +234,18 @@ class _Finishing:
 
     def _stored_poses(self, submap: Submap) -> dict[int, np.ndarray]:
         """Return the poses (4, 4) as tracked, by number, of the submap's frames that wait for fusion."""
-        if not self.pipeline.fusion.at_end:
+        if not self.run.pipeline.fusion.at_end:
             return {}
         poses = zip(self.frames["index"].tolist(), self.frames["T_world_camera"], strict=True)
         return {index: T_world_camera for index, T_world_camera in poses if index in submap.frames}
 
     def _triangulated_depths(self, final: FinalFrames) -> KeyframeDepths | None:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
-        config, flow = self.pipeline.config, self.pipeline.estimators.keyframe_flow
-        used = bool(self.writers) or config.fusion.enabled
+        config, flow = self.run.pipeline.config, self.run.pipeline.estimators.keyframe_flow
+        used = bool(self.run.writers) or config.fusion.enabled
         if not (used and config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
-        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.sequence.camera, flow)
+        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.run.sequence.camera, flow)
 
     def _written(
         self, frames: Iterator[Frame], checked: SpreadFrames, moving: MovingTissue, count: int
@@ -272,10 +262,10 @@ class _Finishing:
             self._write(frame)
             yield frame
             self._done += 1
-            self.progress("fusing", self._done, count)
+            self.run.progress("fusing", self._done, count)
 
     def _write(self, frame: Frame) -> None:
-        for write in self.writers:
+        for write in self.run.writers:
             write(frame)
 
 
