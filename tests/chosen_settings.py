@@ -14,10 +14,12 @@ Stage = TypeVar("Stage", bound=StageSettings)
 def chosen(stage: type[Stage] | Stage, **values: Any) -> Stage:
     """Return settings of a stage, the default ones of a class, with the settings and constants that `values` names."""
     before = stage.model_validate({}) if isinstance(stage, type) else stage
-    constants = {name: values.pop(name) for name in [field.name for field in fields(before.advanced)] if name in values}
+    constants = {
+        name: values.pop(name) for name in [field.name for field in fields(before.constants)] if name in values
+    }
     changed = type(before).model_validate(before.model_dump() | values)
-    base = before.advanced if "method" not in values else changed.advanced
-    return changed.model_copy(update={"advanced": replace(base, **constants)})
+    base = before.constants if "method" not in values else changed.constants
+    return changed.model_copy(update={"constants": replace(base, **constants)})
 
 
 def configured(settings: dict[str, Any], preset: Preset | None = None) -> Config:

@@ -6,14 +6,14 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
-from scopemap.config.mapping import FusionAdvanced
+from scopemap.config.mapping import FusionConstants
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import se3, so3_exp
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 GREY = (120, 110, 100)
-LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, advanced=FusionAdvanced(min_weight=0.2))
+LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, constants=FusionConstants(min_weight=0.2))
 AHEAD = np.array([0.0, 0.0, 1.0])
 
 

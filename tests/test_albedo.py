@@ -8,7 +8,7 @@ import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
-from scopemap.config.mapping import FusionAdvanced
+from scopemap.config.mapping import FusionConstants
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import compare_with_frame
 from scopemap.fusion.surface_fusion import TsdfVolume
@@ -35,7 +35,7 @@ def _shot(x_mm: float = 0.0, exposure: float = 1.0, albedo: np.ndarray = PINK, s
 
 def _fused(frames: list[Frame], colours: str = "albedo") -> trimesh.Trimesh:
     settings = FusionSettings(
-        voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours, advanced=FusionAdvanced(min_weight=0.01)
+        voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours, constants=FusionConstants(min_weight=0.01)
     )
     volume = TsdfVolume(settings)
     for frame in frames:

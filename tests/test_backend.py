@@ -12,7 +12,7 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingAdvanced
+from scopemap.config.mapping import MappingConstants
 from scopemap.flow.corners import detect_corners, sample_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -50,7 +50,7 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    settings = MappingSettings(advanced=MappingAdvanced(depth_sigma_share=0.05, scale_sigma=0.3))
+    settings = MappingSettings(constants=MappingConstants(depth_sigma_share=0.05, scale_sigma=0.3))
     frames = [_frame(number, factor=0.8 if number == 2 else 1.0) for number in range(6)]
     correction = plane_scene.adjusted(frames, settings)
     factors = np.array([correction.depth_factor(10 * number) for number in range(6)])
@@ -165,7 +165,7 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
 def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
     factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
     for most, refused in ((0.2, True), (0.6, False)):
-        settings = MappingSettings(advanced=MappingAdvanced(max_depth_change=most, depth_sigma_share=0.5))
+        settings = MappingSettings(constants=MappingConstants(max_depth_change=most, depth_sigma_share=0.5))
         frames = [replace(frame, depth_mm=frame.depth_mm * factors) for frame in map(_frame, range(5))]
         correction = plane_scene.adjusted(frames, settings)
         assert bool(correction.refused) == refused

@@ -11,7 +11,7 @@ from drawn_bundle import FOCAL_PX, LINE, tracked, world
 from plane_scene import CAMERA
 
 from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingAdvanced
+from scopemap.config.mapping import MappingConstants
 from scopemap.flow.corners import normalised_brightness, refined_corners
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import FlowEstimator
@@ -41,7 +41,7 @@ class _FromZero(DisFlow):
 def _errors_px(flow: FlowEstimator, gap: int, step_mm: float) -> np.ndarray:
     """Errors (n,) of the observations at a gap between keyframes that slide along the plane by steps."""
     poses = [plane_scene.pose(at_mm=(step_mm * n, 0.0, 0.0)) for n in range(gap + 1)]
-    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(gap,))), flow)
+    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(gap,))), flow)
     for number, pose in enumerate(poses):
         tracks.add(plane_scene.frame(pose, number))
     points, observations = tracks.collected()
@@ -71,7 +71,7 @@ def test_distant_keyframes_are_matched_along_those_between() -> None:
 
 
 def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_back() -> None:
-    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2, 3))), DisFlow())
+    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), DisFlow())
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
         tracks.add(plane_scene.frame(pose, number), map_number)
@@ -111,7 +111,7 @@ def test_observations_that_share_their_errors_count_as_one() -> None:
 
 
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
-    tracks = FeatureTracks(MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1, 2))), DisFlow())
+    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2))), DisFlow())
     for number in range(4):
         tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
     points, observations = tracks.collected()

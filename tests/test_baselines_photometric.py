@@ -71,9 +71,9 @@ def test_two_scales_and_grey_values_alone() -> None:
     assert [view.weight.shape for view in build_pyramid(frame, SETTINGS)] == [(48, 64), (24, 32)]
     # Of the settings that make our tracker what it is, none is left.
     ours = TrackingSettings()
-    advanced = SETTINGS.advanced
+    advanced = SETTINGS.constants
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start"):
-        assert getattr(advanced, name) != getattr(ours.advanced, name)
+        assert getattr(advanced, name) != getattr(ours.constants, name)
     assert advanced.depth_weight == advanced.min_keyframe_agreement == advanced.corner_depth_sigma == 0
     assert (advanced.min_correlation, advanced.min_inlier_share) == (-1, 0)
     assert advanced.min_sharpness == advanced.relocalisation_keyframes == advanced.new_map_after == 0

@@ -62,7 +62,7 @@ def test_a_runs_file_repeats_the_run_without_naming_its_preset(preset: str, tmp_
     config = Config.load(preset, settings={"tracking.method": "paper+gauss-newton"})  # type: ignore[arg-type]
     again = Config.load(file=_write(tmp_path, config.toml()))
     assert again == config
-    assert again.tracking.advanced.solver == "gauss-newton"
+    assert again.tracking.constants.solver == "gauss-newton"
 
 
 @settings(max_examples=25, deadline=None)
@@ -83,7 +83,7 @@ def test_any_values_go_through_a_file(
     ("stage", "method"), [(stage, name) for stage, part in STAGES.items() for name in part.METHODS]
 )
 def test_each_method_changes_constants_to_values_of_their_types(stage: str, method: str) -> None:
-    constants = getattr(Config.load(settings={f"{stage}.method": method}), stage).advanced
+    constants = getattr(Config.load(settings={f"{stage}.method": method}), stage).constants
     default = type(constants)()
     changed = {
         field.name for field in fields(default) if getattr(constants, field.name) != getattr(default, field.name)
@@ -94,10 +94,10 @@ def test_each_method_changes_constants_to_values_of_their_types(stage: str, meth
 
 
 def test_of_joined_methods_the_later_one_wins() -> None:
-    paper = Config.load("paper").mapis.advanced
-    both = Config.load("paper", settings={"mapis.method": "paper+no-blend"}).mapis.advanced
+    paper = Config.load("paper").mapis.constants
+    both = Config.load("paper", settings={"mapis.method": "paper+no-blend"}).mapis.constants
     assert (paper.blend, both.blend, both.order) == ("linear", "none", "refine-first")
-    assert Config.load(settings={"mapis.method": "no-blend+paper"}).mapis.advanced == paper
+    assert Config.load(settings={"mapis.method": "no-blend+paper"}).mapis.constants == paper
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_of_joined_methods_the_later_one_wins() -> None:
             1,
             "unknown setting 'tracking.keyframes_every': did you mean 'tracking.keyframe_ev",
         ),
-        ("tracking.advanced", {}, "unknown setting 'tracking.advanced': did you mean 'tracking"),
+        ("tracking.constants", {}, "unknown setting 'tracking.constants': did you mean 'tracking"),
         ("fusion.voxel", 1, "did you mean 'fusion.voxel_mm'"),
         ("qqqq", 1, "unknown setting 'qqqq': choose from preset, run"),
         ("tracking.method", "papper", "'tracking.method': unknown method 'papper': did you mean 'paper'"),
@@ -175,7 +175,7 @@ def test_the_page_of_settings_is_the_generated_one() -> None:
 
 def test_each_setting_and_each_constant_is_read() -> None:
     named = {tuple(name.split(".")) for name in setting_names() if "." in name}
-    named |= {(stage, field.name) for stage, part in STAGES.items() for field in fields(part.advanced)}
+    named |= {(stage, field.name) for stage, part in STAGES.items() for field in fields(part.constants)}
     # What a method is, is read where its constants are chosen.
     named -= {(stage, "method") for stage in STAGES if stage not in ("smoothing", "mapping")}
     assert {group for group, _ in named} == set(READERS)

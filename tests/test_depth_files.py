@@ -17,7 +17,7 @@ from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.create import create_anchor, create_depth
+from scopemap.depth.backends import create_anchor, create_depth
 from scopemap.depth.files import FilesDepth
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame

@@ -13,7 +13,7 @@ from small_networks import saved, small_depth_anything, small_depth_pro
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
-from scopemap.depth.create import create_anchor, create_depth
+from scopemap.depth.backends import create_anchor, create_depth
 from scopemap.depth.depth_anything import DepthAnything
 from scopemap.depth.depth_pro import DepthPro
 from scopemap.errors import WeightsError

@@ -15,7 +15,7 @@ from torch import nn
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
-from scopemap.depth.create import create_depth
+from scopemap.depth.backends import create_depth
 from scopemap.depth.scopenet import estimator as module
 from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
 from scopemap.depth.scopenet.planes import input_planes

@@ -11,7 +11,7 @@ from chosen_settings import chosen
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings, FusionSettings, MapisSettings
-from scopemap.config.mapping import FusionAdvanced
+from scopemap.config.mapping import FusionConstants
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
 from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
@@ -154,7 +154,7 @@ def _wall(sigma_mm: np.ndarray | None = None, depth_mm: np.ndarray | None = None
 
 def _field(*frames: Frame, **changes: Any) -> Any:
     volume = TsdfVolume(
-        FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, advanced=FusionAdvanced(min_weight=0.2, **changes))
+        FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, constants=FusionConstants(min_weight=0.2, **changes))
     )
     for frame in frames:
         volume.integrate(frame)

@@ -13,9 +13,9 @@ import torch
 from torchvision.models.optical_flow import raft_large, raft_small
 
 from scopemap.errors import SettingsError, WeightsError
-from scopemap.flow.create import create_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.flow.estimator import agree, pair_flow
+from scopemap.flow.flows import create_flow
 from scopemap.flow.raft import RaftFlow, torchvision_names
 from scopemap.geometry.warp import pull
 

@@ -13,7 +13,7 @@ from tiny_phantom import with_true_depth, write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, FusionSettings
-from scopemap.config.mapping import FusionAdvanced
+from scopemap.config.mapping import FusionConstants
 from scopemap.errors import InputError
 from scopemap.frame import Frame, Rows
 from scopemap.fusion.frame_store import FrameStore
@@ -118,15 +118,15 @@ def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
 def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     corrected: bool, voxel_mm: float | None, at_end: bool
 ) -> None:
-    advanced = FusionAdvanced(min_weight=0.0)
-    settings = FusionSettings(voxel_mm=voxel_mm, every=2, advanced=advanced)
+    advanced = FusionConstants(min_weight=0.0)
+    settings = FusionSettings(voxel_mm=voxel_mm, every=2, constants=advanced)
     fusion = SurfaceFusion(settings, FrameStore(), corrected=corrected)
     frames = [wall(60.0, n) for n in range(3)]
     for frame in frames:
         fusion.put(frame)
     assert (fusion.at_end, fusion.at_once) == (at_end, not at_end)
     surface = fusion.fuse(fusion.store.frames(), {0, 1, 2})
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, advanced=advanced))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, constants=advanced))
     for frame in frames[::2]:
         volume.integrate(frame)
     assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)

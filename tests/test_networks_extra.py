@@ -13,10 +13,10 @@ from chosen_settings import chosen
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
-from scopemap.depth.create import create_depth
+from scopemap.depth.backends import create_depth
 from scopemap.depth.perceptual import create_perceptual
 from scopemap.errors import SettingsError
-from scopemap.flow.create import create_flow
+from scopemap.flow.flows import create_flow
 from scopemap.io import weights
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

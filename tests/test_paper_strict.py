@@ -18,7 +18,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import PRESETS
 from scopemap.depth.estimate import PerceptualResult
 from scopemap.depth.mapis import DenseMatcher, Mapis
-from scopemap.flow.create import create_flow
+from scopemap.flow.flows import create_flow
 from scopemap.frame import Frame
 from scopemap.odometry import Step
 from scopemap.tracking.tracker import Tracker

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from chosen_settings import configured
 from scipy.spatial import KDTree
 from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
@@ -19,7 +18,7 @@ from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth,
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
 from scopemap.config import PRESETS
 from scopemap.depth.anchor import depth_downscale
-from scopemap.errors import InputError, SettingsError, WeightsError
+from scopemap.errors import InputError, WeightsError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.odometry import Step
@@ -84,27 +83,24 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spies, steps = spied(monkeypatch), list[Step]()
-    config = configured({"depth.backend": "shading", "depth.downscale": 2})
-    reconstruct(open_sequence(folder), config, observers=(steps.append,))
+    monkeypatch.setattr("scopemap.depth.anchor._SCOPENET_PX", SIZE[0] // 2)
+    reconstruct(open_sequence(folder), Config(), observers=(steps.append,))
     assert {frame.valid.shape for frame in spies.pop().seen} == {(SIZE[1] // 2, SIZE[0] // 2)}
     depths = [(step.raw_mm, step.frame.depth_mm, step.frame.depth_sigma_mm) for step in steps]
     assert {mm.shape for depth in depths for mm in depth if mm is not None} == {SIZE[::-1]}
     # Files are read at their own size.
-    reconstruct(open_sequence(folder), with_true_depth(folder, depth__downscale=2))
+    reconstruct(open_sequence(folder), with_true_depth(folder))
     assert {frame.valid.shape for frame in spies.pop().seen} == {SIZE[::-1]}
 
 
 @pytest.mark.parametrize(
     ("settings", "longest_px", "expected"),
-    [({}, 319, 1), ({}, 337, 2), ({}, 1280, 8), ({"depth.downscale": 3}, 1280, 3),
-     ({"depth.backend": "shading"}, 1280, 1)],
-)  # fmt: skip
+    [({}, 319, 1), ({}, 337, 2), ({}, 1280, 8), ({"backend": "shading"}, 1280, 1)],
+)
 def test_scopenet_sees_images_of_about_its_training_size(
     settings: dict[str, Any], longest_px: int, expected: int
 ) -> None:
-    assert depth_downscale(configured(settings).depth, longest_px) == expected
-    with pytest.raises(SettingsError, match=r"depth\.downscale=6: .* at most 5 here"):
-        depth_downscale(configured({"depth.downscale": 6}).depth, 191)
+    assert depth_downscale(DepthSettings(**settings), longest_px) == expected
 
 
 def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingAdvanced
+from scopemap.config.mapping import MappingConstants
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.mapping import TrackedPose
 from scopemap.mapping.pose_graph import path_without_drift
@@ -57,7 +57,7 @@ def test_the_adjustment_does_not_bring_the_drift_back() -> None:
             T, factor = T_true.copy(), float(np.exp(log_scale[n]))
             T[:3, 3] = true[0][:3, 3] + steps[:n].sum(0)
             frames.append(replace(plane_scene.frame(T_true, n, T, factor), depth_scale=factor if known else 1.0))
-        correction = plane_scene.adjusted(frames, MappingSettings(advanced=MappingAdvanced(keyframe_gaps=(1,))))
+        correction = plane_scene.adjusted(frames, MappingSettings(constants=MappingConstants(keyframe_gaps=(1,))))
         assert not correction.refused
         factor = np.log([correction.depth_factor(n) for n in range(40)]) + log_scale
         spread.append(np.ptp(factor))

@@ -10,7 +10,7 @@ from chosen_settings import chosen
 from drawn_inputs import number_in, poses, write_sevenscenes
 
 from scopemap.config import DepthSettings
-from scopemap.depth.create import create_depth
+from scopemap.depth.backends import create_depth
 from scopemap.io.opening import open_sequence
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from scopemap.config import Config
 from scopemap.depth.anchor import max_depth_mm
-from scopemap.depth.create import create_anchor, create_depth, files_folder
+from scopemap.depth.backends import create_anchor, create_depth, files_folder
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.depth.perceptual import create_perceptual
-from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.flows import create_flow
 from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
 from scopemap.io import weights
 from scopemap.io.sequence import Sequence
@@ -90,7 +90,7 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
     """
     if isinstance(estimators.depth, FilesDepth) and estimators.depth.measured_max_mm:
         return estimators.depth.measured_max_mm
-    mapping, log_factor = config.mapping.advanced, 0.0
+    mapping, log_factor = config.mapping.constants, 0.0
     if config.mapping.method != "none":
         log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
     return math.exp(log_factor) * max_depth_mm(config.depth)

@@ -79,7 +79,7 @@ class Odometry:
         return step
 
     def _track(self, preprocessed: PreprocessedFrame) -> Step:
-        refined = self._refine(preprocessed, None) if self._config.mapis.paper.order == "refine-first" else None
+        refined = self._refine(preprocessed, None) if self._config.mapis.constants.order == "refine-first" else None
         track, last = self._tracker.track(preprocessed.frame), self._last_track
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()

@@ -81,7 +81,7 @@ class Preprocessing:
         frame = self._masker(frame)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
         # A frame that the tracker refuses must not fix the scale of depth.
-        usable = frame.valid.mean() >= self._config.tracking.min_valid_share
+        usable = frame.valid.mean() >= self._config.tracking.constants.min_valid_share
         small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
         shown = small if usable else replace(small, valid=np.zeros_like(small.valid))
         estimate = self.estimators.depth.estimate(shown)
@@ -94,7 +94,7 @@ class Preprocessing:
             sigma = None if estimate.sigma is None else estimate.sigma * unknown
             estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
             frame, small, shown = (without_instruments(seen, instruments) for seen in (frame, small, shown))
-            if usable and frame.valid.mean() < self._config.tracking.min_valid_share:
+            if usable and frame.valid.mean() < self._config.tracking.constants.min_valid_share:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
                 fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
         raw = self.estimators.anchor.metric(estimate, shown)

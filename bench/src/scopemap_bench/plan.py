@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from scopemap.config import Config, Preset, explain
 from scopemap.errors import InputError, ScopemapError, SettingsError
-from scopemap.flow.create import FLOWS
+from scopemap.flow.flows import FLOWS
 from scopemap.geometry.align import AlignMode
 from scopemap.io.opening import readers
 from scopemap_bench.evaluation.depth import DepthScaling

@@ -13,8 +13,8 @@ from scopemap.actions.inputs import is_camera_of, open_truth
 from scopemap.config import MaskSettings
 from scopemap.errors import AlignmentError, InputError
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
-from scopemap.flow.create import create_flow
 from scopemap.flow.estimator import FlowEstimator, pair_flow
+from scopemap.flow.flows import create_flow
 from scopemap.geometry.align import AlignMode, Similarity
 from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence

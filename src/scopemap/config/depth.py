@@ -11,12 +11,9 @@ from scopemap.config.settings import Settings, StageSettings, constants_of
 
 
 @dataclass(frozen=True)
-class DepthAdvanced:
+class DepthConstants:
     """Constants of the metric anchor and of shading depth."""
 
-    # Depth is estimated and made consistent at the working size over this, but for depth from files; None: scopenet at
-    # about its training size, the longest side 160 to 319 px, others at the full one.
-    downscale: int | None = None
     reanchor_every: int = 0  # fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once
     shading_exponent: float = 0.6  # distance = k * brightness^-exponent
     fit_shift: bool = True  # fit scale and shift to the anchor; False: the pseudo-stereo baseline
@@ -69,11 +66,11 @@ class DepthSettings(StageSettings):
     max_depth_mm: float = Field(
         300.0, gt=0, description="predicted depth beyond this is unknown, unless near-far names a farther one, mm"
     )
-    advanced: DepthAdvanced = constants_of(DepthAdvanced(), DEPTH)
+    constants: DepthConstants = constants_of(DepthConstants(), DEPTH)
 
 
 @dataclass(frozen=True)
-class MapisAdvanced:
+class MapisConstants:
     """Constants of depth consistency."""
 
     # Scale of each frame's depth: robust: median ratio to the warped previous depth; none: 1; auto: robust for
@@ -118,7 +115,7 @@ class MapisSettings(StageSettings):
 
     METHODS = MAPIS
     method: str = Field("scopemap", description="constants of depth consistency")
-    advanced: MapisAdvanced = constants_of(MapisAdvanced(), MAPIS)
+    constants: MapisConstants = constants_of(MapisConstants(), MAPIS)
 
 
 class NetworkSettings(Settings):

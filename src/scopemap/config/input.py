@@ -51,7 +51,7 @@ class InputSettings(Settings):
 
 
 @dataclass(frozen=True)
-class MaskAdvanced:
+class MaskConstants:
     """Constants of masking."""
 
     field_of_view: bool = True  # find the circular or octagonal field of view and black borders
@@ -87,4 +87,4 @@ class MaskSettings(StageSettings):
         "without one the depth network, where it can (scopenet), which misses some and takes pale tissue for others; "
         "off: nobody, masks from files are not read either",
     )
-    advanced: MaskAdvanced = constants_of(MaskAdvanced(), MASK)
+    constants: MaskConstants = constants_of(MaskConstants(), MASK)

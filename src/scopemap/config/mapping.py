@@ -11,7 +11,7 @@ from scopemap.config.settings import StageSettings, constants_of
 
 
 @dataclass(frozen=True)
-class MappingAdvanced:
+class MappingConstants:
     """Constants of bundle adjustment, loop closure and triangulation."""
 
     min_loop_inliers: int = 25  # of PnP, that a loop closure needs; 0: no loop closure, no map merging
@@ -52,11 +52,11 @@ class MappingSettings(StageSettings):
         description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
         "predicted (measured depth tracks as well or better without)",
     )
-    advanced: MappingAdvanced = constants_of(MappingAdvanced(), MAPPING)
+    constants: MappingConstants = constants_of(MappingConstants(), MAPPING)
 
 
 @dataclass(frozen=True)
-class FusionAdvanced:
+class FusionConstants:
     """Constants of fusion."""
 
     # Weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; False: 1.
@@ -108,4 +108,4 @@ class FusionSettings(StageSettings):
     )
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
     mesh_faces: int | None = Field(None, ge=4, description="simplify the mesh to about so many faces; default: not")
-    advanced: FusionAdvanced = constants_of(FusionAdvanced(), FUSION)
+    constants: FusionConstants = constants_of(FusionConstants(), FUSION)

@@ -17,7 +17,7 @@ class Settings(BaseModel):
 
 
 class StageSettings(Settings):
-    """Settings of a stage whose constants `advanced` follow from `method`.
+    """Settings of a stage whose `constants` follow from `method`.
 
     A method is one entry of METHODS, or several joined by "+", of which later ones win: "paper+gauss-newton".
     """
@@ -33,12 +33,6 @@ class StageSettings(Settings):
             if name not in cls.METHODS:
                 raise ValueError(f"unknown method '{name}': {hint(name, cls.METHODS)}")
         return method
-
-    def __getattr__(self, name: str) -> Any:
-        """Return the constant `name`."""
-        if name.startswith("_") or name == "advanced":
-            raise AttributeError(name)
-        return self.advanced if name == "paper" else getattr(self.advanced, name)
 
 
 def constants_of(default: Any, methods: Mapping[str, Mapping[str, Any]]) -> Any:

@@ -11,7 +11,7 @@ from scopemap.config.settings import StageSettings, constants_of
 
 
 @dataclass(frozen=True)
-class TrackingAdvanced:
+class TrackingConstants:
     """Constants of tracking."""
 
     min_valid_share: float = 0.1  # a frame with a smaller usable overlap is lost
@@ -71,11 +71,11 @@ class TrackingSettings(StageSettings):
         False, description="the camera does not move: poses stay the first one, every frame has a surface (surfaces/)"
     )
     keyframe_every: int = Field(10, ge=1, description="every n-th frame becomes a keyframe (the paper: 2)")
-    advanced: TrackingAdvanced = constants_of(TrackingAdvanced(), TRACKING)
+    constants: TrackingConstants = constants_of(TrackingConstants(), TRACKING)
 
 
 @dataclass(frozen=True)
-class SmoothingAdvanced:
+class SmoothingConstants:
     """Constants of WEMA."""
 
     alpha: float = 0.6  # weights of the poses i, i-1 and i-2; their sum is 1
@@ -93,4 +93,4 @@ class SmoothingSettings(StageSettings):
 
     METHODS = SMOOTHING
     method: str = Field("none", description="wema: smooth poses; wema-constant: with weights that do not change")
-    advanced: SmoothingAdvanced = constants_of(SmoothingAdvanced(), SMOOTHING)
+    constants: SmoothingConstants = constants_of(SmoothingConstants(), SMOOTHING)

@@ -25,7 +25,6 @@ _FACTOR_MM = 1000.0
 # Longest side of most images that scopenet was trained on: at twice the size it needs four times as long, and surfaces
 # are less consistent.
 _SCOPENET_PX = 160
-_LEAST_PX = 32  # of the longest side, as of an input's; flow needs 12
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class AnchoredDepth:
     prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if given, else the estimate's own
     millimetres, else shading. Measured depth is not changed.
 
-    `settings.advanced.reanchor_every` repeats the fit to the reference, which bounds drift.
+    `settings.constants.reanchor_every` repeats the fit to the reference, which bounds drift.
 
     Raises `SettingsError` where `near-far` is chosen without a valid range.
 
@@ -121,7 +120,7 @@ class AnchoredDepth:
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self.conversion is None:
             return True
-        every = self._settings.advanced.reanchor_every
+        every = self._settings.constants.reanchor_every
         return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> tuple[np.ndarray | None, str]:
@@ -151,7 +150,7 @@ class AnchoredDepth:
             focal_px = reference.focal_px or frame.camera.fx
             self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
-            first_mm = None if self._settings.paper.fit_shift else reference.values
+            first_mm = None if self._settings.constants.fit_shift else reference.values
         self._frames_held = 0
         self.description = self._describe(source, estimate, frame) + details
         network = (
@@ -173,7 +172,7 @@ class AnchoredDepth:
 
     def _from_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
         """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
-        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.paper.factor
+        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.constants.factor
         positive = values[values > 0]
         if not positive.size:
             raise InputError("anchoring depth by a factor: no pixel of the first usable frame has a positive value")
@@ -195,9 +194,9 @@ class AnchoredDepth:
         """Return the conversion of estimated values (N,) to their metric depth (N,), mm."""
         if kind == "depth":
             return DepthScale(float(np.exp(np.median(np.log(depth_mm / values)))))
-        if self._settings.paper.fit_shift:
+        if self._settings.constants.fit_shift:
             return fit_affine_disparity(depth_mm, values, max_depth_mm(self._settings))
-        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.paper.disparity_floor)
+        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.constants.disparity_floor)
         return AffineDisparity.from_baseline(baseline_mm, focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
@@ -206,7 +205,7 @@ class AnchoredDepth:
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
-            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.paper.factor:g}"
+            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.constants.factor:g}"
         name = self._settings.backend if source == "estimate" else self.reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
@@ -217,7 +216,7 @@ class AnchoredDepth:
         if reference.focal_px is None:
             return ""
         found_px, known_px = reference.focal_px, frame.camera.fx
-        if self._settings.paper.depth_pro_focal == "network" or np.isclose(known_px, found_px, rtol=1e-3):
+        if self._settings.constants.depth_pro_focal == "network" or np.isclose(known_px, found_px, rtol=1e-3):
             return f", by the focal length that it finds, {found_px:.0f} px"
         ratio = known_px / found_px
         return f", times {ratio:.3f}: the camera's focal length is {known_px:.0f} px, it finds {found_px:.0f} px"
@@ -229,20 +228,10 @@ def max_depth_mm(settings: DepthSettings) -> float:
 
 
 def depth_downscale(settings: DepthSettings, longest_px: int) -> int:
-    """Return what the working size is divided by for the estimation of depth.
+    """Return what the working size is divided by for the estimation of depth: for scopenet, by its training size.
 
-    longest_px : longest side of the working images. Raises `SettingsError` where too little would be left of it.
+    longest_px : longest side of the working images.
     """
-    if settings.backend.startswith("files:"):
-        return 1  # nothing is estimated
-    if settings.downscale is not None:
-        most = max(longest_px // _LEAST_PX, 1)
-        if settings.downscale > most:
-            raise SettingsError(
-                f"depth.downscale={settings.downscale}: of images of {longest_px} px less than {_LEAST_PX} px would be "
-                f"left; at most {most} here"
-            )
-        return settings.downscale
     return max(longest_px // _SCOPENET_PX, 1) if settings.backend == "scopenet" else 1
 
 

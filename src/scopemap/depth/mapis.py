@@ -58,12 +58,14 @@ class DenseMatcher:
         if previous is None or not wanted:
             return None
         rgb_previous, valid_previous = previous
-        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.advanced.consistency_px)
+        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.constants.consistency_px)
         # Masked pixels of either image show no tissue.
         seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
-        compared = pull(rgb_previous, flow.to_previous) if self._settings.paper.compare_warped else rgb_previous
+        compared = pull(rgb_previous, flow.to_previous) if self._settings.constants.compare_warped else rgb_previous
         distance = self._perceptual.compare(compared, rgb)
-        values = np.full_like(distance.map, distance.score) if self._settings.paper.perceptual_score else distance.map
+        values = (
+            np.full_like(distance.map, distance.score) if self._settings.constants.perceptual_score else distance.map
+        )
         consistent = flow.consistent & seen & valid
         return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
 
@@ -134,7 +136,7 @@ class Mapis:
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_sigma = blended_sigma(weight, warped_sigma, sigma)
         self._propagated = (
-            _Propagated(depth_mm, refined_sigma) if self.settings.paper.recursive else _Propagated(scaled_mm, sigma)
+            _Propagated(depth_mm, refined_sigma) if self.settings.constants.recursive else _Propagated(scaled_mm, sigma)
         )
         return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
 
@@ -151,7 +153,7 @@ class Mapis:
         self._propagated, self._scale = None, scale
 
     def _scales(self, kind: DepthKind) -> bool:
-        frame_scale = self.settings.advanced.frame_scale
+        frame_scale = self.settings.constants.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
     def _pulled_back(self, scale: float, matched_share: float) -> float:
@@ -159,11 +161,11 @@ class Mapis:
 
         Errors of chained scales accumulate, and fast motion biases them: depth would grow or shrink without limit.
         """
-        return float(scale ** (1 - self.settings.advanced.scale_pull * max(1 - matched_share, 0.0) ** 2))
+        return float(scale ** (1 - self.settings.constants.scale_pull * max(1 - matched_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
-        if self.settings.paper.blend != "auto":
-            return self.settings.paper.blend
+        if self.settings.constants.blend != "auto":
+            return self.settings.constants.blend
         return "none" if kind == "measured" else "linear"
 
     def _warped(
@@ -182,21 +184,21 @@ class Mapis:
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
         filtered_mm = bilateral_filtered(
-            warped_mm, self.settings.advanced.filter_sigma_px, self.settings.advanced.filter_sigma_mm
+            warped_mm, self.settings.constants.filter_sigma_px, self.settings.constants.filter_sigma_mm
         )
         warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
-        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.advanced.sigma_fading))
+        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.constants.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
         match blend:
             case "exponential":
-                return np.exp(-distance / np.float32(self.settings.paper.tau))
+                return np.exp(-distance / np.float32(self.settings.constants.tau))
             case "linear":
                 return 1 - np.clip(distance, 0, 1)
             case "paper-equation":
                 return np.clip(distance, 0, 1)
-        return np.full_like(distance, self.settings.paper.constant_weight)
+        return np.full_like(distance, self.settings.constants.constant_weight)
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:

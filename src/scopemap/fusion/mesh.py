@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numba import njit
 
-from scopemap.config.mapping import FusionAdvanced
+from scopemap.config.mapping import FusionConstants
 from scopemap.fusion.albedo import displayed
 from scopemap.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
 
@@ -50,7 +50,7 @@ class _Chunk(NamedTuple):
 
 
 def extract_mesh(
-    blocks: VoxelBlocks, settings: FusionAdvanced, voxel_mm: float, median_level: float | None = None
+    blocks: VoxelBlocks, settings: FusionConstants, voxel_mm: float, median_level: float | None = None
 ) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 

@@ -109,7 +109,7 @@ class TsdfVolume:
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
         depth_mm, T_world_camera = self._checked(frame)
-        camera, advanced, parameters = frame.camera, self.settings.advanced, self.parameters
+        camera, advanced, parameters = frame.camera, self.settings.constants, self.parameters
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         pinhole = TsdfCamera(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
@@ -148,7 +148,7 @@ class TsdfVolume:
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
         median_level = None if self._painter is None else self._painter.median_level
-        return extract_mesh(self._blocks, self.settings.advanced, self.parameters.voxel_mm, median_level)
+        return extract_mesh(self._blocks, self.settings.constants, self.parameters.voxel_mm, median_level)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         for name in ("depth_mm", "T_world_camera"):

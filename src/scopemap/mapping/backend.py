@@ -13,7 +13,7 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingAdvanced
+from scopemap.config.mapping import MappingConstants
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
@@ -93,14 +93,14 @@ class Backend:
         table: RowTable = rows_in_memory,
         features: FeatureDetector | None = None,
     ) -> None:
-        self.settings = settings.advanced
+        self.settings = settings.constants
         self._frames: list[int] = []
         self._tracked: list[TrackedPose] = []
         self._log_scales: list[float] = []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
         self._tracks = FeatureTracks(settings, flow, table)
-        self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
+        self._finder = LoopFinder(settings, table, features) if settings.constants.min_loop_inliers > 0 else None
         self._loops = table("loops", LOOP)
         self._all_weighed = False
         self._camera: PinholeCamera | None = None
@@ -357,7 +357,7 @@ def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
     return min(least, default=0)
 
 
-def contradiction(points: Points, found: BundleSolution, settings: MappingAdvanced) -> str:
+def contradiction(points: Points, found: BundleSolution, settings: MappingConstants) -> str:
     """Return why a rigid scene does not explain the observations, "" where it does."""
     if not found.sigma_px <= settings.max_sigma_px:
         return f"reprojection errors stay at {found.sigma_px:.2f} px (robust standard deviation)"

@@ -62,7 +62,7 @@ class FeatureTracks:
     """
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
-        self.settings, self._flow = settings.advanced, flow
+        self.settings, self._flow = settings.constants, flow
         self._recent: dict[int, deque[_FlowKeyframe]] = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
         self._keyframe_count = 0

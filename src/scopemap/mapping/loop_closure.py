@@ -81,7 +81,7 @@ class LoopFinder:
     """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
-    at least `settings.min_loop_inliers` inliers. table : where features are kept that only PnP needs.
+    at least `settings.constants.min_loop_inliers` inliers. table : where features are kept that only PnP needs.
     detector : of features; None: SIFT.
     """
 
@@ -93,7 +93,7 @@ class LoopFinder:
     ) -> None:
         self._detector = detector or SiftFeatures()
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
-        self._min_inliers, self._max_gap = settings.min_loop_inliers, max(settings.advanced.keyframe_gaps)
+        self._min_inliers, self._max_gap = settings.constants.min_loop_inliers, max(settings.constants.keyframe_gaps)
         self._features: dict[int, _KeptFeatures] = {}
         self._rows = table("features", self._kind)
         self._map_of: dict[int, int] = {}

@@ -243,7 +243,7 @@ class _Finishing:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
         config, flow = self.run.pipeline.config, self.run.pipeline.estimators.keyframe_flow
         used = bool(self.run.writers) or config.fusion.enabled
-        if not (used and config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
+        if not (used and config.mapping.constants.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.run.sequence.camera, flow)
 

@@ -95,7 +95,7 @@ class KeyframeAligner:
 
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator | None, motion: MotionModel) -> None:
         self._settings, self.flow, self._motion = settings, flow, motion
-        with_corners = flow is not None and flow.name != "none" and settings.advanced.corner_depth_sigma > 0
+        with_corners = flow is not None and flow.name != "none" and settings.constants.corner_depth_sigma > 0
         self._matcher = KeyframeMatcher(flow) if flow is not None and with_corners else None
 
     def has_corners(self, keyframe: Keyframe) -> bool:
@@ -115,7 +115,7 @@ class KeyframeAligner:
         if by_corners is not None and self.rejection(keyframe, by_corners) is None:
             return by_corners, None
         pyramid, starts = self.pyramid(keyframe, frame), self._motion.predictions()
-        if self._settings.paper.start == "identity" and len(starts) == 1:
+        if self._settings.constants.start == "identity" and len(starts) == 1:
             starts = [keyframe.T_world_camera]
         found = [align(keyframe.pyramid, pyramid, inverse(T) @ keyframe.T_world_camera, self._settings) for T in starts]
         best = max(found, key=lambda alignment: alignment.agreement)
@@ -139,7 +139,7 @@ class KeyframeAligner:
         correspondences = None if self._matcher is None else self._matcher.match(frame)
         if correspondences is None:
             return None
-        depth_sigma = self._settings.advanced.corner_depth_sigma
+        depth_sigma = self._settings.constants.corner_depth_sigma
         T = pose_from_correspondences(correspondences, frame.camera, T_start, depth_sigma)
         if T is None:
             return None
@@ -159,10 +159,10 @@ class KeyframeAligner:
 
     def rejection(self, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
         """Return why an alignment is rejected, or None."""
-        T_world_camera, advanced = keyframe.pose_by(alignment), self._settings.advanced
+        T_world_camera, advanced = keyframe.pose_by(alignment), self._settings.constants
         if not np.isfinite(T_world_camera).all():
             return TrackingLoss(LossCause.VIEW_CHANGED, "the alignment diverged")
-        if alignment.overlap < self._settings.min_valid_share:
+        if alignment.overlap < self._settings.constants.min_valid_share:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"overlap {alignment.overlap:.0%} with the keyframe")
         if alignment.inlier_share < advanced.min_inlier_share and not alignment.is_supported:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"inlier share {alignment.inlier_share:.0%} with the keyframe")

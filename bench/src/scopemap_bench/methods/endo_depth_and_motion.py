@@ -16,13 +16,13 @@ only where the image or its overlap with the keyframe is nearly empty, or the re
 
 from __future__ import annotations
 
-from scopemap.config.tracking import TrackingAdvanced, TrackingSettings
+from scopemap.config.tracking import TrackingConstants, TrackingSettings
 from scopemap.tracking.track import FrameTracker
 from scopemap.tracking.tracker import Tracker
 
 SETTINGS = TrackingSettings(
     keyframe_every=2,
-    advanced=TrackingAdvanced(
+    constants=TrackingConstants(
         min_sharpness=0.0,
         relocalisation_keyframes=0,
         search_every=1,
