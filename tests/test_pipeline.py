@@ -16,7 +16,7 @@ from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
-from scopemap.config import PRESETS
+from scopemap.config import PRESETS, DepthSettings
 from scopemap.depth.anchor import depth_downscale
 from scopemap.errors import InputError, WeightsError
 from scopemap.estimators import create_estimators
