@@ -20,8 +20,15 @@ from scopemap.frame import Frame
 from scopemap.fusion.agreement import compare_with_frame
 from scopemap.geometry.rendering import Rendering
 from scopemap.io.run_folder import RunFolder
-from scopemap.report.canvas import ESTIMATE_COLOUR
-from scopemap.report.mesh_figures import MeshView, cropped, draw_path, mesh_picture, outside_views
+from scopemap.report.mesh_figures import (
+    ESTIMATE_COLOUR,
+    MeshView,
+    cropped,
+    draw_path,
+    mesh_picture,
+    on_white,
+    outside_views,
+)
 from scopemap.report.sheet import picture_grid
 
 MOST_BYTES = 200_000
@@ -34,7 +41,7 @@ def draw_surface(run: RunFolder, frame: Frame, pose: np.ndarray, rendering: Rend
     """
     mesh, camera, positions_mm = run.mesh, frame.camera, run.frames["T_world_camera"][run.frames.tracked, :3, 3]
     view, outside = MeshView(pose, camera), outside_views(mesh, pose, positions_mm)["from outside"]
-    rendered = np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(255), rendering.rgb)
+    rendered = on_white(rendering)
     pictures = {"frame": frame.rgb, "surface": rendered}
     if "confidence" in mesh.vertex_attributes:
         levels = np.round(255 * np.clip(mesh.vertex_attributes["confidence"].reshape(-1, 1), 0, 1)).astype(np.uint8)

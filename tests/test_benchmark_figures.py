@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 
-from scopemap.report.canvas import ESTIMATE_COLOUR
+from scopemap.report.mesh_figures import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap_bench.pictures import (
     BAR_COLOUR,
     draw_ate,
     draw_frames_until_loss,
 )
+from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction
 
 NAN = float("nan")
 
@@ -59,3 +61,32 @@ def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
     assert lost[0] / kept[0] == pytest.approx(0.5, abs=0.02)
     with pytest.raises(ValueError, match="lengths"):
         draw_frames_until_loss(frames, [90, 80], tmp_path / "bad.png")
+
+
+def test_depth_changes_share_one_scale(tmp_path: Path) -> None:
+    image = np.full((40, 60, 3), (250, 0, 250), np.uint8)
+    flat = np.full((40, 60), 30.0)
+    jumpy, unknown = (flat, flat + np.linspace(0, 10, 60)), (flat, np.full_like(flat, NAN))
+    depths = {"MAPIS": (flat, flat), "plain": jumpy, "lost": unknown}
+    draw_depth_change({"frame 1": image, "frame 2": image}, depths, tmp_path / "depth.png")
+    picture = read(tmp_path / "depth.png")
+    frame_px = is_colour(picture, "#fa00fa").sum() / 2
+    turbo = cv2.applyColorMap(np.array([[0, 255]], np.uint8), cv2.COLORMAP_TURBO)[0, :, ::-1]
+    none, most = ("#" + bytes(colour.tolist()).hex() for colour in turbo)
+    # Six depths and a difference of 0 are the near end; the largest differences the far one; black is unknown.
+    assert is_colour(picture, none).sum() > 5 * frame_px
+    assert is_colour(picture, most).sum() > 50
+    assert is_colour(picture, "#000000").sum() > 1.9 * frame_px
+
+
+def test_a_reconstruction_shows_estimate_green_and_truth_red(tmp_path: Path) -> None:
+    truth = np.linspace(0, 1, 30)[:, None] * [20.0, 5.0, 40.0]
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0).apply_translation([0.0, 0.0, 60.0])
+    for name, true_mm in (("same", truth), ("alone", None)):
+        draw_reconstruction(ball, truth, true_mm, tmp_path / f"{name}.png", np.eye(4))
+    same, alone = read(tmp_path / "same.png"), read(tmp_path / "alone.png")
+    # The truth is the broader line below: it shows beside an estimate that lies on it.
+    assert is_colour(same, ESTIMATE_COLOUR).sum() > 500
+    assert is_colour(same, TRUTH_COLOUR).sum() > 500
+    assert is_colour(alone, ESTIMATE_COLOUR).sum() > 500
+    assert is_colour(alone, TRUTH_COLOUR).sum() == 0

@@ -26,8 +26,6 @@ from scopemap.io.depth_maps import DepthReader
 from scopemap.io.reference import reference_trajectory
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.masking.masker import Masker
-from scopemap.report.depth_figures import DepthScene, draw_depth_change
-from scopemap.report.mesh_figures import draw_reconstruction, draw_registered_clouds
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.evaluation.correspondences import FrameMatcher, lifted_matches
 from scopemap_bench.pictures import (
@@ -39,6 +37,7 @@ from scopemap_bench.pictures import (
 )
 from scopemap_bench.plan import folder_name
 from scopemap_bench.result import RunResult
+from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction, draw_registered_clouds
 from scopemap_bench.summary import joined, summarise
 from scopemap_bench.table import pd
 from scopemap_bench.tables import write_tables
@@ -159,8 +158,8 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
         return
     name = folder_name(sequence)
     images = (previous.rgb, current.rgb)
-    scene = DepthScene(f"{sequence}, frames {previous.index}, {current.index}", images, depths)
-    draw_depth_change(scene, folder / f"depth_change_{name}.png")
+    frames_shown = {f"frame {frame.index}": frame.rgb for frame in (previous, current)}
+    draw_depth_change(frames_shown, depths, folder / f"depth_change_{name}.png")
     yield folder / f"depth_change_{name}.png"
     posed = {method: poses for method, poses in own_poses.items() if poses is not None}
     if posed:

@@ -6,20 +6,22 @@ per method, NaN where there is no figure. All functions write a PNG.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from scopemap.errors import check_shape
-from scopemap.report.canvas import ESTIMATE_COLOUR, headline, new_figure
+from scopemap.report.mesh_figures import ESTIMATE_COLOUR
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.container import BarContainer
-    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
 BAR_COLOUR = "#4575b4"
@@ -28,6 +30,7 @@ _MEAN_COLOUR = "#d95f02"
 _PANELS_ACROSS = 4
 _LONGEST_NAME = 34
 _SHOWN_MATCHES = 400
+_LETTERS_PER_INCH = 12
 
 
 def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:
@@ -36,7 +39,7 @@ def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:
     for axes, values in zip(panels, ate_mm.to_numpy(), strict=True):
         _draw_bars(axes, values, ".2f")
         axes.set_xlabel("ATE RMSE, mm")
-    headline(figure, f"Position error after alignment: {alignment}; lower is better")
+    _headline(figure, f"Position error after alignment: {alignment}; lower is better")
     figure.savefig(file)
 
 
@@ -52,7 +55,7 @@ def draw_frames_until_loss(frames: pd.DataFrame, lengths: Sequence[int], file: P
             bar.set_color(ESTIMATE_COLOUR if value >= length else BAR_COLOUR)
         axes.axvline(length, color="black", linestyle="--", linewidth=1)
         axes.set_xlabel(f"frames, of {length}")
-    headline(figure, "Frames until tracking is lost; green: never; higher is better")
+    _headline(figure, "Frames until tracking is lost; green: never; higher is better")
     figure.savefig(file)
 
 
@@ -71,7 +74,7 @@ def draw_displacement_bars(
         axes.plot(medians, places, "D", color="white", markeredgecolor="black", markersize=6, linestyle="none")
         axes.set_xlabel("displacement, mm")
     marks = "bar: mean, whisker: standard deviation, diamond: median; lower is better"
-    headline(figure, f"ORB displacement between consecutive frames, {where}; {marks}")
+    _headline(figure, f"ORB displacement between consecutive frames, {where}; {marks}")
     figure.savefig(file)
 
 
@@ -81,7 +84,7 @@ def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Pa
     `pair_median_mm` gives each method's (P,) values in order, NaN where nothing was matched.
     """
     across, down = _grid_size(len(pair_median_mm))
-    figure = new_figure(3.4 * across + 0.6, 2.7 * down + 0.7)
+    figure = _new_figure(3.4 * across + 0.6, 2.7 * down + 0.7)
     grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, (name, medians_mm) in zip(grid, pair_median_mm.items(), strict=False):
         axes.plot(np.arange(1, len(medians_mm) + 1), medians_mm, ".", color=BAR_COLOUR, markersize=4, alpha=0.7)
@@ -97,7 +100,7 @@ def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Pa
         axes.tick_params(labelbottom=place + across >= len(pair_median_mm))
     figure.supxlabel("pair of consecutive frames")
     figure.supylabel("displacement, mm")
-    headline(figure, f"ORB displacement, median of each pair, {where}; line: mean of the pairs")
+    _headline(figure, f"ORB displacement, median of each pair, {where}; line: mean of the pairs")
     figure.savefig(file)
 
 
@@ -108,7 +111,7 @@ def draw_matched_points(points_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], 
     of more than 400 matches every k-th is drawn.
     """
     across, down = _grid_size(len(points_mm))
-    figure = new_figure(4.2 * across, 4.2 * down)
+    figure = _new_figure(4.2 * across, 4.2 * down)
     # The constrained layout ignores the labels of 3D axes.
     figure.set_layout_engine(None)
     figure.subplots_adjust(left=0.02, right=1 - 0.3 / across, bottom=0.05, top=1 - 0.13 / down)
@@ -137,6 +140,20 @@ def _draw_matches(axes: Axes3D, previous: np.ndarray, current: np.ndarray) -> No
     axes.locator_params(nbins=5)
 
 
+def _new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure of this size, 100 dots per inch, with its own canvas: there is no global state."""
+    figure = Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _headline(figure: Figure, text: str) -> None:
+    """Write a title over the whole figure, in lines of about the same length."""
+    width = int(_LETTERS_PER_INCH * figure.get_figwidth())
+    even = min(width, len(text) // len(textwrap.wrap(text, width)) + 12)
+    figure.suptitle(textwrap.fill(text, even), fontsize=11)
+
+
 def _grid_size(panels: int) -> tuple[int, int]:
     """Return columns and rows of a grid of panels."""
     across = min(_PANELS_ACROSS, panels)
@@ -146,7 +163,7 @@ def _grid_size(panels: int) -> tuple[int, int]:
 def _bar_panels(values: pd.DataFrame) -> tuple[Figure, list[Axes]]:
     """Return a figure with one panel per sequence, all with the methods from top to bottom."""
     across, down = _grid_size(len(values))
-    figure = new_figure(3.4 * across + 2.2, (0.32 * len(values.columns) + 1.0) * down + 0.8)
+    figure = _new_figure(3.4 * across + 2.2, (0.32 * len(values.columns) + 1.0) * down + 0.8)
     panels = list(figure.subplots(down, across, sharey=True, squeeze=False).ravel())
     for axes in panels[len(values) :]:
         axes.set_visible(False)

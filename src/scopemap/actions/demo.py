@@ -26,8 +26,9 @@ from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.depth_figures import draw_depths
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.report.mesh_figures import draw_mesh, draw_trajectories
+from scopemap.report.mesh_figures import draw_trajectories, inside_view, mesh_picture, outside_views
 from scopemap.report.page import write_report
+from scopemap.report.sheet import picture_grid
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -124,11 +125,10 @@ def draw(demo: Demonstration, folder: Path) -> list[Path]:
     draw_trajectories(estimate_mm, matched.reference[:, :3, 3], drawings[0])
     mesh = demo.result.mesh.copy()
     mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
-    draw_mesh(mesh, drawings[1], matched.reference[0])
+    views = {"from the camera": inside_view(matched.reference[0]), **outside_views(mesh, matched.reference[0])}
+    picture_grid([{title: mesh_picture(mesh, view) for title, view in views.items()}], (400, 400)).save(drawings[1])
     shown = [frame for frame, _ in demo.sequence if frame.index in demo.raw_mm]
-    depths: dict[str, list[np.ndarray | None]] = {
-        "raw depth": [demo.raw_mm[frame.index] for frame in shown],
-        "refined depth": [demo.refined_mm[frame.index] for frame in shown],
-    }
+    kinds = {"raw depth": demo.raw_mm, "refined depth": demo.refined_mm}
+    depths = {kind: [depth_mm[frame.index] for frame in shown] for kind, depth_mm in kinds.items()}
     draw_depths([frame.rgb for frame in shown], depths, drawings[2])
     return drawings

@@ -14,12 +14,12 @@ import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import check_shape
-from scopemap.geometry.rendering import Rendering, render_mesh, render_points
+from scopemap.geometry.rendering import Rendering, render_mesh
 from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
-from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
-from scopemap.report.sheet import SOFT, Plot, Sheet, picture_grid
+from scopemap.report.sheet import SOFT, Plot, Sheet
 
+ESTIMATE_COLOUR = "#1a9850"
+TRUTH_COLOUR = "#d73027"
 _SIDE_PX = 480
 _AMBIENT = 0.35
 _UNPAINTED = 190
@@ -40,114 +40,37 @@ class MeshView:
         return points, self.camera.project(points)
 
 
-def draw_trajectories(estimate_positions_mm: np.ndarray, reference_positions_mm: np.ndarray | None, file: Path) -> None:
-    """Draw camera positions (N, 3) and, if given, the true ones (M, 3), mm, in three orthogonal views as a PNG.
+def draw_trajectories(estimate_positions_mm: np.ndarray, true_positions_mm: np.ndarray, file: Path) -> None:
+    """Draw camera positions (N, 3) and the true ones (M, 3), mm, in three orthogonal views as a PNG.
 
     A dot marks the start; rows of NaN (lost frames) are gaps.
     """
     sheet = Sheet(3 * _PLOT_PX + 20, _PLOT_PX + 20)
-    paths = _paths(estimate_positions_mm, reference_positions_mm)
-    for number, (across, up) in enumerate([(0, 1), (0, 2), (2, 1)]):
-        shown = {name: (colour, positions[:, [across, up]]) for name, (colour, positions) in paths.items()}
-        known = np.concatenate([values[np.isfinite(values).all(1)] for _, values in shown.values()])
+    paths = {TRUTH_COLOUR: true_positions_mm, ESTIMATE_COLOUR: estimate_positions_mm}
+    for number, axes in enumerate([(0, 1), (0, 2), (2, 1)]):
+        shown = {colour: positions[:, axes] for colour, positions in paths.items()}
+        known = np.concatenate([values[np.isfinite(values).all(1)] for values in shown.values()])
         low, high = (known.min(0), known.max(0)) if len(known) else (np.zeros(2), np.ones(2))
         centre, half = (low + high) / 2, 0.55 * max(float((high - low).max()), 1e-3)
         x, y = ((float(value) - half, float(value) + half) for value in centre)
         # The world's y points down.
         inside = (number * _PLOT_PX + 60.0, 15.0, _PLOT_PX - 60.0, _PLOT_PX - 60.0)
-        plot = Plot(sheet, inside, x, y[::-1] if up == 1 else y)
-        plot.frame(f"{'xyz'[across]} mm", f"{'xyz'[up]} mm")
-        for colour, values in shown.values():
-            places = plot.place(values)
-            sheet.line(places, colour, 2)
-            start = places[np.isfinite(places).all(1)][:1]
-            sheet.dots(start, "#000000", 5)
-            sheet.dots(start, colour, 4)
-    _write_legend(sheet, list(paths), 80, _PLOT_PX - 92)
+        plot = Plot(sheet, inside, x, y[::-1] if axes[1] == 1 else y)
+        plot.frame(f"{'xyz'[axes[0]]} mm", f"{'xyz'[axes[1]]} mm")
+        for colour, values in shown.items():
+            _draw_line(sheet, plot.place(values), colour, 2)
+    sheet.text((80, _PLOT_PX - 92), "estimate", 14, ESTIMATE_COLOUR)
+    sheet.text((80, _PLOT_PX - 76), "truth", 14, TRUTH_COLOUR)
+    sheet.text((80, _PLOT_PX - 60), "dot: start", 12, SOFT)
     sheet.save(file)
 
 
-def _write_legend(sheet: Sheet, names: list[str], left: float, top: float) -> None:
-    for row, name in enumerate(reversed(names)):
-        sheet.text((left, top + 16 * row), name, 14, ESTIMATE_COLOUR if name == "estimate" else TRUTH_COLOUR)
-    sheet.text((left, top + 16 * len(names)), "dot: start", 12, SOFT)
-
-
-def draw_mesh(
-    mesh: trimesh.Trimesh,
-    file: Path,
-    T_world_view: np.ndarray | None = None,
-    reference_mesh: trimesh.Trimesh | None = None,
-) -> None:
-    """Draw a mesh, world mm, as a PNG: from `T_world_view` (4, 4), and from two sides outside.
-
-    A reference mesh (the truth) is drawn below from the same views. Without `T_world_view` there are only the outside
-    views; an empty mesh gives empty views.
-    """
-    framed = reference_mesh if reference_mesh is not None and not len(mesh.faces) else mesh
-    views = {} if T_world_view is None else {"from the camera": inside_view(T_world_view)}
-    views |= outside_views(framed, T_world_view)
-    meshes = {"": mesh} | ({} if reference_mesh is None else {"truth, ": reference_mesh})
-    rows = [
-        {prefix + title: mesh_picture(drawn, view) for title, view in views.items()} for prefix, drawn in meshes.items()
-    ]
-    picture_grid(rows, (400, 400)).save(file)
-
-
-def draw_reconstruction(
-    mesh: trimesh.Trimesh,
-    estimate_positions_mm: np.ndarray,
-    reference_positions_mm: np.ndarray | None,
-    file: Path,
-    T_world_view: np.ndarray | None = None,
-) -> None:
-    """Draw a mesh with the estimated (N, 3) and the true (M, 3) camera positions over it, all world mm, as a PNG.
-
-    Views: from behind `T_world_view` (4, 4), the first camera, and from two sides outside; without it only from
-    outside. A dot marks the start; rows of NaN (lost frames) are gaps.
-    """
-    paths = _paths(estimate_positions_mm, reference_positions_mm)
-    # The truth is drawn first and broader: where both agree it is the edge of the estimate.
-    widths_px = {"truth": 5, "estimate": 2}
-    everywhere = np.concatenate([positions for _, positions in paths.values()])
-    views = {} if T_world_view is None else {"from behind the start": view_from_behind(T_world_view, everywhere)}
-    views |= outside_views(mesh, T_world_view, everywhere)
-    pictures = {title: mesh_picture(mesh, view) for title, view in views.items()}
-    for title, view in views.items():
-        for name, (colour, positions) in paths.items():
-            draw_path(pictures[title], view, positions, colour, thickness_px=widths_px[name])
-    sheet = picture_grid([{title: cropped(picture) for title, picture in pictures.items()}], (460, 460))
-    _write_legend(sheet, list(paths), 14, 30)
-    if reference_positions_mm is None:
-        sheet.text((14, 62), "no true poses are known", 12, SOFT)
-    sheet.save(file)
-
-
-def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
-    """Draw the point clouds of two frames on each other as a PNG, one panel per method, from in front and aside.
-
-    Each method gives points (N, 3), mm, in a camera of the clouds, and their colours (N, 3) uint8; `where` names the
-    poses that registered them.
-    """
-    rows: list[dict[str, np.ndarray]] = [{}, {}]
-    for method, (points, colours) in clouds.items():
-        centre = np.median(points, axis=0)
-        radius = float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
-        for row, yaw_rad in zip(rows, (0.0, 0.8), strict=True):
-            view = _view_of(np.eye(3), centre, radius, yaw_rad, 0.0)
-            row[f"{method}\n{where}"] = cropped(
-                _on_white(render_points(points, colours, view.camera, view.T_world_camera))
-            )
-    picture_grid(rows, (360, 360)).save(file)
-
-
-def _paths(estimate_mm: np.ndarray, reference_mm: np.ndarray | None) -> dict[str, tuple[str, np.ndarray]]:
-    """Return colour and positions by name, in the order in which they are drawn."""
-    check_shape("estimate_positions_mm", estimate_mm, (None, 3))
-    if reference_mm is None:
-        return {"estimate": (ESTIMATE_COLOUR, estimate_mm)}
-    check_shape("reference_positions_mm", reference_mm, (None, 3))
-    return {"truth": (TRUTH_COLOUR, reference_mm), "estimate": (ESTIMATE_COLOUR, estimate_mm)}
+def _draw_line(sheet: Sheet, places: np.ndarray, colour: str, thickness_px: int) -> None:
+    """Draw a path through places (N, 2), px, its start a dot."""
+    start = places[np.isfinite(places).all(axis=1)][:1]
+    sheet.line(places, colour, thickness_px)
+    sheet.dots(start, "#000000", 3 + thickness_px)
+    sheet.dots(start, colour, 2 + thickness_px)
 
 
 def inside_view(T_world_camera: np.ndarray, field_of_view_rad: float = 1.6) -> MeshView:
@@ -171,24 +94,23 @@ def view_from_behind(T_world_camera: np.ndarray, positions_mm: np.ndarray) -> Me
 
 
 def outside_views(
-    mesh: trimesh.Trimesh, T_world_camera: np.ndarray | None = None, positions_mm: np.ndarray | None = None
+    mesh: trimesh.Trimesh, T_world_camera: np.ndarray, positions_mm: np.ndarray | None = None
 ) -> Mapping[str, MeshView]:
     """Return two views of the whole mesh from opposite sides, upright for the camera at `T_world_camera` (4, 4).
 
     Positions (N, 3), mm, are in view, too; those of NaN do not count.
     """
-    R = np.eye(3) if T_world_camera is None else T_world_camera[:3, :3]
     points = [np.empty((0, 3)) if positions_mm is None else positions_mm[np.isfinite(positions_mm).all(axis=1)]]
     points += [np.asarray(mesh.bounds)] if len(mesh.vertices) else []
     shown = np.concatenate(points)
     low, high = (shown.min(axis=0), shown.max(axis=0)) if len(shown) else (np.zeros(3), np.ones(3))
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     sides = {"from outside": -1.0, "from the other side": 2.1}
-    return {name: _view_of(R, centre, radius, yaw_rad, -0.45) for name, yaw_rad in sides.items()}
+    return {name: view_of(T_world_camera[:3, :3], centre, radius, yaw_rad, -0.45) for name, yaw_rad in sides.items()}
 
 
-def _view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: float, pitch_rad: float) -> MeshView:
-    """Return a view of a whole ball, turned from the orientation R (3, 3)."""
+def view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: float, pitch_rad: float) -> MeshView:
+    """Return a view of a whole ball, rotated from the orientation R (3, 3)."""
     R_view = R @ so3_exp(np.array([0.0, yaw_rad, 0.0])) @ so3_exp(np.array([pitch_rad, 0.0, 0.0]))
     # From 4 radii away the ball fills a field of view of 2 asin(1/4).
     return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
@@ -209,14 +131,15 @@ def mesh_picture(mesh: trimesh.Trimesh, view: MeshView, *, smooth: bool = True) 
     shaded = np.round((_AMBIENT + (1 - _AMBIENT) * cosine)[:, None] * colours).astype(np.uint8)
     lit = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=shaded, process=False)
     if not smooth:
-        return _on_white(render_mesh(lit, camera, view.T_world_camera))
+        return on_white(render_mesh(lit, camera, view.T_world_camera))
     # Half a pixel's sampling: the mesh's triangles are often smaller than a pixel.
     fine = camera.resized(2 * camera.width, 2 * camera.height)
-    picture = _on_white(render_mesh(lit, fine, view.T_world_camera))
+    picture = on_white(render_mesh(lit, fine, view.T_world_camera))
     return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def _on_white(rendering: Rendering) -> np.ndarray:
+def on_white(rendering: Rendering) -> np.ndarray:
+    """Return the colours of a rendering, (H, W, 3) uint8, white where there is no surface."""
     return np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(255), rendering.rgb)
 
 
@@ -229,10 +152,7 @@ def draw_path(
     """
     points, pixels = view.project(positions_mm)
     places = np.where(points[:, 2:] > 0, pixels, np.nan)
-    sheet, start = Sheet.over(picture), places[np.isfinite(places).all(axis=1)][:1]
-    sheet.line(places, colour, thickness_px)
-    sheet.dots(start, "#000000", 3 + thickness_px)
-    sheet.dots(start, colour, 2 + thickness_px)
+    _draw_line(Sheet.over(picture), places, colour, thickness_px)
 
 
 def cropped(picture: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from scopemap.geometry.rendering import vertex_colours
 from scopemap.io.decoding import read_decoded
 from scopemap.io.run_folder import RunFolder
-from scopemap.report.canvas import ESTIMATE_COLOUR
 from scopemap.report.mesh_figures import (
+    ESTIMATE_COLOUR,
     MeshView,
     cropped,
     draw_path,

@@ -1,0 +1,92 @@
+"""Figures of a sequence's runs: depth of two frames, their registered point clouds, meshes with camera paths."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from scopemap.geometry.rendering import render_points
+from scopemap.report.depth_figures import colour_depth, percentiles
+from scopemap.report.mesh_figures import (
+    ESTIMATE_COLOUR,
+    TRUTH_COLOUR,
+    cropped,
+    draw_path,
+    mesh_picture,
+    on_white,
+    outside_views,
+    view_from_behind,
+    view_of,
+)
+from scopemap.report.sheet import picture_grid
+
+
+def draw_depth_change(
+    images: Mapping[str, np.ndarray], depths_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path
+) -> None:
+    """Draw two consecutive frames by name, and each method's depth (H, W), mm, of both and its absolute difference.
+
+    The paper's experiments 1 and 2 (arXiv 2508.11282). Methods share the scales of depth and of difference, whose far
+    end is the 98th percentile; unknown is black.
+    """
+    near_mm, far_mm = percentiles([depth for pair in depths_mm.values() for depth in pair])
+    changes_mm = {method: np.abs(current - previous) for method, (previous, current) in depths_mm.items()}
+    most_mm = percentiles(list(changes_mm.values()))[1]
+    rows = [dict(images)]
+    for method, depths in depths_mm.items():
+        change_mm = changes_mm[method][np.isfinite(changes_mm[method])]
+        mean = f"mean {change_mm.mean():.2f} mm" if len(change_mm) else "unknown"
+        names = (f"{method}: previous", "current", f"|difference|: {mean}")
+        pictures = [colour_depth(depth, near_mm, far_mm) for depth in depths]
+        pictures.append(colour_depth(changes_mm[method], 0.0, most_mm))
+        rows.append(dict(zip(names, pictures, strict=True)))
+    scales = f"depth: blue {near_mm:.0f} to red {far_mm:.0f} mm; difference: blue 0 to red {most_mm:.1f} mm"
+    picture_grid(rows, (300, 250), scales).save(file)
+
+
+def draw_reconstruction(
+    mesh: trimesh.Trimesh,
+    estimate_positions_mm: np.ndarray,
+    reference_positions_mm: np.ndarray | None,
+    file: Path,
+    T_world_view: np.ndarray,
+) -> None:
+    """Draw a mesh with the estimated (N, 3) and the true (M, 3) camera positions over it, all world mm, as a PNG.
+
+    Views: from behind `T_world_view` (4, 4), the first camera, and from two sides outside. A dot marks the start; rows
+    of NaN (lost frames) are gaps.
+    """
+    # The truth is drawn first and broader: where both agree it is the edge of the estimate.
+    paths = [] if reference_positions_mm is None else [(reference_positions_mm, TRUTH_COLOUR, 5)]
+    paths.append((estimate_positions_mm, ESTIMATE_COLOUR, 2))
+    everywhere = np.concatenate([positions for positions, _, _ in paths])
+    views = {"from behind the start": view_from_behind(T_world_view, everywhere)}
+    views |= outside_views(mesh, T_world_view, everywhere)
+    pictures = {}
+    for title, view in views.items():
+        picture = mesh_picture(mesh, view)
+        for positions, colour, thickness_px in paths:
+            draw_path(picture, view, positions, colour, thickness_px=thickness_px)
+        pictures[title] = cropped(picture)
+    of_truth = "no true poses are known" if reference_positions_mm is None else "red: true path"
+    picture_grid([pictures], (460, 460), f"green: estimated path, its start a dot; {of_truth}").save(file)
+
+
+def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
+    """Draw the point clouds of two frames on each other as a PNG, one panel per method, from in front and aside.
+
+    Each method gives points (N, 3), mm, in a camera of the clouds, and their colours (N, 3) uint8; `where` names the
+    poses that registered them.
+    """
+    rows: list[dict[str, np.ndarray]] = [{}, {}]
+    for method, (points, colours) in clouds.items():
+        centre = np.median(points, axis=0)
+        radius = float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
+        for row, yaw_rad in zip(rows, (0.0, 0.8), strict=True):
+            view = view_of(np.eye(3), centre, radius, yaw_rad, 0.0)
+            rendering = render_points(points, colours, view.camera, view.T_world_camera)
+            row[f"{method}\n{where}"] = cropped(on_white(rendering))
+    picture_grid(rows, (360, 360)).save(file)
