@@ -178,12 +178,12 @@ def test_endonerf(run: Path, tmp_path: Path) -> None:
 
 
 def test_endonerf_has_its_principal_point_in_the_middle(run: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
     from scopemap.actions.export.exported_run import read_exported
 
     lens = PinholeCamera(60.0, 48.0, 36.5, 29.0, 80, 64)
-    write_endonerf(replace(read_exported(run), camera=lens), tmp_path / "out")
+    exported = read_exported(run)
+    exported.camera = lens
+    write_endonerf(exported, tmp_path / "out")
     # What the run's picture shows at (u, v) is where a camera with one focal length, centred, has it.
     u, v = 50, 40
     there = (39.5 + (u - 36.5), 31.5 + (v - 29.0) * 60 / 48)

@@ -6,7 +6,7 @@ The run's frames are fused again with its settings, poses and depth, but for eve
 from __future__ import annotations
 
 import csv
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from scopemap.actions.inputs import is_camera_of, open_truth
-from scopemap.config import Config, FusionSettings
+from scopemap.actions.inputs import open_input
 from scopemap.depth.perceptual import CHECKPOINTS, PACKAGES, create_perceptual
 from scopemap.errors import InputError
 from scopemap.frame import Frame
@@ -29,11 +28,9 @@ from scopemap.geometry.se3 import transform
 from scopemap.io import weights
 from scopemap.io.device import missing_packages
 from scopemap.io.run_folder import RunFolder
-from scopemap.masking.mask_files import create_masks
-from scopemap.masking.masker import Masker
 from scopemap.report.depth_figures import draw_renderings
 
-HELD_OUT_EVERY = 10
+_HELD_OUT_EVERY = 10
 _WORST = 3  # frames that are drawn
 
 
@@ -84,21 +81,27 @@ class SurfaceAgreement:
 class RunFrames:
     """The frames of a run's surface, read again from its folder and its input, in an unnamed file there until `close`.
 
-    fusion : settings instead of the run's. Raises `InputError` where the run has no surface, kept no depth, or its
-    input is not there any more.
+    Raises `InputError` where the run has no surface, kept no depth, or its input is not there any more.
     """
 
-    def __init__(self, run: Path, fusion: FusionSettings | None = None) -> None:
-        config = RunFolder(run).config
-        fusion = fusion or config.fusion
-        if config.fusion.voxel_mm is None or not config.fusion.enabled:
+    def __init__(self, run: Path) -> None:
+        folder = RunFolder(run)
+        fusion = folder.config.fusion
+        if fusion.voxel_mm is None or not fusion.enabled:
             raise InputError(f"the run {run} has no surface that could be compared with its video")
+        (sequence, mask), depth = open_input(run), folder.depth
+        if not depth.present:
+            raise InputError(f"the run {run} kept no depth maps")
         self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore(run)
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
-        for frame in _frames(run, config):
-            self._store.put(frame)
-            self.indices.append(frame.index)
+        tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every]
+        pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
+        for frame in map(mask, sequence.frames()):
+            if frame.index in pose_of and (depth_mm := depth.read(frame.index)) is not None:
+                sigma_mm, pose = depth.read_sigma(frame.index), pose_of[frame.index]
+                self._store.put(replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, T_world_camera=pose))
+                self.indices.append(frame.index)
 
     def close(self) -> None:
         """Delete the unnamed file."""
@@ -111,14 +114,15 @@ class RunFrames:
         surface = fusion.fuse(self._store.frames(fused), fused)
         return finished(surface.mesh, surface.settings)
 
-    def agreement(self, every: int = HELD_OUT_EVERY) -> SurfaceAgreement:
-        """Return the agreement of the surface with the video; every `every`-th frame is kept out of fusion.
+    def agreement(self) -> SurfaceAgreement:
+        """Return the agreement of the surface with the video; every tenth frame is kept out of fusion.
 
         Raises `InputError` where the frames are too few for that.
         """
-        held_out = frozenset(self.indices[every // 2 :: every])
+        held_out = frozenset(self.indices[_HELD_OUT_EVERY // 2 :: _HELD_OUT_EVERY])
         if not held_out:
-            raise InputError(f"the run {self._run} has too few tracked frames to keep every {every}th out of fusion")
+            which = f"every {_HELD_OUT_EVERY}th"
+            raise InputError(f"the run {self._run} has too few tracked frames to keep {which} out of fusion")
         mesh, missing = self.fuse(without=held_out), _lpips_missing()
         perceptual = None if missing else create_perceptual("lpips")
         found = SurfaceAgreement(lpips_missing=missing)
@@ -149,14 +153,14 @@ class RunFrames:
         return render_points(points_mm, other.rgb[known], frame.camera, _pose(frame))
 
 
-def held_out_agreement(run: Path, every: int = HELD_OUT_EVERY) -> SurfaceAgreement:
-    """Return the agreement of a run's surface with its video; every `every`-th tracked frame is kept out of fusion.
+def held_out_agreement(run: Path) -> SurfaceAgreement:
+    """Return the agreement of a run's surface with its video; every tenth tracked frame is kept out of fusion.
 
     LPIPS is measured where its weights are present. Raises `InputError` where the run has no surface, kept no depth,
     its input is not there any more, or too few of its frames are tracked.
     """
     with closing(RunFrames(run)) as frames:
-        return frames.agreement(every)
+        return frames.agreement()
 
 
 def _lpips_missing() -> str:
@@ -176,22 +180,3 @@ def _pose(frame: Frame) -> np.ndarray:
 def _usable_depth(frame: Frame) -> np.ndarray:
     assert frame.depth_mm is not None
     return np.where(frame.valid, frame.depth_mm, np.nan)
-
-
-def _frames(run: Path, config: Config) -> Iterator[Frame]:
-    """Yield the run's tracked frames that are fused, with valid pixels, depth and pose."""
-    folder = RunFolder(run)
-    source = Path(folder.provenance.get("input", ""))
-    if not source.exists():
-        raise InputError(f"the input {source} of the run {run} is not there any more")
-    depth, sequence = folder.depth, open_truth(run, source)
-    if not depth.present or not is_camera_of(run, sequence):
-        raise InputError(f"the run {run} kept no depth maps, or its input gives another camera now")
-    tracked = folder.frames.rows[folder.frames.tracked][:: config.fusion.every]
-    pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
-    mask = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
-    for frame in sequence.frames():
-        masked = mask(frame)
-        if frame.index in pose_of and (depth_mm := depth.read(frame.index)) is not None:
-            sigma_mm, pose = depth.read_sigma(frame.index), pose_of[frame.index]
-            yield replace(masked, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, T_world_camera=pose)

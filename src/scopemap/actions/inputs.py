@@ -1,16 +1,22 @@
-"""Opens a data set for its truth as a run read it: same size, same view of a stereo picture, same camera."""
+"""Opens the input of a run again, or a data set for its truth: same size, view of a stereo picture, camera, masks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, InputSettings
 from scopemap.errors import CalibrationError, InputError, SettingsError
+from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import OF_UNKNOWN_VIEWS
 from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence
+from scopemap.masking.mask_files import create_masks
+from scopemap.masking.masker import Masker
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.trajectory.trajectory import SKIPPED
 
 _SAME_CAMERA_PX = 0.01
 
@@ -48,6 +54,37 @@ def is_camera_of(run: Path, sequence: Sequence) -> bool:
         abs(getattr(camera, name) - getattr(sequence.camera, name)) <= _SAME_CAMERA_PX
         for name in ("fx", "fy", "cx", "cy")
     )
+
+
+def open_input(run: Path) -> tuple[Sequence, Masker]:
+    """Return the input of a run, rectified as the run had it, and what masks its frames as the run did.
+
+    Raises `InputError` where the input is gone or gives another camera.
+    """
+    folder = RunFolder(run)
+    source, config = Path(folder.provenance.get("input", "")), folder.config
+    if not source.exists():
+        raise InputError(f"the input {source} of the run {run} is not there any more")
+    sequence = open_truth(run, source)
+    if not is_camera_of(run, sequence):
+        raise InputError(f"the input {source} of the run {run} gives another camera now")
+    return sequence, Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
+
+
+def frames_again(run: Path, indices: set[int]) -> Iterator[Frame]:
+    """Yield the frames with these numbers from the input of the run, rectified and masked. Raises as `open_input`."""
+    sequence, mask = open_input(run)
+    for frame in sequence.frames():
+        if frame.index in indices:
+            yield mask(frame)
+
+
+def keep_pictures_again(run: Path) -> None:
+    """Write the pictures of a run that kept none, from its input. Raises `InputError` where that is not possible."""
+    frames, pictures = RunFolder(run).checked().frames, FramePictures(timed=False)
+    for frame in frames_again(run, set(frames["index"][frames["status"] != SKIPPED].tolist())):
+        pictures.put(frame.index, frame.rgb, frame.valid)
+    pictures.save(run)
 
 
 def _camera_of(run: Path) -> PinholeCamera | None:

@@ -137,17 +137,10 @@ def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np
     """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
     own, sigma = run.depth.read(frame), run.depth.read_sigma(frame)
     column, row = np.round(pixels).astype(int).T
-    errors = np.full(len(pixels), np.nan)
-    for image in () if own is None else (sigma, np.abs(own - _at(depth_mm, row, column, own.shape))):
-        if image is not None:
-            errors = np.fmax(errors, image[row, column] / depth_mm)
+    errors = np.full(len(pixels), np.nan) if own is None else np.abs(own[row, column] - depth_mm) / depth_mm
+    if own is not None and sigma is not None:
+        errors = np.fmax(errors, sigma[row, column] / depth_mm)
     return np.where(np.isfinite(errors), errors, _DEPTH_ERROR)
-
-
-def _at(values: np.ndarray, row: np.ndarray, column: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    image = np.full(shape, np.nan)
-    image[row, column] = values
-    return image
 
 
 def _drawn(run: ExportedRun) -> _Errors:

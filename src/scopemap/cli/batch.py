@@ -301,11 +301,7 @@ def _lines(*, silent: bool) -> Iterator[Callable[[str, str, int, bool], None]]:
 @contextmanager
 def _ending_by_sigterm() -> Iterator[None]:
     """Let SIGTERM, by which clusters end a job, end the processes and write the table, as Ctrl-C does."""
-
-    def end(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, end)
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         yield
     finally:

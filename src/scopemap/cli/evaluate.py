@@ -102,14 +102,10 @@ def against_own_video(run: Path) -> dict[str, Any]:
 
 def warn_of(matched: MatchedTrajectories) -> None:
     """Print what limits the figures of these trajectories."""
-    lost = int((~matched.tracked).sum())
+    lost, ratio = int((~matched.tracked).sum()), matched.similarity.line_ratio
     if lost:
-        typer.echo(
-            f"warning: {lost} of {len(matched.tracked)} frames are lost and left out of all but one figure", err=True
-        )
-    if matched.similarity.line_ratio < _WEAK_LINE_RATIO:
-        typer.echo(
-            f"warning: the path is nearly a straight line (D2/D1 = {matched.similarity.line_ratio:.1e}); the rotation "
-            "about it is poorly determined, and so are the rotation errors",
-            err=True,
-        )
+        counted = f"{lost} of {len(matched.tracked)} frames are lost"
+        typer.echo(f"warning: {counted} and left out of all but one figure", err=True)
+    if ratio < _WEAK_LINE_RATIO:
+        line = f"the path is nearly a straight line (D2/D1 = {ratio:.1e}); the rotation about it is poorly determined"
+        typer.echo(f"warning: {line}, and so are the rotation errors", err=True)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from scopemap.cli.figures import print_json
 from scopemap.cli.options import AsJson, Quiet, Unit
 
 To = Literal[
@@ -34,6 +34,6 @@ def export(
 
     scale = export_run(run, to, out, units, axes)
     if as_json:
-        typer.echo(json.dumps({"out": str(out), "format": to, "scale": scale}, indent=2))
+        print_json({"out": str(out), "format": to, "scale": scale})
     elif not quiet:
         typer.echo(f"{out}: written; {scale}")

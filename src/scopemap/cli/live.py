@@ -165,15 +165,13 @@ def _controls(session: LiveSession, port: int | None, seconds: float | None, *, 
 
 def _served(session: LiveSession, port: int, *, silent: bool) -> Callable[[], None]:
     """Serve the session's page, and return what ends that."""
-    from scopemap.report.serving import Content, LocalServer, live_page
+    from scopemap.report.serving import LocalServer, live_page
 
-    def state() -> Content:
-        return "application/json", json.dumps(session.state()).encode()
-
-    def picture() -> Content | None:
-        return ("image/jpeg", jpeg) if (jpeg := session.picture()) else None
-
-    pages = {"/": live_page, "/state": state, "/picture.jpg": picture}
+    pages = {
+        "/": live_page,
+        "/state": lambda: ("application/json", json.dumps(session.state()).encode()),
+        "/picture.jpg": lambda: ("image/jpeg", jpeg) if (jpeg := session.picture()) else None,
+    }
     actions = {"/pause": session.pause, "/reset": session.reset, "/snapshot": session.snapshot}
     server = LocalServer(pages, actions, port)
     if not silent:

@@ -47,11 +47,6 @@ def measure(
 
 def _pixels(text: str, option: str) -> list[list[float]]:
     try:
-        return [[float(number) for number in _pair(word)] for word in text.split()]
+        return [[float(x), float(y)] for x, y in (word.split(",") for word in text.split())]
     except ValueError:
         raise typer.BadParameter(f'"{text}" is not "x,y x,y ..."', param_hint=option) from None
-
-
-def _pair(word: str) -> tuple[str, str]:
-    x, y = word.split(",")
-    return x, y

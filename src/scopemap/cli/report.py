@@ -17,7 +17,7 @@ def report(
     ] = False,
 ) -> None:
     """Write report.html and summary.png of a run into its folder."""
-    from scopemap.actions.pictures import keep_pictures_again
+    from scopemap.actions.inputs import keep_pictures_again
     from scopemap.errors import InputError
     from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import write_report

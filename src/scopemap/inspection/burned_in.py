@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from scopemap.inspection.clip import VideoFinding, segments_of
-from scopemap.inspection.field_shape import ShareBox
+from scopemap.inspection.field_shape import ShareBox, shares_of
 from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.masking.masker import hull_of_largest
 from scopemap.masking.overlays import OverlayFinder
@@ -62,7 +62,7 @@ class OverlayWatcher:
         joined = cv2.morphologyEx(there, cv2.MORPH_CLOSE, np.ones((3, side), np.uint8))
         _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
         found = [
-            Overlay(_shares((x, y, w, h), self._times.shape), bool(self._field[labels == label].mean() > 0.5))
+            Overlay(shares_of((x, y, w, h), self._times.shape), bool(self._field[labels == label].mean() > 0.5))
             for label, (x, y, w, h, _) in enumerate(stats[1:].tolist(), start=1)
             if min(w, h) >= _LEAST_BOX_PX
         ]
@@ -86,12 +86,6 @@ class OverlayWatcher:
 
 def _square(side_px: int) -> np.ndarray:
     return np.ones((side_px, side_px), np.uint8)
-
-
-def _shares(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> ShareBox:
-    """Return left, top, width and height, px, as shares."""
-    (height, width), (x, y, w, h) = shape, box
-    return x / width, y / height, (x + w) / width, (y + h) / height
 
 
 def _rim(field: np.ndarray) -> np.ndarray:
@@ -143,7 +137,7 @@ class InsetWatcher:
         found = [(a, b, c - a, d - b) for a, b, c, d in boxes if self._is_inset((a, b, c, d), upright, level)]
         # The largest first, and none that overlaps one before it.
         kept = cv2.dnn.NMSBoxes(found, [float(w * h) for _, _, w, h in found], 0.0, 0.0)
-        return [_shares(found[number], upright.shape) for number in kept]
+        return [shares_of(found[number], upright.shape) for number in kept]
 
     def findings(self) -> Iterator[VideoFinding]:
         """Yield a finding where there is an inset."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -113,11 +113,14 @@ class FieldWatcher:
             yield VideoFinding("warning" if far else "info", "field-moves", message, advice if far else "")
 
 
-def _box(mask: np.ndarray) -> ShareBox:
-    """Return the box around a mask."""
-    height, width = mask.shape
-    x, y, across, down = cv2.boundingRect(mask.astype(np.uint8))
+def shares_of(box: Sequence[int], shape: tuple[int, ...]) -> ShareBox:
+    """Return left, top, width and height, px, as shares of a picture's shape (height, width)."""
+    (height, width), (x, y, across, down) = shape, box
     return x / width, y / height, (x + across) / width, (y + down) / height
+
+
+def _box(mask: np.ndarray) -> ShareBox:
+    return shares_of(cv2.boundingRect(mask.astype(np.uint8)), mask.shape)
 
 
 def _points(hull: np.ndarray) -> np.ndarray:

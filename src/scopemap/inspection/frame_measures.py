@@ -11,6 +11,7 @@ from scopemap.config import MaskSettings
 from scopemap.frame import Frame, is_constant
 from scopemap.io.frame_choice import LEAST_DIFFERENCE, mean_difference
 from scopemap.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, darker_channels, is_lit, specular
+from scopemap.report.frame_pictures import shrunk
 from scopemap.tracking.sharpness import sharpness
 
 _SMALL_PX, _FLOW_PX = 320, 160
@@ -74,7 +75,7 @@ class FrameInspector:
 
     def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
         """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
-        small = smaller(rgb, _SMALL_PX)
+        small = shrunk(rgb, _SMALL_PX)
         lit = is_lit(small, _MASK.constants.dark_level)
         field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
         inside = field if field.any() else np.ones_like(field)
@@ -112,7 +113,7 @@ class FrameInspector:
 
     def _motion(self, small: np.ndarray) -> tuple[float, float]:
         """Return motion and likeness."""
-        grey = cv2.cvtColor(smaller(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(shrunk(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
         before, self._before = self._before, grey
         if before is None:
             return 0.0, 1.0
@@ -129,11 +130,3 @@ def _fine(grey: np.ndarray) -> np.ndarray:
     """Return a picture (H, W) uint8 without what is larger than some 10 pixels, float32."""
     picture = grey.astype(np.float32)
     return cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 4.0)
-
-
-def smaller(rgb: np.ndarray, longest_px: int) -> np.ndarray:
-    """Return a copy of a picture whose longer side is at most `longest_px`, means of its pixels."""
-    height, width = rgb.shape[:2]
-    factor = min(1.0, longest_px / max(height, width))
-    size = max(1, round(factor * width)), max(1, round(factor * height))
-    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.inspection.frame_measures import InspectedFrame, smaller
+from scopemap.inspection.frame_measures import InspectedFrame
 from scopemap.inspection.inspecting import Inspection
+from scopemap.report.frame_pictures import shrunk
 from scopemap.report.sheet import Plot, Sheet
 
 Box = tuple[float, float, float, float]
@@ -85,7 +86,7 @@ def write_mask(inspection: Inspection, folder: Path) -> bool:
 
 def _draw_found(sheet: Sheet, box: Box, view: InspectedFrame, inspection: Inspection) -> str:
     """Draw a frame of the video with what was found in it, and return its title."""
-    left, top, width, height = sheet.picture(smaller(view.rgb, _SHOWN_PX), box)
+    left, top, width, height = sheet.picture(shrunk(view.rgb, _SHOWN_PX), box)
     corner, size = np.array([left, top]) - 0.5, np.array([width, height])
     if inspection.field.shape != "full":
         outline = np.vstack([inspection.field.outline, inspection.field.outline[:1]])

@@ -9,14 +9,14 @@ from __future__ import annotations
 import csv
 import time
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 
 from scopemap.errors import reporting
-from scopemap.frame import Frame, Rows
+from scopemap.frame import Rows
 from scopemap.io.run_folder import RunFolder
+from scopemap.odometry import Step
 
 FOLDER = "frames"
 _MOST = 64
@@ -26,14 +26,6 @@ _QUALITY = 80
 _USABLE, _INSTRUMENT = 255, 90
 _COLUMNS = ("index", "sharpness", "ms")
 _MEASURE = np.dtype(list(zip(_COLUMNS, (np.int64, np.float64, np.float64), strict=True)))
-
-
-class HasFrame(Protocol):
-    """What a run shows to its observers: a step."""
-
-    @property
-    def frame(self) -> Frame:
-        """The frame."""
 
 
 class FramePictures:
@@ -53,7 +45,7 @@ class FramePictures:
         self._every, self._timed, self._before = 1, timed, time.perf_counter()
         self._count = 0
 
-    def observe(self, step: HasFrame) -> None:
+    def observe(self, step: Step) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""
         self.put(step.frame.index, step.frame.rgb, step.frame.valid, step.frame.instruments)
 
@@ -64,11 +56,12 @@ class FramePictures:
         laplacian = cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_16S)
         sharpness = float(cv2.meanStdDev(laplacian, mask=mask)[1][0, 0])
         if self._count % self._every == 0:
-            small = _shrunk(rgb, cv2.INTER_AREA)
+            small = shrunk(rgb, _LONGEST_SIDE_PX)
             levels = mask * np.uint8(_USABLE)
             if instruments is not None:
                 levels[instruments] = _INSTRUMENT
-            self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", _shrunk(levels, cv2.INTER_NEAREST)))
+            levels = shrunk(levels, _LONGEST_SIDE_PX, cv2.INTER_NEAREST)
+            self._pictures[index] = (_encoded(".jpg", small), _encoded(".png", levels))
         waited_ms = 1000 * (now - self._before) if self._timed else np.nan
         self._measures.append(np.array([(index, sharpness, waited_ms)], _MEASURE))
         self._count += 1
@@ -101,8 +94,9 @@ class FramePictures:
                 )
 
 
-def _shrunk(image: np.ndarray, interpolation: int) -> np.ndarray:
-    scale = min(1.0, _LONGEST_SIDE_PX / max(image.shape[:2]))
+def shrunk(image: np.ndarray, longest_px: int, interpolation: int = cv2.INTER_AREA) -> np.ndarray:
+    """Return a copy of an image whose longer side is at most `longest_px`."""
+    scale = min(1.0, longest_px / max(image.shape[:2]))
     size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
     return cv2.resize(image, size, interpolation=interpolation)
 

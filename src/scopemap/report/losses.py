@@ -47,7 +47,10 @@ def losses(frames: FrameTable) -> list[LostSegment]:
         rows = list(group)
         if lost:
             begin_s, end_s = (float(frames["time_s"][row]) for row in (rows[0], rows[-1]))
-            cause = _main_cause(frames["cause"][rows])
+            counts = Counter(map(LossCause, frames["cause"][rows].tolist()))
+            # What began the loss counts, not that the camera is not found again later.
+            began = {cause: count for cause, count in counts.items() if cause is not LossCause.NOT_FOUND_AGAIN}
+            cause = max(began or counts, key=(began or counts).__getitem__)
             found.append(LostSegment(rows[0], rows[-1], begin_s, end_s, len(rows), cause))
     return found
 
@@ -62,10 +65,3 @@ def in_words(found: list[LostSegment]) -> str:
         return ""
     cause = frames.most_common(1)[0][0]
     return f"Mostly by this: {cause}. Next time: {ADVICE[cause]}."
-
-
-def _main_cause(causes: np.ndarray) -> LossCause:
-    """Return the cause of most frames; what began the loss counts, not that the camera is not found again later."""
-    counts = Counter(map(LossCause, causes.tolist()))
-    began = {cause: count for cause, count in counts.items() if cause is not LossCause.NOT_FOUND_AGAIN}
-    return max(began or counts, key=lambda cause: counts[cause])

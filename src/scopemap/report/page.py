@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from collections.abc import Sequence
@@ -79,8 +80,10 @@ def page_html(runs: list[dict[str, Any]]) -> str:
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
     content = without_nan({"runs": runs, "licences": _LICENCES} | colours)
+    names = ", ".join(run["name"] for run in runs)
     parts = {
-        "title": _escaped(", ".join(run["name"] for run in runs)),
+        # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
+        "title": html.escape(names.encode("utf-8", "replace").decode("utf-8"), quote=False),
         "style": _asset("page.css"),
         "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
         # "<" would end the script that holds the data, wherever a name in it contains "</script>".
@@ -91,9 +94,3 @@ def page_html(runs: list[dict[str, Any]]) -> str:
 
 def _asset(name: str) -> str:
     return (files("scopemap.report") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _escaped(text: str) -> str:
-    # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
-    text = text.encode("utf-8", "replace").decode("utf-8")
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

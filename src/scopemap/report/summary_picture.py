@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import trimesh
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from scopemap.geometry.rendering import vertex_colours
 from scopemap.io.decoding import read_decoded
@@ -24,14 +24,14 @@ from scopemap.report.mesh_figures import (
     outside_views,
     view_from_behind,
 )
-from scopemap.report.submap_summaries import SubmapSummary, most_doubtful, submaps_in_time
+from scopemap.report.sheet import SOFT, Sheet, rgb_of
+from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.report.verdict import Result, Verdict, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
 _COLUMNS = 4
 _MOST_REASONS = 2
 _TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}
-_INK, _SOFT, _GROUND = "#17202b", "#566373", "#ffffff"
 _UNKNOWN = 32
 
 
@@ -43,32 +43,30 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
     folder = run if isinstance(run, RunFolder) else None
     frames = [] if folder is None else _spread(folder)
     seen = [] if folder is None else [_frames_row(folder, frames), _depth_row(folder, frames)]
-    rows = [*seen, _mesh_row(run, meshes[0]), *_piece_rows(run, meshes)]
+    rows = [*seen, _mesh_row(run, meshes[0]), *_submap_rows(run, meshes)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
-    sheet = Image.new("RGB", (width, _HEAD_PX + sum(heights) + _GAP_PX), _GROUND)
-    draw = ImageDraw.Draw(sheet)
-    _write_head(draw, verdict(run), width)
+    sheet = Sheet(width, _HEAD_PX + sum(heights) + _GAP_PX)
+    _write_head(sheet, verdict(run))
     top = _HEAD_PX
     for row, height in zip(rows, heights, strict=True):
         for place, (title, picture) in enumerate(row.items()):
             left = _GAP_PX + place * (_CELL_PX + _GAP_PX)
-            draw.text((left, top + 4), title, _INK, ImageFont.load_default(15))
-            sheet.paste(Image.fromarray(picture), (left, top + _LABEL_PX))
+            sheet.text((left, top + 4), title, 15)
+            rows_px = slice(top + _LABEL_PX, top + _LABEL_PX + picture.shape[0])
+            sheet.rgb[rows_px, left : left + _CELL_PX] = picture
         top += height
-    return sheet
+    return Image.fromarray(sheet.rgb)
 
 
-def _write_head(draw: ImageDraw.ImageDraw, found: Verdict, width_px: int) -> None:
-    draw.rectangle((0, 0, width_px, 8), fill=_TONES[found.level])
-    draw.text((_GAP_PX, 18), found.word.capitalize(), _TONES[found.level], ImageFont.load_default(38))
-    draw.text((_GAP_PX, 66), "research software, not a medical device", _SOFT, ImageFont.load_default(14))
-    left = 330
-    draw.text((left, 16), found.advice, _INK, ImageFont.load_default(19))
-    lines = [found.sentence, *(f"- {reason.text}" for reason in found.reasons[:_MOST_REASONS])]
-    for place, line in enumerate(lines):
-        draw.text((left, 42 + 18 * place), line, _SOFT, ImageFont.load_default(14))
+def _write_head(sheet: Sheet, found: Verdict) -> None:
+    sheet.rgb[:9] = rgb_of(_TONES[found.level])
+    sheet.text((_GAP_PX, 18), found.word.capitalize(), 38, _TONES[found.level])
+    sheet.text((_GAP_PX, 66), "research software, not a medical device", 14, SOFT)
+    sheet.text((330, 16), found.advice, 19)
+    for place, line in enumerate([found.sentence, *(f"- {reason.text}" for reason in found.reasons[:_MOST_REASONS])]):
+        sheet.text((330, 42 + 18 * place), line, 14, SOFT)
 
 
 def _spread(run: RunFolder) -> list[int]:
@@ -109,37 +107,36 @@ def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     outside, other = outside_views(mesh, poses[0], path).values()
     views = {"surface and camera path": outside, "from the other side": other}
     views["from behind the start"] = view_from_behind(poses[0], path)
-    pictures = {}
-    for title, view in views.items():
-        picture = mesh_picture(mesh if view is other else _opened(mesh, view), view, smooth=False)
-        draw_path(picture, view, path, ESTIMATE_COLOUR, thickness_px=2)
-        pictures[title] = _fitted(cropped(picture))
+    pictures = {
+        title: _with_path(mesh if view is other else _opened(mesh, view), view, path) for title, view in views.items()
+    }
     middle = inside_view(poses[len(poses) // 2])
     inside = mesh_picture(_opened(mesh, middle), middle, smooth=False)
     return pictures | {"from the middle of the path": _fitted(inside)}
 
 
-def _piece_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
+def _with_path(mesh: trimesh.Trimesh, view: MeshView, path_mm: np.ndarray) -> np.ndarray:
+    picture = mesh_picture(mesh, view, smooth=False)
+    draw_path(picture, view, path_mm, ESTIMATE_COLOUR)
+    return _fitted(cropped(picture))
+
+
+def _submap_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
     """Return the submaps of a run that has several, in order of time, in rows: each from outside with its path."""
     submaps = submaps_in_time(run.frames)
     if len(submaps) < 2:
         return []
     worst, shown = most_doubtful(submaps), {}
     for submap in submaps:
-        if submap.number < len(meshes) and len(meshes[submap.number].faces):
+        if submap.number < len(meshes) and len((mesh := meshes[submap.number]).faces):
             frames = run.submaps[submap.number].frames
             poses = frames["T_world_camera"][frames.tracked]
-            view = outside_views(meshes[submap.number], poses[0], poses[:, :3, 3])["from outside"]
-            picture = mesh_picture(_opened(meshes[submap.number], view), view, smooth=False)
-            draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR, thickness_px=2)
-            shown[_submap_title(submap, is_worst=submap is worst)] = _fitted(cropped(picture))
+            view = outside_views(mesh, poses[0], poses[:, :3, 3])["from outside"]
+            title = f"{submap.name}: frames {submap.first} to {submap.last}"
+            title = ", ".join(filter(None, (title, submap.inliers, "most doubtful" * (submap is worst))))
+            shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3])
     titles = list(shown)
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
-
-
-def _submap_title(submap: SubmapSummary, *, is_worst: bool) -> str:
-    facts = [f"{submap.name}: frames {submap.first} to {submap.last}", submap.inliers, "most doubtful" * is_worst]
-    return ", ".join(filter(None, facts))
 
 
 def _opened(mesh: trimesh.Trimesh, view: MeshView) -> trimesh.Trimesh:

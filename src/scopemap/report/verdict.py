@@ -170,24 +170,16 @@ def _of_notices(run: Result) -> list[Reason]:
     codes = {notice.code for notice in notices_of(run.provenance)}
     if "camera-at-rest-stated" in codes:
         found = [notice for notice in found if notice.code != "camera-at-rest"]
-    more = {"tissue-moves": _moving_words(codes)}
-    return [Reason(notice.code, notice.level, notice.plain + more.get(notice.code, "")) for notice in found]
-
-
-def _moving_words(codes: set[str]) -> str:
-    """Return what moving tissue means for the surface and the path."""
     shown = "as seen at one moment" if "fusion-at-one-moment" in codes else "a mean"
     whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
-    return f" There the surface is {shown}.{whole}"
+    more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
+    return [Reason(notice.code, notice.level, notice.plain + more.get(notice.code, "")) for notice in found]
 
 
 def _of_end(run: Result) -> list[Reason]:
     last = run.provenance.get("interrupted_at_frame")
-    return (
-        []
-        if last is None
-        else [Reason("interrupted", "doubtful", f"The run was stopped at frame {last}: the rest is missing.")]
-    )
+    text = f"The run was stopped at frame {last}: the rest is missing."
+    return [] if last is None else [Reason("interrupted", "doubtful", text)]
 
 
 def _level(value: float, good: float, bad: float) -> Level:

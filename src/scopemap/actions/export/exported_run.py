@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.actions.pictures import frames_again
+from scopemap.actions.inputs import frames_again
 from scopemap.errors import InputError, reporting
 from scopemap.frame import Frame
 from scopemap.geometry.rendering import vertex_colours

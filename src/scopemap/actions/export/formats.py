@@ -13,9 +13,9 @@ from scopemap.actions.export.image_layouts import write_colmap, write_endogslam,
 from scopemap.actions.export.mcap_bag import write_mcap
 from scopemap.actions.export.points import write_gaussians, write_points
 from scopemap.actions.export.surfaces import Axes, write_glb, write_slicer, write_surface
-from scopemap.actions.export.trajectories import write_euroc_file, write_kitti_folder, write_tum_file
+from scopemap.actions.export.trajectories import write_euroc_file, write_kitti_folder
 from scopemap.errors import InputError, SettingsError
-from scopemap.trajectory.trajectory import Unit
+from scopemap.trajectory.trajectory import Unit, write_tum
 
 Write = Callable[[ExportedRun, Path, Unit, Axes], None]
 
@@ -39,7 +39,11 @@ FORMATS: dict[str, ExportFormat] = {
     "colmap": ExportFormat(lambda run, out, unit, axes: write_colmap(run, out, unit), ("mm", "m")),
     "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",)),
     "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",)),
-    "tum": ExportFormat(lambda run, out, unit, axes: write_tum_file(run, out, unit), ("m", "mm"), ending=".txt"),
+    "tum": ExportFormat(
+        lambda run, out, unit, axes: write_tum(out, run.trajectory, unit=unit, comment=run.scale),
+        ("m", "mm"),
+        ending=".txt",
+    ),
     "kitti": ExportFormat(lambda run, out, unit, axes: write_kitti_folder(run, out, unit), ("m", "mm")),
     "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv"),
     "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),

@@ -1,6 +1,6 @@
-"""Camera paths as TUM, KITTI and EuRoC write them; evo reads all three.
+"""Camera paths as KITTI and EuRoC write them; evo reads both.
 
-Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/datasets/kitti/eval_odometry.php; Burri et
+Sources: cvlibs.net/datasets/kitti/eval_odometry.php; Burri et
 al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
@@ -12,14 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scopemap.actions.export.exported_run import ExportedRun
-from scopemap.trajectory.trajectory import MM_PER_UNIT, Unit, write_kitti, write_tum
+from scopemap.trajectory.trajectory import MM_PER_UNIT, Unit, write_kitti
 
 _NS_PER_S = 1e9
-
-
-def write_tum_file(run: ExportedRun, file: Path, unit: Unit) -> None:
-    """Write a TUM file of the tracked frames; its header states convention, unit and scale."""
-    write_tum(file, run.trajectory, unit=unit, comment=run.scale)
 
 
 def write_kitti_folder(run: ExportedRun, folder: Path, unit: Unit) -> None:
