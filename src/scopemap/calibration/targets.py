@@ -1,7 +1,4 @@
-"""Calibration targets, a checkerboard or a ChArUco board: found in images and videos, and views of them selected.
-
-OpenCV's detectors find them. Views are measured for sharpness, and selected so that they differ.
-"""
+"""Calibration targets, a checkerboard or a ChArUco board: found by OpenCV, and sharp views that differ selected."""
 
 from __future__ import annotations
 
@@ -47,10 +44,7 @@ class Corners:
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the image.
-
-    Raises `SettingsError` for a board that cannot be.
-    """
+    """A checkerboard of `columns` x `rows` inner corners, all in the image; `SettingsError` for one that cannot be."""
 
     columns: int
     rows: int
@@ -252,11 +246,7 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
 def select_views(
     views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS
 ) -> tuple[list[BoardView], list[LeftOut]]:
-    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, and those that are blurred.
-
-    The next view is the one with most new cells of the image under its corners and the greatest distance, in position,
-    size and tilt, from those that were taken.
-    """
+    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, and the blurred ones."""
     edge_px = np.array([view.edge_px for view in views])
     usual = float(np.percentile(edge_px, 25))
     limit = max(_BLURRED * usual, usual + _BLURRED_PX)

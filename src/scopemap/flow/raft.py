@@ -113,10 +113,7 @@ class RaftFlow(FlowEstimator):
 
 
 def torchvision_names(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return RAFT's parameters under torchvision's names; those that have them already are left as they are.
-
-    The authors' checkpoints name some norms twice; raises `WeightsError` if the two differ.
-    """
+    """Return RAFT's parameters under torchvision's names; `WeightsError` if two norms of the authors' differ."""
     import torch
 
     renamed: dict[str, torch.Tensor] = {}
