@@ -243,10 +243,8 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(np.median(widths[v, u]))
 
 
-def select_views(
-    views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS
-) -> tuple[list[BoardView], list[LeftOut]]:
-    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, and the blurred ones."""
+def select_views(views: list[BoardView], size: tuple[int, int]) -> tuple[list[BoardView], list[LeftOut]]:
+    """Return at most 40 sharp `views` of frames of `size` (width, height) that differ, and the blurred ones."""
     edge_px = np.array([view.edge_px for view in views])
     usual = float(np.percentile(edge_px, 25))
     limit = max(_BLURRED * usual, usual + _BLURRED_PX)
@@ -257,7 +255,7 @@ def select_views(
     cells = np.array([_cells(view, size) for view in sharp])
     covered, distance = np.zeros(cells.shape[1], dtype=bool), np.full(len(sharp), _FARTHEST)
     chosen: list[int] = []
-    while len(chosen) < most:
+    while len(chosen) < _MOST_VIEWS:
         new = (cells & ~covered).sum(axis=1)
         worth = (distance + new / cells.shape[1]) * edge_px.min() / edge_px
         worth[(distance < _SAME) & (new < _NEW_CELLS)] = -1.0

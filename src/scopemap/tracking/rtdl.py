@@ -112,15 +112,11 @@ def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
     return Loss(sigma, settings.constants.huber, np.array(share), _LIT, settings.constants.lamp_gamma)
 
 
-def _residuals(reference: View, current: View, motion: Motion, settings: TrackingSettings) -> np.ndarray:
-    loss = _loss(np.ones(len(reference.channels)), settings)
-    return residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
-
-
 def _align_level(
     reference: View, current: View, motion: Motion, settings: TrackingSettings, rotation_only: bool, unit_mm: float
 ) -> tuple[Motion, int]:
-    start = _residuals(reference, current, motion, settings)
+    loss = _loss(np.ones(len(reference.channels)), settings)
+    start = residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
     loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _MIN_SIGMA) for r in start]), settings)
     if settings.constants.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
