@@ -126,10 +126,7 @@ class Truth:
 
 
 class Rows:
-    """Rows of one type, put in one after the other, packed: objects would take ten times as much memory.
-
-    kind : numpy's type of a row.
-    """
+    """Rows of one numpy type, put in one after the other, packed: objects would take ten times as much memory."""
 
     def __init__(self, kind: np.dtype) -> None:
         self._kind, self._count = kind, 0

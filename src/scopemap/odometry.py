@@ -1,7 +1,4 @@
-"""Poses frame by frame: tracking against the keyframe (RTDL), depth refined with the motion known (MAPIS), keyframes.
-
-The preset `paper` refines before it tracks.
-"""
+"""Poses by frame: tracking against the keyframe (RTDL), depth refined with the motion known (MAPIS), keyframes."""
 
 from __future__ import annotations
 
@@ -24,10 +21,7 @@ from scopemap.trajectory.causes import LossCause
 
 @dataclass(frozen=True)
 class Step:
-    """All results for a frame; `frame` has refined depth and, unless it is lost, its pose as tracked.
-
-    raw_mm : of the frame's size. refined : of the size of the depth estimate.
-    """
+    """All results for a frame: refined depth (at the size of `raw_mm`'s estimate) and, unless lost, pose as tracked."""
 
     frame: Frame
     track: Track

@@ -1,8 +1,4 @@
-"""Camera calibration with a target: views selected, outliers left out, a camera fitted, judged and written.
-
-The fits are OpenCV's, pinhole (Zhang 2000) and fisheye. The model and its number of coefficients are chosen by the
-error in views that were held out.
-"""
+"""Camera calibration with a target, pinhole (Zhang 2000) or fisheye, by OpenCV's fits and errors in held-out views."""
 
 from __future__ import annotations
 
@@ -66,9 +62,8 @@ FORMS = (
 class Fit:
     """A camera, and the poses of the target in its views.
 
-    form : the free coefficients. T_camera_board : (V, 4, 4), mm, of the V views, in their order.
-    residuals_px : V arrays (N, 2), corner seen minus corner projected; NaN beyond the field of the lens.
-    deviations : standard deviations of fx, fy, cx, cy (px) and the free coefficients; empty before `with_deviations`.
+    form : the free coefficients. T_camera_board : (V, 4, 4), mm. residuals_px : V arrays (N, 2), seen minus projected,
+    NaN beyond the lens' field. deviations : standard deviations of fx, fy, cx, cy (px) and `form`; or empty.
     """
 
     form: LensForm
@@ -97,10 +92,7 @@ class Fit:
 
 
 def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel | None = None) -> Fit:
-    """Return the camera of `form` for frames of `size` (width, height) with the smallest reprojection error.
-
-    `near` is a camera to start from, else several starts are tried. Raises `CalibrationError` where none converges.
-    """
+    """Return the camera of `form` with the smallest reprojection error, from `near` or several starts."""
     w, h = size
     starts: list[PinholeCamera | None] = [near.central] if near is not None else []
     if near is None:
@@ -120,11 +112,7 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
 
 
 def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
-    """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to resampled views, 20 of them.
-
-    OpenCV's own follow from the noise of single corners, and are too small by a factor of 2.3 where the board bends;
-    for the fisheye it has none.
-    """
+    """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to resampled views, 20 of them."""
     size, rng = (fit.camera.width, fit.camera.height), np.random.default_rng(0)
     drawn = [[views[i] for i in rng.integers(0, len(views), len(views))] for _ in range(_RESAMPLES)]
     fits = [_attempt(some, size, fit.form, fit.camera.central) for some in drawn]
@@ -134,10 +122,7 @@ def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
 
 
 def choose_form(errors_px: dict[LensForm, float]) -> LensForm:
-    """Return the simplest form that predicts about as well as the best, given errors in held-out views, px, by form.
-
-    Raises `CalibrationError` where no form predicts anything.
-    """
+    """Return the simplest form that predicts about as well as the best, by held-out errors, px; `CalibrationError`."""
     best: LensForm | None = None
     for form, error_px in errors_px.items():
         if np.isfinite(error_px) and (best is None or error_px < (1 - _WORTH_IT) * errors_px[best]):
@@ -151,10 +136,7 @@ def choose_form(errors_px: dict[LensForm, float]) -> LensForm:
 
 
 def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
-    """Return the RMS reprojection error, px, in views that the form was not fitted to (5 folds); inf: a fit failed.
-
-    In these only the pose of the target is fitted. `near` is a camera of the same model to start from.
-    """
+    """Return the RMS reprojection error, px, in views that the form was not fitted to (5 folds); inf: a fit failed."""
     try:
         fit = fit_camera(views, size, form, near)
         residuals = []
@@ -171,11 +153,7 @@ def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensF
 def without_outliers(
     views: list[BoardView], size: tuple[int, int], form: LensForm
 ) -> tuple[list[BoardView], list[LeftOut]]:
-    """Return the views that agree on a camera of `form`, without stray corners, and those that do not: a third at most.
-
-    As long as half of the corners of a view or more are far from their projections, the worst view is left out and the
-    others are fitted again.
-    """
+    """Return the views that agree on a camera of `form`, without stray corners, and the others: a third at most."""
     kept, out = list(views), list[LeftOut]()
     while True:
         fit = fit_camera(kept, size, form)
@@ -222,10 +200,7 @@ def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, star
 
 
 def _resected(camera: CameraModel, corners: Corners, T_camera_board: np.ndarray) -> np.ndarray:
-    """Return corners seen minus projected (N, 2), px, for the pose of the target refined from the given one.
-
-    NaN beyond the field of the lens.
-    """
+    """Return corners seen minus projected (N, 2), px, for the refined pose; NaN beyond the lens' field."""
     rays = camera.unproject(corners.pixels)
     seen = np.isfinite(rays).all(axis=1)
     rotation, translation = cv2.Rodrigues(T_camera_board[:3, :3])[0], T_camera_board[:3, 3].copy()

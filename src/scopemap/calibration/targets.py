@@ -1,7 +1,4 @@
-"""Calibration targets, a checkerboard or a ChArUco board: found in images and videos, and views of them selected.
-
-OpenCV's detectors find them. Views are measured for sharpness, and selected so that they differ.
-"""
+"""Calibration targets, a checkerboard or a ChArUco board: found by OpenCV, and sharp views that differ selected."""
 
 from __future__ import annotations
 
@@ -47,10 +44,7 @@ class Corners:
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """A checkerboard of `columns` x `rows` inner corners, where four squares meet; all have to be in the image.
-
-    Raises `SettingsError` for a board that cannot be.
-    """
+    """A checkerboard of `columns` x `rows` inner corners, all in the image; `SettingsError` for one that cannot be."""
 
     columns: int
     rows: int
@@ -249,14 +243,8 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(np.median(widths[v, u]))
 
 
-def select_views(
-    views: list[BoardView], size: tuple[int, int], most: int = _MOST_VIEWS
-) -> tuple[list[BoardView], list[LeftOut]]:
-    """Return at most `most` sharp `views` of frames of `size` (width, height) that differ, and those that are blurred.
-
-    The next view is the one with most new cells of the image under its corners and the greatest distance, in position,
-    size and tilt, from those that were taken.
-    """
+def select_views(views: list[BoardView], size: tuple[int, int]) -> tuple[list[BoardView], list[LeftOut]]:
+    """Return at most 40 sharp `views` of frames of `size` (width, height) that differ, and the blurred ones."""
     edge_px = np.array([view.edge_px for view in views])
     usual = float(np.percentile(edge_px, 25))
     limit = max(_BLURRED * usual, usual + _BLURRED_PX)
@@ -267,7 +255,7 @@ def select_views(
     cells = np.array([_cells(view, size) for view in sharp])
     covered, distance = np.zeros(cells.shape[1], dtype=bool), np.full(len(sharp), _FARTHEST)
     chosen: list[int] = []
-    while len(chosen) < most:
+    while len(chosen) < _MOST_VIEWS:
         new = (cells & ~covered).sum(axis=1)
         worth = (distance + new / cells.shape[1]) * edge_px.min() / edge_px
         worth[(distance < _SAME) & (new < _NEW_CELLS)] = -1.0

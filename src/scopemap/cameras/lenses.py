@@ -83,10 +83,7 @@ class _RadialLens(CameraModel, ABC):
 
 @dataclass(frozen=True)
 class OpenCvCamera(_RadialLens):
-    """OpenCV's radial-tangential lens, `cv2.projectPoints` (Brown 1966).
-
-    distortion : k1 k2 p1 p2 [k3 [k4 k5 k6]] in OpenCV's order.
-    """
+    """OpenCV's radial-tangential lens, `cv2.projectPoints` (Brown 1966): k1 k2 p1 p2 [k3 [k4 k5 k6]]."""
 
     distortion: tuple[float, ...]
 
@@ -120,12 +117,7 @@ class OpenCvCamera(_RadialLens):
 
 @dataclass(frozen=True)
 class FisheyeCamera(_RadialLens):
-    """Kannala-Brandt fisheye lens, `cv2.fisheye` (IEEE PAMI 28(8), 2006, eq. 6 without its odd terms).
-
-    The angle t from the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
-
-    distortion : k1 k2 k3 k4.
-    """
+    """Kannala-Brandt fisheye (IEEE PAMI 28(8), 2006, eq. 6): the angle t becomes t (1 + k1 t^2 + ... + k4 t^8)."""
 
     distortion: tuple[float, ...]
 

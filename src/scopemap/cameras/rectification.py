@@ -16,19 +16,13 @@ _BLUR_PER_SHRINK = 0.4
 
 
 def working_size(width: int, height: int, longest_side_px: int = LONGEST_SIDE_PX) -> tuple[int, int]:
-    """Return (width, height) divided, rounding down, by the smallest whole number that brings both to the longest side.
-
-    longest_side_px : 0 means no limit; the size stays.
-    """
+    """Return (width, height) divided, rounded down, by the least whole number that brings both to the longest side."""
     divisor = -(-max(width, height) // longest_side_px) if longest_side_px else 1
     return width // divisor, height // divisor
 
 
 def working_camera(source: CameraModel, size: tuple[int, int], zoom: float = 1.0) -> PinholeCamera:
-    """Return the pinhole camera of `size` (width, height) that sees what `source` sees around its principal point.
-
-    The focal length is the source's at its centre, scaled, times `zoom` (smaller: wider view).
-    """
+    """Return the pinhole of `size` (width, height) around the principal point of `source`, scaled, times `zoom`."""
     camera = source.central.resized(*size)
     return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 

@@ -1,8 +1,4 @@
-"""The metric anchor: converts a depth estimate of any kind to millimetres, fitted on the first frame and then fixed.
-
-METHOD section MAPIS-Depth, steps 1-4. Only the scale (and the shift of a disparity) is fitted, once. A scale that
-changes from frame to frame is estimated by the consistency stage (mapis.py), which has the camera motion.
-"""
+"""The metric anchor: converts a depth estimate of any kind to mm, fitted once, on the first frame (MAPIS steps 1-4)."""
 
 from __future__ import annotations
 
@@ -45,10 +41,7 @@ class DepthScale:
 
 @dataclass(frozen=True)
 class MetricDepth:
-    """Depth of one frame, (H, W) float32, mm, NaN = unknown, and its standard deviation or None (not estimated).
-
-    limit_note : says where most of the depth is unknown because it is beyond the limit; else "".
-    """
+    """Depth of one frame, (H, W) float32, mm, NaN = unknown, its deviation or None, and why most is unknown."""
 
     depth_mm: np.ndarray
     sigma_mm: np.ndarray | None
@@ -58,21 +51,14 @@ class MetricDepth:
 class AnchoredDepth:
     """Converts the estimates of one sequence to raw metric depth.
 
-    The first frame with enough usable pixels determines the conversion for all frames. `settings.anchor` chooses the
-    target of the fit: a given range (`near-far`), a metric network's estimate of that frame (`depth-pro`), the shading
-    prior (`shading`), an arbitrary number (`factor`), or (`auto`) the range if given, else the estimate's own
-    millimetres, else shading. Measured depth is not changed.
+    `settings.anchor` chooses the target of the fit to the first frame with enough usable pixels: a range (`near-far`),
+    `depth-pro`, the `shading` prior, an arbitrary `factor`, or (`auto`) the range if given, else the estimate's own
+    millimetres, else shading. `settings.constants.reanchor_every` repeats the fit. Measured depth is not changed.
+    Raises `SettingsError` where `near-far` has no valid range.
 
-    `settings.constants.reanchor_every` repeats the fit to the reference, which bounds drift.
-
-    Raises `SettingsError` where `near-far` is chosen without a valid range.
-
-    Attributes
-    ----------
-    reference : metric estimator for anchors other than the range and the estimate itself.
-    conversion : of the sequence; None until it is fitted. description : the source of the scale, for people.
-    is_measured : whether depth is measured, and so needs no anchor. scale_is_known : whether it is, or is anchored to a
-    stated range or by Depth Pro; the millimetres of other networks, the shading prior and a factor are a guess.
+    reference : metric estimator for anchors other than the range and the estimate itself. conversion : of the sequence;
+    None until it is fitted. description : the source of the scale. is_measured : whether depth needs no anchor.
+    scale_is_known : whether it is measured, or anchored to a range or by Depth Pro.
     """
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
@@ -228,10 +214,7 @@ def max_depth_mm(settings: DepthSettings) -> float:
 
 
 def depth_downscale(settings: DepthSettings, longest_px: int) -> int:
-    """Return what the working size is divided by for the estimation of depth: for scopenet, by its training size.
-
-    longest_px : longest side of the working images.
-    """
+    """Return what the working size, px, is divided by to estimate depth: for scopenet, by its training size."""
     return max(longest_px // _SCOPENET_PX, 1) if settings.backend == "scopenet" else 1
 
 

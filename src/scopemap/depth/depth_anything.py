@@ -16,10 +16,7 @@ class DepthAnything(PretrainedNetwork):
 
     @classmethod
     def from_folder_or_hub(cls, model: str = "", device: str = "auto") -> DepthAnything:
-        """Return the estimator with the weights `model`: a local folder, a pulled hub id, or "" = the pinned Small.
-
-        Never downloads. Raises `WeightsError` with the name to pull.
-        """
+        """Return the estimator with weights `model` (folder, pulled hub id, "": pinned Small), or `WeightsError`."""
         network, processor, origin = load_pretrained("DepthAnythingForDepthEstimation", model, cls.name)
         return cls(network, processor, device=device, origin=origin)
 

@@ -18,11 +18,9 @@ if TYPE_CHECKING:
 
 
 class DepthPro(PretrainedNetwork):
-    """A Depth Pro network behind the `DepthEstimator` contract.
+    """A Depth Pro network: depth is f / (W c), c canonical inverse depth, f and W in px (paper, section 3.2).
 
-    The network gives canonical inverse depth c and a field of view; depth is f / (W c) with the focal length f and the
-    width W in px (paper, section 3.2). `use_known_focal` takes f from the frame's camera instead of the network: set
-    False where the camera is itself a guess.
+    `use_known_focal` takes f from the frame's camera, False from the network.
     """
 
     name = "depth-pro"
@@ -48,10 +46,7 @@ class DepthPro(PretrainedNetwork):
 
     @classmethod
     def from_folder_or_hub(cls, model: str = "", device: str = "auto", *, use_known_focal: bool = True) -> DepthPro:
-        """Return the estimator with the weights `model`: a local folder, a pulled hub id, or "" = Apple's own.
-
-        Never downloads. Raises `WeightsError` with the name to pull.
-        """
+        """Return the estimator with weights `model` (folder, pulled hub id, "": Apple's own), or `WeightsError`."""
         network, processor, origin = load_pretrained("DepthProForDepthEstimation", model, cls.name)
         return cls(network, processor, device=device, use_known_focal=use_known_focal, origin=origin)
 

@@ -1,8 +1,4 @@
-"""Edge-aware smoothing and filling of images with holes, from box filters alone.
-
-Guided filter: He, Sun and Tang, "Guided image filtering", ECCV 2010, eq. 5-8. Holes: normalised convolution, Knutsson
-and Westin, CVPR 1993.
-"""
+"""Edge-aware smoothing (He, Sun, Tang, ECCV 2010) and hole filling (Knutsson, Westin, CVPR 1993) by box filters."""
 
 from __future__ import annotations
 
@@ -37,10 +33,7 @@ def guided_filter(image: np.ndarray, known: np.ndarray, radius_px: int, edge: fl
 
 
 def filled(image: np.ndarray, known: np.ndarray, max_distance_px: int) -> np.ndarray:
-    """Fill pixels of an image (H, W) that are not `known` from the nearest known ones, window by growing window.
-
-    max_distance_px : pixels farther than this (along rows or columns) from every known one stay NaN.
-    """
+    """Fill pixels (H, W) not `known` from the nearest known ones; NaN where these are beyond `max_distance_px`."""
     result = np.where(known, image, np.nan).astype(np.float32)
     radius_px = 1
     while radius_px < 2 * max_distance_px and np.isnan(result).any():

@@ -1,11 +1,8 @@
-"""MAPIS: depth that keeps its scale from frame to frame.
+"""MAPIS: depth that keeps its scale from frame to frame (METHOD section MAPIS-Depth, steps 5-8).
 
-METHOD section MAPIS-Depth, steps 5-8. The previous depth is warped into the current frame along the flow, filtered, and
-blended with the current estimate by a weight from their perceptual distance. The paper's text trusts the warped depth
-where the images are alike, its equation does the reverse; `blend = "paper-equation"` is the latter, taken literally.
-
-Where the estimator gives a standard deviation, the odds of that weight are multiplied by the ratio of inverse
-variances: a pixel with glare keeps its earlier depth. The standard deviation is propagated relative to depth.
+The previous depth is warped along the flow, filtered, and blended with the current estimate by a weight from their
+perceptual distance, by the paper's text; `blend = "paper-equation"` does the reverse. The weight's odds are multiplied
+by the ratio of inverse variances, where known.
 """
 
 from __future__ import annotations
@@ -50,10 +47,7 @@ class DenseMatcher:
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
     def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
-        """Return the correspondence of an image (H, W, 3) uint8 with valid pixels (H, W) to the previous one.
-
-        None for the first image and where it is not `wanted`.
-        """
+        """Return the correspondence of an image (H, W, 3) uint8 to the previous one; None without or not `wanted`."""
         previous, self._previous = self._previous, (rgb, valid)
         if previous is None or not wanted:
             return None
@@ -157,10 +151,7 @@ class Mapis:
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
     def _pulled_back(self, scale: float, matched_share: float) -> float:
-        """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame.
-
-        Errors of chained scales accumulate, and fast motion biases them: depth would grow or shrink without limit.
-        """
+        """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame."""
         return float(scale ** (1 - self.settings.constants.scale_pull * max(1 - matched_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
@@ -202,10 +193,7 @@ class Mapis:
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:
-    """Return the median ratio of warped to raw depth, or `otherwise` where they overlap too little.
-
-    Only a scale is fitted: chaining a shift from frame to frame diverges.
-    """
+    """Return the median ratio of warped to raw depth, or `otherwise` where they overlap too little."""
     both = np.isfinite(raw_mm) & np.isfinite(warped_mm) & (raw_mm > 0)
     if both.mean() < _MIN_OVERLAP:
         return otherwise

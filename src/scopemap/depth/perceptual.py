@@ -1,7 +1,4 @@
-"""Perceptual distance between two images: LPIPS with AlexNet, or structural similarity, which needs no weights.
-
-LPIPS: Zhang et al., CVPR 2018; heads from the `lpips` package, backbone from the weights registry.
-"""
+"""Perceptual distance between two images: LPIPS with AlexNet (Zhang et al., CVPR 2018), or structural similarity."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ _SLICE_OF_LAYER = {"0": "slice1", "3": "slice2", "6": "slice3", "8": "slice4", "
 
 
 def create_perceptual(name: str, device: str = "auto") -> PerceptualDistance:
-    """Return the distance "lpips" or "structure".
-
-    Raises `SettingsError` for an unknown name or without lpips' packages, `WeightsError` where lpips lacks its weights.
-    """
+    """Return the distance "lpips" or "structure"; raises `SettingsError`, and `WeightsError` for missing weights."""
     match name:
         case "lpips":
             return LpipsAlex(device=device)
@@ -57,11 +51,7 @@ class StructureDistance:
 
 
 class LpipsAlex:
-    """LPIPS(AlexNet), version 0.1, per pixel.
-
-    `checkpoint` is a file with torchvision's names of AlexNet's parameters (default: the first of `CHECKPOINTS` that is
-    there). Raises `WeightsError` if there is none or if it does not fit.
-    """
+    """LPIPS(AlexNet), version 0.1, per pixel; `checkpoint` is a file with torchvision's names, or `WeightsError`."""
 
     name = "lpips"
 
@@ -86,10 +76,7 @@ class LpipsAlex:
         self._network = network.to(self._device).eval()
 
     def compare(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> PerceptualResult:
-        """Compare two (H, W, 3) uint8 images of one size, 32 px or more on each side.
-
-        The score is the map's mean; it equals the package's own score but for the enlargement of the layers' maps.
-        """
+        """Compare two (H, W, 3) uint8 images of one size, 32 px or more on each side; the score is the map's mean."""
         import torch
 
         check_shape("rgb_a", rgb_a, (None, None, 3))

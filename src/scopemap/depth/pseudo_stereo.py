@@ -1,7 +1,4 @@
-"""From relative disparity to metric depth: the paper's pseudo-stereo baseline and a robust affine fit.
-
-Paper: arXiv 2508.11282, section MAPIS-Depth. A disparity is unitless, larger is nearer, known up to scale and shift.
-"""
+"""From relative disparity to metric depth: pseudo-stereo baseline and robust affine fit (arXiv 2508.11282)."""
 
 from __future__ import annotations
 

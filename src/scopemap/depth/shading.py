@@ -1,9 +1,4 @@
-"""Depth from near-field shading: an estimator that needs no weights.
-
-In endoscopy the lamp is at the camera and is the only light, so brightness falls with the square of the distance along
-the ray; the power 1/2 of that law is exact for a surface that always faces the camera. Real tissue faces away from the
-lamp down a lumen, and light bounces between its walls: the exponent is chosen on real frames.
-"""
+"""Depth from near-field shading, without weights: brightness falls with a power of the distance along the ray."""
 
 from __future__ import annotations
 
@@ -72,10 +67,7 @@ class ShadingDepth:
 
 
 def relative_distance(frame: Frame, unit_z: np.ndarray, exponent: float) -> np.ndarray:
-    """Return the distance along the ray up to one factor for the image, (H, W) float32, NaN = unknown.
-
-    unit_z : (H, W) z-component of the unit ray of each pixel, 0..1.
-    """
+    """Return the distance along the ray up to a factor, (H, W) float32, NaN = unknown; unit_z : (H, W) of unit rays."""
     width = frame.camera.width
     brightness = linear_brightness(frame.rgb) / unit_z**_LAMP_COSINE_POWER
     log_brightness = np.log(np.maximum(brightness, _DARKEST)).astype(np.float32)
@@ -92,10 +84,7 @@ def linear_brightness(rgb: np.ndarray) -> np.ndarray:
 
 
 def _glare(rgb: np.ndarray, log_brightness: np.ndarray, width_px: int) -> np.ndarray:
-    """Return where light comes from a mirror-like reflection or from beyond the sensor's range, (H, W) bool.
-
-    A reflection is white, and narrower than `width_px`: the lit side of a fold is bright too, but wide.
-    """
+    """Return where light comes from a reflection narrower than `width_px` or beyond the sensor's range, (H, W) bool."""
     calm = cv2.blur(log_brightness, (3, 3))
     wide = cv2.morphologyEx(calm, cv2.MORPH_OPEN, np.ones((width_px, width_px), np.uint8))
     white = rgb.min(-1) > _HIGHLIGHT_WHITENESS * rgb.max(-1)

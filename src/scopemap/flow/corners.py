@@ -1,9 +1,4 @@
-"""Corners of a frame, matched in other frames by optical flow.
-
-Shading moves with the lamp and biases flow on tissue without texture; corners stay on the tissue. Flow is smooth over
-tens of pixels, so that its errors are alike at neighbouring corners; patches of locally normalised brightness, aligned
-one by one, show the tissue alone (Lucas and Kanade, IJCAI 1981, in the iterative form of Bouguet, 2001).
-"""
+"""Corners of a frame, matched by optical flow and aligned patches of local contrast (Lucas, Kanade; Bouguet 2001)."""
 
 from __future__ import annotations
 
@@ -69,11 +64,7 @@ class Correspondences2D3D:
 
 
 class KeyframeMatcher:
-    """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow.
-
-    The flow to a frame is searched from that to the frame before, in small images; patches of the whole ones are then
-    aligned. Where that matches few corners, flow between the whole images is used.
-    """
+    """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow."""
 
     def __init__(self, flow: FlowEstimator) -> None:
         self.flow = flow
@@ -87,11 +78,7 @@ class KeyframeMatcher:
     def set_keyframe(
         self, keyframe: Frame | None, frame: Frame | None = None, T_frame_keyframe: np.ndarray | None = None
     ) -> None:
-        """Detect the corners of a frame with depth, which replace those of the last keyframe; None: no keyframe.
-
-        frame, T_frame_keyframe : the frame that will be matched next and a first guess of its motion (4, 4), where one
-        is known: the flow is searched from there.
-        """
+        """Detect the corners of a frame, None: no keyframe; flow is searched from `T_frame_keyframe` (4, 4) first."""
         same, self._keyframe, self._flows = keyframe is self._keyframe, keyframe, None
         if keyframe is not None and frame is not None and T_frame_keyframe is not None:
             self._flows = _expected_flow(keyframe, T_frame_keyframe), _expected_flow(frame, inverse(T_frame_keyframe))

@@ -33,10 +33,7 @@ class FlowEstimator(Protocol):
         return self.estimate(rgb_a, rgb_b), self.estimate(rgb_b, rgb_a)
 
     def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
-        """Return the flow from one image to another, and one back that serves only to check it.
-
-        For images of successive frames, or with `start`, what this returned for a frame before.
-        """
+        """Return the flow from one image to another, and one back that serves only to check it."""
         return self.estimate_both(rgb_from, rgb_to)
 
     def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
@@ -110,10 +107,7 @@ class Flow:
 def pair_flow(
     estimator: FlowEstimator, rgb_previous: np.ndarray, rgb_current: np.ndarray, consistency_px: float
 ) -> Flow:
-    """Return the flow from a frame (H, W, 3) uint8 to the previous one, with its forward-backward consistency check.
-
-    consistency_px : largest forward-backward error.
-    """
+    """Return the flow from a frame (H, W, 3) uint8 to the previous one, checked both ways to `consistency_px`."""
     check_shape("rgb_previous", rgb_previous, (None, None, 3))
     check_shape("rgb_current", rgb_current, rgb_previous.shape)
     to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)

@@ -9,11 +9,7 @@ FLOWS = ("dis", "raft-small", "raft-large", "none")
 
 
 def create_flow(name: str, device: str = "auto") -> FlowEstimator:
-    """Return the estimator `name` (one of `FLOWS`); device matters to RAFT only.
-
-    Raises `SettingsError` for an unknown name, or RAFT without its packages, and `WeightsError` where RAFT's weights
-    are missing.
-    """
+    """Return the estimator `name` (one of `FLOWS`); raises `SettingsError`, `WeightsError` without RAFT's weights."""
     match name:
         case "raft-small":
             return RaftFlow("small", device=device)

@@ -113,26 +113,19 @@ class RaftFlow(FlowEstimator):
 
 
 def torchvision_names(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return RAFT's parameters under torchvision's names; those that have them already are left as they are.
-
-    The authors' checkpoints name some norms twice; raises `WeightsError` if the two differ.
-    """
+    """Return RAFT's parameters under torchvision's names; `WeightsError` if two norms of the authors' differ."""
     import torch
 
     renamed: dict[str, torch.Tensor] = {}
     authors = any(re.match(r"(module\.)?fnet\.", name) for name in state)
     for name, tensor in state.items():
-        new = _rename(name) if authors else name
+        new = name
+        for pattern, replacement in _RENAMES if authors else ():
+            new = re.sub(pattern, replacement, new)
         if new in renamed and not torch.equal(renamed[new], tensor):
             raise WeightsError(f"RAFT checkpoint: '{name}' and another name of '{new}' hold different values")
         renamed[new] = tensor
     return renamed
-
-
-def _rename(name: str) -> str:
-    for pattern, replacement in _RENAMES:
-        name = re.sub(pattern, replacement, name)
-    return name
 
 
 def _padded(side_px: int) -> int:

@@ -88,10 +88,7 @@ def compare_rendering(
 
 
 def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
-    """Return the number of frames, mean and least coverage, median depth error, mean SSIM and LPIPS.
-
-    A figure that no frame has is absent.
-    """
+    """Return the number of frames, mean and least coverage, median depth error, mean SSIM and LPIPS, where known."""
     rows = list(agreements)
     coverage, depth_error, ssim, lpips = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 4).T)
     figures: dict[str, float] = {"frames": len(rows)}

@@ -12,10 +12,9 @@ from scopemap.geometry.se3 import transform
 
 
 def depth_mesh(frame: Frame, step_px: int, min_incidence: float) -> trimesh.Trimesh:
-    """Return the surface of every n-th usable pixel of a frame with depth and a pose, world mm, in the video's colours.
+    """Return the surface of every `step_px`-th usable pixel of a frame, world mm, with its colours; it may be empty.
 
-    step_px : n. min_incidence : cosine of incidence below which neighbours are two surfaces, not a slanted one.
-    Normals point to the camera. The mesh may be empty.
+    min_incidence : cosine of incidence below which neighbours are two surfaces. Normals point to the camera.
     """
     assert frame.depth_mm is not None
     assert frame.T_world_camera is not None

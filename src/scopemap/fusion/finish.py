@@ -32,10 +32,7 @@ def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh
 
 
 def simplified(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
-    """Return the mesh with at most about so many faces (Garland and Heckbert, SIGGRAPH 1997).
-
-    Colours and vertex attributes, such as `confidence`, are those of the nearest vertex. Borders stay where they are.
-    """
+    """Return the mesh with at most about so many faces (Garland and Heckbert, SIGGRAPH 1997); borders stay."""
     if len(mesh.faces) <= most_faces:
         return mesh
     vertices, faces = fast_simplification.simplify(

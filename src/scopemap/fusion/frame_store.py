@@ -1,7 +1,4 @@
-"""The frame store: tracked frames on disk (about 5 bytes a pixel) until the last one, so that memory stays bounded.
-
-So is what else grows with a run and is needed at its end alone: rows in tables.
-"""
+"""The frame store: tracked frames (about 5 bytes a pixel) and rows in tables, on disk until the last frame."""
 
 from __future__ import annotations
 
@@ -183,10 +180,7 @@ class FrameStore:
             self._file = self.reopened("frames", self._end)
 
     def reopened(self, name: str, size: int) -> IO[bytes]:
-        """Open a file of the store that was restored, and cut it off after so many bytes.
-
-        Raises `InputError` where it has fewer.
-        """
+        """Open a restored file of the store, cut off after so many bytes; raises `InputError` where it has fewer."""
         file = self.opened(name, "r+b")
         if (found := file.seek(0, os.SEEK_END)) < size:
             file.close()

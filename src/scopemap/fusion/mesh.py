@@ -1,8 +1,4 @@
-"""The mesh: marching cubes on the distance field, chunk by chunk, welded, without floaters.
-
-A chunk is 64^3 cells, so it needs one sample more on each side, which it shares with its neighbour; a vertex is on a
-grid edge, and the edge's address welds the chunks exactly.
-"""
+"""The mesh: marching cubes on the distance field by chunks of 64^3 cells, welded by edge address, without floaters."""
 
 from __future__ import annotations
 
@@ -38,10 +34,7 @@ _MOST_TRIANGLES = len(_EDGES)  # of a cell
 
 
 class _Chunk(NamedTuple):
-    """Mesh of a chunk: vertices (V, 3) in voxels, edge addresses (V, 3), values (V, 4), faces (F, 3).
-
-    values : colour, 0..255, and confidence, 0..1.
-    """
+    """Mesh of a chunk: vertices (V, 3) in voxels, edges (V, 3), values (V, 4) colour, confidence 0..1, faces (F, 3)."""
 
     vertices: np.ndarray
     edges: np.ndarray

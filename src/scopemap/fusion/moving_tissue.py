@@ -33,10 +33,7 @@ def block_edge_mm(median_depth_mm: float | None) -> float:
 
 
 class MovingTissue:
-    """Counts in which frames blocks of space are seen, and in which their tissue moves, by `Frame.nonrigidity`.
-
-    edge_mm : of a block.
-    """
+    """Counts in which frames blocks of space, `edge_mm` wide, are seen, and in which their tissue moves."""
 
     def __init__(self, edge_mm: float) -> None:
         self._edge_mm = edge_mm
@@ -64,10 +61,7 @@ class MovingTissue:
             self._rows.append(counted)
 
     def shares(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return in which share of the frames that see them points (N, 3), world mm, move, (N,) float64.
-
-        Interpolated between the middles of blocks; 0 where nothing was measured.
-        """
+        """Return in which share of the frames that see them points (N, 3), world mm, move, (N,); 0: not measured."""
         rows = self._counted()
         if not len(rows):
             return np.zeros(len(points_mm))
@@ -166,10 +160,7 @@ class SeenAt:
         return _found(self._keys, keys.reshape(some_mm.shape))
 
     def _in_view(self, points_mm: np.ndarray, view: _View) -> np.ndarray:
-        """Return which points (N, 3) a frame sees, sees through, or has behind tissue that moves, (N,) bool.
-
-        What was behind that is the same tissue at another time.
-        """
+        """Return which points (N, 3) a frame sees, sees through, or has behind tissue that moves, (N,) bool."""
         in_camera = transform(inverse(view.T_world_camera), points_mm)
         height, width = view.depth_mm.shape
         with np.errstate(invalid="ignore", divide="ignore"):

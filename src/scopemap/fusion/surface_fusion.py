@@ -65,10 +65,7 @@ class TsdfParameters(NamedTuple):
 
 
 def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = None) -> TsdfParameters:
-    """Return the parameters that are set, and for the others those that suit tissue at `median_depth_mm`.
-
-    Raises `ValueError` where neither `voxel_mm` nor the depth is known.
-    """
+    """Return the parameters, those not set by `median_depth_mm`; `ValueError` if neither it nor `voxel_mm` is known."""
     voxel_mm = settings.voxel_mm
     if voxel_mm is None:
         if median_depth_mm is None or not median_depth_mm > 0:
@@ -83,10 +80,7 @@ def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = 
 
 
 class TsdfVolume:
-    """An unbounded truncated signed distance field that grows with the frames fused into it.
-
-    parameters : by default those of the settings, which must then set `voxel_mm` (`ValueError` otherwise).
-    """
+    """An unbounded truncated signed distance field; `ValueError` where the parameters do not set `voxel_mm`."""
 
     def __init__(self, settings: FusionSettings, parameters: TsdfParameters | None = None) -> None:
         self.settings = settings
@@ -198,10 +192,7 @@ class FusedSurface:
 
 
 class SurfaceFusion:
-    """Fuses tracked frames: at once, or after the last one where they are corrected then or voxels follow the scene.
-
-    store : for frames until then. corrected : whether a back end corrects them.
-    """
+    """Fuses tracked frames: at once, or after the last one where they are corrected then or voxels follow the scene."""
 
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store

@@ -43,10 +43,7 @@ class TsdfCamera(NamedTuple):
 
 
 class MeasuredSurface(NamedTuple):
-    """What a frame measures, each (H, W) float32.
-
-    Inverse depth 1/mm, NaN where there is none; distance of the tangent plane from the camera, mm; weight, 0..1.
-    """
+    """What a frame measures, (H, W) float32: inverse depth 1/mm or NaN; tangent plane's distance, mm; weight 0..1."""
 
     inverse_depth: np.ndarray
     plane_mm: np.ndarray
@@ -134,10 +131,7 @@ def _blocks_between(a: float, b: float, wide: float, per_mm: float) -> tuple[int
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _depth_ranges(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
-    """Return the nearest and the farthest depth of each 2 by 2 pixels, (4, rows, columns, 2), mm; 0: none.
-
-    The first of the four holds the range of all of them where they are one surface; else each has its own depth.
-    """
+    """Return the nearest and the farthest depth of each 2 by 2 pixels, (4, rows, columns, 2), mm; 0: none."""
     height, width = inverse_depth.shape
     ranges = np.zeros((4, (height + 1) // 2, (width + 1) // 2, 2))
     for row in range(ranges.shape[1]):
@@ -323,10 +317,7 @@ def integrate_blocks(
 
 
 class VoxelBlocks:
-    """Blocks of 8^3 voxels found by the key of their block coordinate.
-
-    voxels : storage of at least `len(self) + 1` blocks; slot 0 is always an empty block.
-    """
+    """Blocks of 8^3 voxels by the key of their coordinate; slot 0 of `voxels` is always an empty block."""
 
     def __init__(self) -> None:
         self.voxels = _zeros(_FIRST_CAPACITY)
@@ -371,10 +362,7 @@ class VoxelBlocks:
         return np.array([self._slots.get(key, 0) for key in keys.tolist()], dtype=np.int64)
 
     def dense(self, corner: np.ndarray, blocks: int) -> Voxels:
-        """Return the cube of `blocks`^3 blocks from block coordinate `corner` (3,) on as dense arrays (8 blocks, ...).
-
-        Where there is no block the weight is 0.
-        """
+        """Return `blocks`^3 blocks from coordinate `corner` (3,) on, dense (8 blocks, ...), weight 0 where none is."""
         slots = self.find(corner + np.argwhere(np.ones((blocks,) * 3)))
         return Voxels(*(_assemble(array[slots], blocks) for array in self.voxels))
 

@@ -67,10 +67,7 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
 def _set_distances(
     field: np.ndarray, planes: tuple[np.ndarray, np.ndarray], tree: cKDTree, corner: np.ndarray, cell_mm: float
 ) -> np.ndarray:
-    """Set the cells near the surface to their signed distance, in cells; return which are set, with the border's.
-
-    planes : vertices (V, 3) mm and their normals. corner : (3,) mm, of the grid, whose cells are `cell_mm` wide.
-    """
+    """Set cells near the surface to their signed distance, in cells; return which are set, with the grid's border."""
     vertices, normals = planes
     near = np.zeros(field.shape, bool)
     near[tuple(((vertices - corner) / cell_mm).astype(int).T)] = True

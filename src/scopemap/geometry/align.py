@@ -1,8 +1,4 @@
-"""Alignment of trajectories: the similarity that takes the estimated world to the reference world.
-
-Source of the closed form: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
-IEEE TPAMI 13(4), 1991, eq. 34-43.
-"""
+"""Alignment of trajectories: similarity of estimated to true world (Umeyama, IEEE TPAMI 13(4), 1991, eq. 34-43)."""
 
 from __future__ import annotations
 
@@ -68,10 +64,9 @@ class Similarity:
 
 
 def umeyama(points_from: np.ndarray, points_to: np.ndarray, with_scale: bool) -> Similarity:
-    """Return the similarity that takes `points_from` to `points_to` with the least squared error.
+    """Return the similarity with the least squared error between (N, 3), mm, matched rows (Umeyama 1991, eq. 34-43).
 
-    Both are (N, 3) float64, mm, matched row by row. Without scale the best rigid motion is returned. A straight line or
-    a single place leaves the rotation free: `AlignmentError`, with the singular values. Umeyama 1991, eq. 34-43.
+    A straight line or a single place leaves the rotation free: `AlignmentError`, with the singular values.
     """
     check_shape("points_from", points_from, (None, 3))
     check_shape("points_to", points_to, (len(points_from), 3))

@@ -1,12 +1,9 @@
 """Robust nonlinear least squares: one trust-region minimiser, robust kernels and robust scale estimates.
 
-Powell's dog-leg, METHOD section WEMA-RTDL, three cases: the Gauss-Newton step if it fits into the ball of radius rho;
-else the steepest descent step cut to rho if the Cauchy point h*p_sd, h = |p_sd|^2 / |J p_sd|^2, is outside; else the
-point where the line from the Cauchy point to the Gauss-Newton step leaves the ball. (The paper misprints the second
-condition, which must compare h*|p_sd| with rho.) Radius update: Nocedal and Wright, "Numerical Optimization",
-algorithm 4.1. For bundle adjustment: Lourakis and Argyros, "Is Levenberg-Marquardt the most efficient optimization
-algorithm for implementing bundle adjustment?", ICCV 2005. `SchurModel` eliminates points, each of which has one unknown
-and touches the camera unknowns of its block alone (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, 6.1).
+Powell's dog-leg, METHOD section WEMA-RTDL: the Gauss-Newton step if within radius rho; else the steepest descent step
+cut to rho if h |p_sd| > rho, h = |p_sd|^2 / |J p_sd|^2; else where the line from the Cauchy point to the Gauss-Newton
+step leaves the ball. Radius: Nocedal and Wright, "Numerical Optimization", algorithm 4.1. `SchurModel` eliminates
+points (Lourakis and Argyros, ICCV 2005; Triggs et al., "Bundle Adjustment", 2000, 6.1).
 """
 
 from __future__ import annotations
@@ -40,10 +37,7 @@ def robust_sigma_2d(lengths: np.ndarray, least: float = 0.0) -> float:
 
 
 def cauchy(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return cost and weight of squared residuals under Cauchy's kernel: at `scale` the weight is a half.
-
-    With `square` in units of the variance, cost and weight are those of 0.5 * square near zero.
-    """
+    """Return Cauchy's cost and weight of squared residuals, near zero 0.5 * square; at `scale` the weight is a half."""
     ratio = square / scale**2
     return 0.5 * scale**2 * np.log1p(ratio), 1 / (1 + ratio)
 

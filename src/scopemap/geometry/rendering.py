@@ -56,10 +56,7 @@ def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np
 def render_points(
     points_mm: np.ndarray, colours: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray
 ) -> Rendering:
-    """Return the view of points (N, 3), world mm, in their colours (N, 3) uint8, as squares a pixel wide.
-
-    A point colours the four pixels that its square touches, each by the area covered; hidden points do not count.
-    """
+    """Return the view of points (N, 3), world mm, in their colours (N, 3) uint8, as squares a pixel wide."""
     points = transform(inverse(T_world_camera), points_mm)
     ahead = points[:, 2] > _NEAR_MM
     points, colours = points[ahead], colours[ahead]

@@ -1,8 +1,4 @@
-"""Rotations and rigid motions as matrices: exponential, logarithm, inverse, weighted mean.
-
-Twists are (rotation vector rad, translation mm), so a 6-vector is `[wx, wy, wz, vx, vy, vz]`. Formulas: Sola, Deray and
-Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv 1812.01537, eq. 132-147 and 172-180.
-"""
+"""Rotations and rigid motions; twists are rad, mm: wx wy wz vx vy vz (Sola et al., arXiv 1812.01537, eq. 132-180)."""
 
 from __future__ import annotations
 

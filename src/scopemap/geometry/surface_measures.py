@@ -1,9 +1,4 @@
-"""Where a ray meets a triangle mesh, the shortest path on it, and the part of it inside a polygon of a picture.
-
-The shortest path is Dijkstra's through vertices and points on the edges, which straight lines join across triangles,
-refined where it passes (Kanai and Suzuki, "Approximate shortest path on a polyhedral surface based on selective
-refinement of the discrete graph and its applications", 2001).
-"""
+"""Ray-mesh intersection, shortest path on a mesh (refined Dijkstra, Kanai and Suzuki 2001), area inside a polygon."""
 
 from __future__ import annotations
 
@@ -38,10 +33,7 @@ class SurfacePoint(NamedTuple):
 
 
 def meet_surface(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarray) -> SurfacePoint | None:
-    """Return the first point of a mesh on a ray from `origin` (3,) along `direction` (3,); None where there is none.
-
-    Möller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997; both sides of a triangle count.
-    """
+    """Return the first point of a mesh on a ray, (3,), or None (Möller and Trumbore 1997); both sides count."""
     corner, first, second = _corners(mesh)
     across = np.cross(direction, second)
     determinant = np.einsum("ij,ij->i", first, across)
@@ -59,10 +51,7 @@ def meet_surface(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarra
 
 
 def path_length(mesh: trimesh.Trimesh, start: SurfacePoint, end: SurfacePoint) -> float:
-    """Return the length of the shortest path on a mesh between two of its points; infinite where none joins them.
-
-    Each pass has more points on the edges, and only the triangles that paths which are hardly longer pass.
-    """
+    """Return the length of the shortest path on a mesh between two of its points; infinite where none joins them."""
     if start.face == end.face:
         return float(np.linalg.norm(end.position - start.position))
     kept, vertices, length = np.asarray(mesh.faces), np.asarray(mesh.vertices), np.inf
@@ -114,10 +103,7 @@ def _corners(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def _shortest(
     vertices: np.ndarray, faces: np.ndarray, ends: tuple[SurfacePoint, SurfacePoint], on_edge: int
 ) -> tuple[float, np.ndarray]:
-    """Return the length of the shortest path through vertices and `on_edge` points on each edge of some faces.
-
-    And for each face the length of the shortest path that passes it, (F,).
-    """
+    """Return the shortest length through vertices and `on_edge` points on each edge, and through each face, (F,)."""
     nodes, of_face = _nodes(vertices, faces, on_edge)
     pairs = [of_face[:, pair] for pair in _joined_pairs(on_edge)]
     for number, point in enumerate(ends, start=len(nodes)):

@@ -1,8 +1,4 @@
-"""Relative standard deviation of depth per pixel, and the weight that follows from it.
-
-Relative, not in millimetres, since an error of predicted depth grows with depth. An unknown sigma (None or NaN)
-is NaN here and 1 as a weight, that of the image's median pixel.
-"""
+"""Relative standard deviation of depth per pixel, NaN = unknown, and the weight that follows from it."""
 
 from __future__ import annotations
 

@@ -89,10 +89,7 @@ def moved_depth(
 
 
 def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return an image (H, W, C) at places (N, 2) x, y within it, (N, C), bilinear.
-
-    OpenCV's remap is not used: it fails for no points and for more than 32767.
-    """
+    """Return an image (H, W, C) at places (N, 2) x, y within it, (N, C), bilinear; also none or more than 32767."""
     corner = np.clip(np.floor(places).astype(int), 0, [image.shape[1] - 2, image.shape[0] - 2])
     x, y = corner.T
     a, b = (places - corner).T[..., None]
@@ -111,10 +108,7 @@ def resampled(values: np.ndarray, camera: PinholeCamera) -> np.ndarray:
 
 
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:
-    """Smooth depth (H, W) float32 within surfaces, not across edges; NaN pixels stay NaN and do not count.
-
-    OpenCV's filter has no missing values: they are set far beyond any range weight, so they affect no neighbour.
-    """
+    """Smooth depth (H, W) float32 within surfaces, not across edges; NaN pixels stay NaN and do not count."""
     known = np.isfinite(depth_mm)
     if sigma_px <= 0 or not known.any():
         return depth_mm

@@ -1,8 +1,7 @@
 """The checkpoint of a run: the state of its objects in one SQLite file, written whole or not at all.
 
-State is what objects hold: numbers, text, arrays, containers and objects of scopemap's classes. Their structure is
-JSON, their arrays are blobs by the hash of their content; no code is stored, and none is run but the classes' own.
-What is neither (a network, a file, a thread) is not stored: the objects that are restored keep theirs.
+Structure of objects is JSON, arrays are blobs by hash; no code. What is no number, text, array, container or object of
+scopemap's classes (a network, a file, a thread) is not stored: the objects restored keep theirs.
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ def is_committed(file: Path) -> bool:
 
 
 class SavedState:
-    """The state of a run, by parts that several threads write; it becomes valid when all are committed.
-
-    file : is made with the first part. Raises `InputError` where it is damaged or cannot be written.
-    """
+    """The state of a run by parts, valid when all are committed; `InputError` where `file` is damaged or read-only."""
 
     def __init__(self, file: Path) -> None:
         self._file = file

@@ -1,8 +1,4 @@
-"""Reading and writing of images; limits of pixels and bytes for files of unknown origin, checked before decoding.
-
-The limit is 64 million pixels an image; the environment variable `SCOPEMAP_MAX_MEGAPIXELS` sets another (up to what
-Pillow opens, 178 million, but for TIFF).
-"""
+"""Reading and writing of images of unknown origin: 64 million pixels, or `SCOPEMAP_MAX_MEGAPIXELS`, at most."""
 
 from __future__ import annotations
 
@@ -28,10 +24,7 @@ _WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Return the image in a file's `content` as OpenCV decodes it (BGR); None where it holds none.
-
-    Raises `InputError` where its header claims more pixels than the limit.
-    """
+    """Return the image in a file's `content` (BGR), None where it holds none; `InputError` beyond the limit."""
     claimed = _claimed_pixels(content)
     check_pixels(claimed)
     if content.startswith(_PNG) and not _holds_its_chunks(content):
@@ -52,10 +45,7 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
 
 
 def write_encoded(file: Path, image: np.ndarray) -> None:
-    """Write an image as OpenCV has it (BGR) in the format of the file's ending.
-
-    OpenCV's own functions for files take no names outside of the system's code page on Windows. Raises `OSError`.
-    """
+    """Write an image (BGR) in the format of the file's ending, by any name on Windows, too. Raises `OSError`."""
     file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())
 
 

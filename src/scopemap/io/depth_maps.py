@@ -106,10 +106,7 @@ def _write_picture(file: Path, image: np.ndarray) -> None:
 
 
 class DepthReader:
-    """Reads back the depth of a run's folder.
-
-    Raises `InputError` where depth/depth.json is there but cannot be read.
-    """
+    """Reads back the depth of a run's folder; raises `InputError` where depth/depth.json cannot be read."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))

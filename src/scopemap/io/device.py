@@ -45,10 +45,7 @@ def need_packages(what: str, *packages: str) -> None:
 
 
 def choose_device(device: str) -> str:
-    """Return the torch device for a setting: "auto" is the first CUDA device if there is one, else the CPU.
-
-    Raises `SettingsError` for a name that torch does not know or a device that is not there.
-    """
+    """Return the torch device for a setting, "auto": the first CUDA device, else the CPU; raises `SettingsError`."""
     import torch
 
     if device == "auto":

@@ -1,9 +1,4 @@
-"""Frames that are skipped because they repeat another or exceed the rate; the others keep their numbers.
-
-A conversion from 25 to 30 frames a second repeats frames, a frozen screen does. The noise of a camera at rest differs
-from frame to frame, so it repeats nothing. A frame is compared with the last one that was kept, so that small
-differences add up until they count.
-"""
+"""Frames that are skipped because they repeat the last one kept or exceed the rate; the others keep their numbers."""
 
 from __future__ import annotations
 
@@ -71,10 +66,7 @@ class FrameChoice:
 
 
 def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the mean absolute difference, grey levels, of two images (h, w, 3) uint8 over pixels not black in both.
-
-    All pixels are compared where both images are black.
-    """
+    """Return the mean absolute difference, grey levels, of (h, w, 3) uint8 over pixels not black in both, or all."""
     step = max(1, min(one.shape[:2]) // _COMPARED_SIDE_PX)
     one, other = (np.ascontiguousarray(rgb[::step, ::step]) for rgb in (one, other))
     difference, (red, green, blue) = cv2.absdiff(one, other), cv2.split(cv2.max(one, other))
@@ -83,8 +75,5 @@ def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def is_repeat(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether two images (h, w, 3) uint8 of one size differ by no more than lossy coding changes.
-
-    Constant images repeat nothing.
-    """
+    """Return whether two (h, w, 3) uint8 of one size, not constant, differ by no more than lossy coding changes."""
     return mean_difference(one, other) < LEAST_DIFFERENCE and not is_constant(other)

@@ -27,10 +27,7 @@ _MOST_WAITING = 4  # messages; a client that is slower than the frames gets fewe
 
 
 class IgtlServer:
-    """Sends to one client at a time, at localhost; without a client nothing is kept.
-
-    Raises `InputError` where pyigtl is not installed or the port is taken. To be made in the main thread.
-    """
+    """Sends to one client at localhost; `InputError` without pyigtl or port. To be made in the main thread."""
 
     def __init__(self, port: int) -> None:
         try:
@@ -54,10 +51,7 @@ class IgtlServer:
         return bool(self._server.is_connected())
 
     def send_frame(self, rgb: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray | None, lost: str) -> None:
-        """Send a picture (H, W, 3) uint8 of a camera, its pose (4, 4) mm unless it is lost, and the status.
-
-        lost : why it is, "" where it is not.
-        """
+        """Send a picture (H, W, 3) uint8 of a camera, its pose (4, 4) mm, and why it is lost, "" where it is not."""
         if T_world_camera is not None:
             matrix = RAS_FROM_WORLD @ T_world_camera
             self._send(self._messages.TransformMessage(matrix, device_name="CameraToWorld"))

@@ -151,10 +151,7 @@ def _numbers(files: list[Path]) -> list[int]:
 
 
 def use_first_calibration(source: Source, *files: Path) -> bool:
-    """Have a source use the first of these files beside the frames that exists; return whether there is one.
-
-    It comes before a data set's own constants; opening fits it.
-    """
+    """Have a source use the first calibration of these files beside the frames; return whether there is one."""
     file = next((file for file in files if file.is_file()), None)
     if file is not None:
         stated = stated_calibration(file, (source.width, source.height))

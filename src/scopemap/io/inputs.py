@@ -1,7 +1,4 @@
-"""Many inputs from a few texts: files, folders of videos, addresses (s3://bucket/video.mp4), patterns, lists, tables.
-
-Files at addresses are listed, and fetched when their turn comes, by fsspec.
-"""
+"""Inputs from a few texts: files, folders of videos, addresses (s3://bucket/video.mp4), patterns, lists, table."""
 
 from __future__ import annotations
 

@@ -61,10 +61,7 @@ class LiveSource(Source):
             self._changed.notify_all()
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the newest frame until the source ends or `stop` is called; `selection` is not used.
-
-        A second call continues. `warnings` says where the source broke off.
-        """
+        """Yield the newest frame until the source ends or `stop` is called, more where called again; no `selection`."""
         if self._thread.ident is None:
             self._started_s = time.monotonic()
             self._thread.start()

@@ -117,10 +117,7 @@ def sequence_of(
 
 
 def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
-    """Return the frames of an input as they are in the file, one view and one field of each by `settings`.
-
-    Their camera is not read, so that a wrong one does not matter. Raises `InputError`.
-    """
+    """Return the frames of an input as in the file, one view and field by `settings`; raises `InputError`."""
     with _errors_of_the_system(path):
         return prepared(_reader(Path(path), dataset), settings or InputSettings())
 
@@ -187,10 +184,7 @@ def _may_enter(folder: Path) -> bool:
 
 
 def _innermost(path: Path, dataset: str) -> Path:
-    """Return the folder in `path` that the reader `dataset` recognises, `path` where none; "": that any reader does.
-
-    A bag or a DICOM file that is beside a data set or `images` does not hide them.
-    """
+    """Return the folder in `path` that the reader `dataset` ("": any) recognises, `path` where none does."""
     if dataset:
         return _recognised_below(path, [readers()[dataset]]) or path
     others = [kind for kind in readers().values() if kind not in (RosBag, Dicom)]

@@ -1,7 +1,4 @@
-"""What is used of each picture: boxes blackened first; then one view and one field of it.
-
-Stereo packing and interlacing are undone as the settings ask or as detected.
-"""
+"""What is used of each picture: boxes blackened first; then one view and one field of it, as set or detected."""
 
 from __future__ import annotations
 
@@ -68,10 +65,7 @@ def prepared(source: Source, settings: InputSettings) -> Source:
 
 
 class PreparedSource(Source):
-    """A source of which a part of each picture is used; all else is the source's own.
-
-    packed : the packing of two views, of which the left eye's is used; None: the picture is one view.
-    """
+    """A source of which a part of each picture is used, of the views `packed` the left eye's; None: one view."""
 
     def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
         self._source, self.packed, self._settings = source, packed, settings

@@ -23,10 +23,7 @@ _SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a gues
 
 
 class RunFolder:
-    """A finished run in its folder, or one of its submaps in `maps/N`; each part is read once, when it is asked for.
-
-    path : the folder, of which nothing is read yet. Each part raises `InputError` where it is missing or damaged.
-    """
+    """A finished run in its folder `path`, or a submap in `maps/N`; parts are read when asked for, or `InputError`."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

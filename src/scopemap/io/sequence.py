@@ -80,10 +80,7 @@ class Sequence:
 
     @property
     def count(self) -> int | None:
-        """Number of selected frames, those that will be skipped too, or None where only reading on would tell.
-
-        A video's is its header's claim.
-        """
+        """Number of selected frames, skipped ones too, by a video's header; None where only reading on would tell."""
         return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
 
     @property
@@ -176,10 +173,7 @@ class _HangingError(Exception):
 def _in_time(
     pictures: Generator[SourceFrame, None, None], first_s: float, next_s: float
 ) -> Generator[SourceFrame, None, None]:
-    """Yield pictures one at a time; raise `_HangingError` where the first or another takes longer than so many seconds.
-
-    They come from a thread of their own, which does not keep the process from ending where it hangs.
-    """
+    """Yield pictures, read in a thread; `_HangingError` where one takes longer than so many seconds."""
     asked, found = SimpleQueue[bool](), SimpleQueue[SourceFrame | BaseException | None]()
 
     def answer() -> None:

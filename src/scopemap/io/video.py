@@ -82,10 +82,7 @@ class VideoFile(Source):
             yield SourceFrame(index, time_s, rgb)
 
     def samples(self, count: int) -> list[np.ndarray]:
-        """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, fewer where it cannot be searched.
-
-        They are not those of `frames`: where the video can be entered, not every frame.
-        """
+        """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, where it can be entered."""
         found: dict[int | None, np.ndarray] = {}
         with suppress(av.FFmpegError, StopIteration), self._opened() as container:
             start, length = container.start_time or 0, container.duration or 0

@@ -1,8 +1,4 @@
-"""Weights that scopemap knows (`checkpoints.toml`): their folder, their verification by hash, their download.
-
-Files must have the hashes of `checkpoints.toml`, and those recorded in the folder's `weights.lock.json` when they were
-pulled, with their revision. A model of the hub that has neither is taken as it is: it was copied by hand.
-"""
+"""Weights that scopemap knows (`checkpoints.toml`, `weights.lock.json`): folder, hashes, download."""
 
 from __future__ import annotations
 
@@ -86,10 +82,7 @@ def is_present(*names: str) -> bool:
 
 
 def locate(*names: str) -> Path:
-    """Return the checked file or folder of the first of `names` that is there; never downloads.
-
-    Raises `WeightsError` that names what to fetch and where to put it, or the damaged file.
-    """
+    """Return the checked file or folder of the first of `names` that is there, no download; raises `WeightsError`."""
     for checkpoint in map(find, names):
         if _is_there(checkpoint):
             return _checked(checkpoint)
@@ -103,10 +96,7 @@ def verify(name: str) -> Path:
 
 
 def overview() -> list[tuple[Checkpoint, State]]:
-    """Return every registered checkpoint and every other one that was pulled, with the state of its files.
-
-    "by hand": they are there, with no hash to check.
-    """
+    """Return every registered checkpoint and every other one that was pulled, with the state of its files."""
     return [(one, _state(one)) for one in map(find, dict.fromkeys([*REGISTRY, *_read_lock()]))]
 
 

@@ -144,10 +144,7 @@ class Backend:
         self._tracked = [change(pose) for pose in self._tracked]
 
     def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
-        """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`.
-
-        Nothing is returned where the camera was not lost within a map.
-        """
+        """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`."""
         self.settle()
         parts = {(pose.map, pose.segment) for pose in self._tracked}
         if self._camera is None or len(parts) == len({number for number, _ in parts}):

@@ -67,10 +67,7 @@ class BundleSolution(NamedTuple):
 
 
 def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
-    """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`.
-
-    Keyframes of earlier windows that share points with a window are held, and their points by what is known of them.
-    """
+    """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`."""
     start, count = problem.begin, len(problem.T_camera_world)
     if count <= window:
         return adjust(problem)
@@ -119,11 +116,7 @@ def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end:
 
 
 def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
-    """Return the solution that the search finds from the start; without observations everything stays as tracked.
-
-    The scale of the reprojection errors is estimated again after every accepted step: which are outliers is judged as
-    the fit gets better.
-    """
+    """Return the solution that the search finds from the start; without observations everything stays as tracked."""
     start = problem.begin
     if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
         return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
@@ -252,10 +245,7 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
 def _summed(
     rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, scores, E, h and g of a `PointBlock`, summed over the observations of a host's points.
-
-    point, observer : (N,) int, numbers among the block's points and keyframes, of which `host` is one.
-    """
+    """Return A, scores, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
     error, weight, by_camera, by_host, by_depth, by_lens = rows
     lens = by_lens.shape[2]
     last = _PER_KEYFRAME * keyframes
@@ -283,10 +273,7 @@ def _summed(
 
 
 def _with_points(problem: BundleProblem, state: State) -> State:
-    """Return the state with the points where all observations place them, keyframes held.
-
-    What observations share makes the keyframes uncertain, not the shape of the tissue between neighbouring points.
-    """
+    """Return the state with the points where all observations place them, keyframes held."""
     points, number = problem.points, problem.observations.point
     for _ in range(_POINT_STEPS):
         seen = reproject(problem, state)

@@ -96,10 +96,7 @@ def fit_depth_correction(
 def fit_depth_corrections(
     camera: PinholeCamera, points: Points, count: int, error: np.ndarray, sigma: np.ndarray, step_sigma: float
 ) -> tuple[DepthCorrectionField, ...]:
-    """Return the correction field of each of `count` keyframes, which are the hosts of points.
-
-    error, sigma : (P,), as for `fit_depth_correction`. Points have the depth as estimated.
-    """
+    """Return the correction field of each of `count` keyframes, hosts of points with error, sigma (P,)."""
     pixels = points.pixel * [1.0, camera.fy / camera.fx] + [camera.cx, camera.cy]
     position, fields = (pixels + 0.5) / [camera.width, camera.height], []
     for k in range(count):

@@ -1,8 +1,4 @@
-"""Feature tracks: corners of keyframes, and where optical flow and loop closures observe them in other keyframes.
-
-Flow between distant keyframes is searched from the flows from keyframe to keyframe in between, composed: from zero it
-would often stay where shading, which moves with the lamp, is alike. Aligned patches then refine each observation.
-"""
+"""Feature tracks: corners of keyframes, matched in others by composed flow, aligned patches, and loops."""
 
 from __future__ import annotations
 
@@ -56,10 +52,7 @@ _MATCH = np.dtype([("point", np.int64), ("keyframe", np.int64), ("pixel", np.flo
 
 
 class FeatureTracks:
-    """Takes keyframes one by one; each is matched both ways with those `keyframe_gaps` before it in its map.
-
-    table : where points and observations are kept until they are collected.
-    """
+    """Takes keyframes one by one; each is matched both ways with those `keyframe_gaps` before it in its map."""
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
         self.settings, self._flow = settings.constants, flow
@@ -145,10 +138,7 @@ class FeatureTracks:
         return Points(host[by_host], pixel, log_depth, sigma), observed
 
     def _add_points(self, keyframe: int, pixels: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:
-        """Add points at pixels (n, 2) of a keyframe; return the number of the first.
-
-        share : (n,) standard deviation of the depth, over the depth.
-        """
+        """Add points at pixels (n, 2), with relative deviation of depth `share` (n,); return the first's number."""
         first, rows = len(self._points), np.zeros(len(pixels), _POINT)
         rows["host"], rows["pixel"], rows["log_depth"] = keyframe, self._centred(pixels), log_depth
         rows["sigma"] = np.hypot(share, self.settings.depth_sigma_share)

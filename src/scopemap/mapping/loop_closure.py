@@ -49,10 +49,7 @@ class Loop:
     log_depth_new: np.ndarray
 
     def among(self, keyframes: list[int], log_unit: np.ndarray) -> Loop:
-        """Return the loop with keyframes numbered by their place in a list, in other units of length.
-
-        log_unit : (K,) ln of the factor of the listed keyframes' millimetres.
-        """
+        """Return the loop with keyframes numbered by their place in a list; log_unit : (K,) ln factor of their mm."""
         past, new = keyframes.index(self.past), keyframes.index(self.new)
         T_new_past = self.T_new_past.copy()
         T_new_past[:3, 3] *= np.exp(log_unit[past])
@@ -136,10 +133,7 @@ class LoopFinder:
         return Features(pixels, descriptors, points, self._detector.max_ratio)
 
     def between(self, map_of: Sequence[int]) -> list[Loop]:
-        """Return further loops between maps, after the last keyframe, of the most similar keyframes of each two maps.
-
-        map_of : numbers of the keyframes' maps, which may have been split or joined since.
-        """
+        """Return further loops between maps, after the last keyframe, of the most similar keyframes of two maps."""
         ranked = defaultdict[tuple[int, int], list[tuple[float, int, int]]](list)
         for past, new in combinations(self._features, 2):
             if map_of[past] != map_of[new] and new not in self._loops_to[past]:
@@ -177,10 +171,7 @@ class LoopFinder:
         return Loop(*pair, T_new_past, log_ratio, *pixels, log_z_past, log_z_new)
 
     def _candidates(self, new: Features, map_number: int) -> list[int]:
-        """Numbers of the most similar keyframes, of this map and of others.
-
-        The last keyframes of this map are left out: flow matches them already.
-        """
+        """Numbers of the most similar keyframes, of this map (but for the last ones) and of others."""
         kept, strongest = list(self._features), new.descriptors[: self._strongest]
         recent = [k for k, number in self._map_of.items() if number == map_number][-self._max_gap :]
         own = [k for k in kept if self._map_of[k] == map_number and k not in recent]

@@ -121,10 +121,7 @@ def _hypothesis(
 
 
 def _best(hypotheses: Sequence[_Hypothesis], depth_mm: float) -> tuple[int, Similarity]:
-    """Return the largest number of agreeing keyframes, on the side with fewer, and Sim(3); 0: none is accepted.
-
-    Two hypotheses agree if they give the second one's keyframe a similar position, with similar rotation and scale.
-    """
+    """Return the largest number of agreeing keyframes, on the side with fewer, and Sim(3); 0: none is accepted."""
     S, T_map_camera, own, other = zip(*hypotheses, strict=True)
     scale, R, t = (np.array([getattr(each, name) for each in S]) for name in ("scale", "R", "t"))
     own, other, centre = np.array(own), np.array(other), np.stack(T_map_camera)[:, :3, 3]

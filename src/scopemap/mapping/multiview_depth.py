@@ -134,10 +134,7 @@ def triangulate_depth(
 def propagate_depth(
     depth_mm: np.ndarray, keyframes: Sequence[tuple[np.ndarray, TriangulatedDepth]], camera: PinholeCamera
 ) -> TriangulatedDepth:
-    """Return the depth of a frame, corrected by what was triangulated at keyframes near it.
-
-    depth_mm : (H, W) float32, NaN = unknown. keyframes : T_keyframe_camera (4, 4) and depth of each, at least one.
-    """
+    """Return a frame's depth (H, W) mm, NaN = unknown, corrected by T_keyframe_camera and depth of `keyframes`."""
     height, width = depth_mm.shape
     total = np.zeros((2, -(-height // _PROPAGATED_EVERY), -(-width // _PROPAGATED_EVERY)), np.float32)
     for T, keyframe in keyframes:
@@ -176,10 +173,7 @@ class KeyframeDepths:
         """Number of keyframes whose depth was triangulated."""
 
     def depth(self, index: int, depth_mm: np.ndarray) -> TriangulatedDepth | None:
-        """Return the depth of a frame, (H, W) mm, corrected by the keyframes before and after it; None without any.
-
-        Numbers must not decrease from call to call.
-        """
+        """Return the depth of a frame, numbers not falling, (H, W) mm, corrected by keyframes around; or None."""
         place = bisect_right(self.keyframes, index)
         is_keyframe = place > 0 and self.keyframes[place - 1] == index
         around = self.keyframes[max(place - 1 - is_keyframe, 0) : place + 1]
@@ -221,10 +215,7 @@ class KeyframeDepths:
 def _estimates(
     view: StereoView, neighbours: Sequence[StereoView], camera: PinholeCamera, flow: FlowEstimator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return each neighbour's ln factor of a view's depth, and its information, without those that tell nothing.
-
-    Information : 1 / variance, 0 = unknown. Each (H, W) float32.
-    """
+    """Return each neighbour's ln factor of a view's depth, and its information, 0 = unknown, (H, W) float32."""
     # Flow of a picture without texture is what it started from.
     grey = view.contrast[..., 0].astype(np.float32)
     spread = _blurred(grey**2, _DISAGREEMENT_PX) - _blurred(grey, _DISAGREEMENT_PX) ** 2

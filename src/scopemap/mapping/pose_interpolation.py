@@ -108,11 +108,7 @@ class FrameCorrection:
         return self.S_common_map.get(0 if tracked is None else tracked.map, Similarity.identity())
 
     def _between(self, index: int) -> tuple[int, int, float]:
-        """Two keyframes whose corrections a frame interpolates, and the weight of the second.
-
-        These are the keyframe that the frame was aligned to and the next one, if that was aligned to the same. After a
-        loss, or a relocalisation against an older keyframe, the correction of the next keyframe holds from there on.
-        """
+        """Two keyframes whose corrections a frame interpolates, and the weight of the second."""
         after = int(np.searchsorted(self.index, index))
         if after < len(self.index) and self.index[after] == index:
             return after, after, 0.0
@@ -129,10 +125,7 @@ class FrameCorrection:
         return after - 1, after, self._weight(index, after - 1, after)
 
     def _weight(self, index: int, before: int, after: int) -> float:
-        """Weight of the second of two keyframes: share of the motion between them; of the time where that is unknown.
-
-        The share of the motion puts the correction of a jump, where a recording was cut, on the frames after it.
-        """
+        """Weight of the second of two keyframes: share of the motion between them; of the time where unknown."""
         frames = (int(self.index[before]), index, int(self.index[after]))
         if all(frame in self.tracked for frame in frames):
             first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)

@@ -1,9 +1,4 @@
-"""Submaps: the frames that share a world, sorted, adjusted and merged after the last frame.
-
-The tracker starts a new map where the camera is lost for good. Where it only seems to have found the camera again, the
-map is split. Maps that loop closures tie together are merged into one
-submap; the relative pose of the others stays unknown, and each is a result of its own.
-"""
+"""Submaps: the frames that share a world, sorted, adjusted and merged by loop closures after the last frame."""
 
 from __future__ import annotations
 
@@ -109,10 +104,7 @@ class Mapper:
         self._extended.add(track.map)
 
     def join(self, start: int, last: int, T_earlier_own: np.ndarray) -> None:
-        """Make the map of the frame `start` a part of an earlier one: tracking leads back from it to its frame `last`.
-
-        T_earlier_own : (4, 4), from its world to that of the earlier map.
-        """
+        """Make the map of frame `start` part of that of an earlier frame `last`; T_earlier_own : (4, 4), of worlds."""
         poses = self._poses()
         earlier, after = poses[last], poses[start]
         own = after.map

@@ -45,10 +45,7 @@ class FieldOfView:
         self._field: np.ndarray | None = None
 
     def __call__(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:
-        """Return the field of view, (H, W) bool, and learn from this frame.
-
-        lit : (H, W) bool, as `masking.is_lit` has it. rectified : (H, W) bool, which pixels show anything.
-        """
+        """Return the field of view, (H, W) bool, and learn from this frame; lit, rectified : (H, W) bool."""
         # Single bright pixels are noise of the coding in the black surround.
         lit = cv2.morphologyEx((lit & rectified).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
         known = self._lit
@@ -91,10 +88,7 @@ class StoredMasks(Protocol):
 
 
 class Masker:
-    """Narrows `Frame.valid` to usable tissue; the field of view is estimated from all frames so far.
-
-    files : masks of pixels that show no tissue, or None.
-    """
+    """Narrows `Frame.valid` to usable tissue, in the field of view of all frames so far and outside of mask `files`."""
 
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
@@ -130,10 +124,7 @@ class Masker:
         return replace(frame, valid=valid & field, highlights=highlights)
 
     def instruments(self, probability: np.ndarray | None) -> np.ndarray | None:
-        """Return the instruments, (H, W) bool, of the frame that was masked last; None where none are looked for.
-
-        probability : (H, W), 0..1. They are widened by a rim, and held where those of the frame before were.
-        """
+        """Return the last frame's instruments, widened and held, (H, W) bool, by (H, W) 0..1; None: not looked for."""
         if probability is None or self.settings.instruments != "auto" or self._from_file:
             self._instruments = None
             return None

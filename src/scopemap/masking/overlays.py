@@ -110,10 +110,7 @@ class OverlayFinder:
 
 
 def _small_detail(level: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Return a small copy minus its local mean, float32, 0 outside the field, so independent of illumination.
-
-    The mean is taken inside the field only, else its static rim would count as detail.
-    """
+    """Return a small copy minus its local mean inside the field, float32, 0 outside."""
     factor = max(1, min(level.shape) // _SMALL_SIDE_PX)
     height, width = (side // factor for side in level.shape)
     # An integer factor is several times faster.

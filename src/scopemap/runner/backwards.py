@@ -1,9 +1,4 @@
-"""Tracks lost frames backwards, after the last frame: from where the camera was found again, or a map began.
-
-A camera that was lost in a turn or at a wall is often found only when the view is wide again; the frames before that
-show what the found one shows, and are tracked from there, in its world. They move with it when keyframes are adjusted.
-Where they lead back into an earlier map, the camera has been found in that map, and the two become one.
-"""
+"""Tracks lost frames backwards, after the last frame: from where the camera was found again, or a map began."""
 
 from __future__ import annotations
 
@@ -59,10 +54,7 @@ def _join(frames: FrameTable, place: int, earlier_map: int, T_earlier_own: np.nd
 
 
 def _tracked_from(pipeline: Pipeline, start: np.void, earlier: np.ndarray) -> Iterator[tuple[int, Track]]:
-    """Yield tracks in the world of `start` of earlier rows, last first, as far as frames can be followed; and places.
-
-    It ends with some frames of an earlier map, or where frames of the same one come.
-    """
+    """Yield tracks in the world of `start` of earlier rows, last first, as far as they can be followed; and places."""
     tracker, store = pipeline.odometry.new_tracker(), pipeline.fusion.store
     if tracker is None:
         return

@@ -139,10 +139,7 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
 
 
 def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path) -> list[Notice]:
-    """Return a notice where an input with this content, as `input_checksum` has it, is not that of an identity.
-
-    identity : {}: that is not known.
-    """
+    """Return a notice where an input with this `input_checksum` is not that of an identity; {} : not known."""
     before = {name: value for name, value in identity.get("input", content).items() if name != "path"}
     return [] if before == content else [Notice("input-changed", {"path": str(path)})]
 

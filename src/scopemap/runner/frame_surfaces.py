@@ -19,10 +19,7 @@ SURFACES = "surfaces"
 
 
 class SurfaceWriter:
-    """Writes surfaces/000000.ply, ...: usable pixels alone, as far apart as those of the depth estimate.
-
-    Raises `InputError` where nothing can be written.
-    """
+    """Writes surfaces/000000.ply, ...: usable pixels, spaced as the depth estimate's. Raises `InputError`."""
 
     NOT_IN_CHECKPOINT = ("_folder", "_config", "_estimators")
     """Not in a checkpoint: nothing changes."""

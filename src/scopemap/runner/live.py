@@ -37,10 +37,7 @@ LiveObserver = Callable[[Step, Reconstructor], None]
 
 
 class LiveSession:
-    """Reconstructs a live source until it ends or `stop` is called; every method may be called from any thread.
-
-    source : whose frames `sequence` rectifies. observers : called with each step. snapshots : folder for them.
-    """
+    """Reconstructs a live source until its end or `stop`, observed step by step; any thread may call its methods."""
 
     def __init__(
         self,
@@ -61,11 +58,7 @@ class LiveSession:
         self._last_snapshot = ""
 
     def run(self) -> Reconstructor:
-        """Reconstruct until the end, and return the reconstructor, which holds the result since the last reset.
-
-        Before the source begins, kernels and networks are loaded, the first time on a machine compiled: that takes a
-        minute, and frames would be lost meanwhile.
-        """
+        """Load kernels and networks, reconstruct until the end, and return the reconstructor with the last result."""
         with Reconstructor(self._config, self._sequence, progress=self._progress) as warm:
             for index in range(2):
                 picture = self._sequence.rectifier.image(np.roll(self._source.first, index, axis=1))

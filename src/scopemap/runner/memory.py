@@ -1,8 +1,7 @@
 """What a run may keep in memory at once, by `run.memory_mb`: what its buffers, adjustment and surface may hold.
 
-A run takes a base, and so much for each pixel of its pictures and each frame; the rest of the limit bounds what else
-grows: half of it the observations that are adjusted, the other half, and what these leave, the volume with its mesh.
-The figures are peaks of runs of 160x128 to 640x512 px, rounded up.
+The limit less a base and so much for each pixel and frame (peaks of runs of 160x128 to 640x512 px, rounded up) goes
+half to the observations, half and what these leave to the volume with its mesh.
 """
 
 from __future__ import annotations
@@ -48,10 +47,7 @@ class MemoryPlan:
 
 
 def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:
-    """Return what a run over a sequence may hold.
-
-    Raises `InputError` where its pictures alone take more, `SettingsError` for networks whose memory is not known.
-    """
+    """Return what a run over a sequence may hold; `InputError` for too large pictures, `SettingsError` for networks."""
     memory_mb, networks = config.run.memory_mb, config.networks
     if memory_mb is None:
         return MemoryPlan()

@@ -1,7 +1,4 @@
-"""Tasks in processes of their own: one that fails, hangs or dies takes no other with it.
-
-The pool of the standard library ends with all its tasks where one of its processes dies, and has no time limit.
-"""
+"""Tasks in processes of their own, with a time limit: one that fails, hangs or dies takes no other with it."""
 
 from __future__ import annotations
 

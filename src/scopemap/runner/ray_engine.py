@@ -62,7 +62,9 @@ class RayEngine:
                     was_busy, (outcome, again) = worker.is_busy, worker.end(limits.seconds)
                     if not was_busy:
                         failed_starts = failed_starts + 1 if outcome.fault else 0
-                        _check_starts(failed_starts, outcome.fault)
+                        if failed_starts > _MOST_FAILED_STARTS:
+                            same = "is the same scopemap installed on its nodes?"
+                            raise InputError(f"no worker starts on Ray: {outcome.fault}; {same}")
                     elif again and limits.allow_another(outcome):
                         waiting.append((worker.number, outcome))
                     else:
@@ -165,12 +167,6 @@ class _Worker:
     def kill(self) -> None:
         """End the actor, whatever it does."""
         self._ray.kill(self._actor)
-
-
-def _check_starts(failed: int, fault: str) -> None:
-    """Raise `InputError` where too many starts have failed one after the other."""
-    if failed > _MOST_FAILED_STARTS:
-        raise InputError(f"no worker starts on Ray: {fault}; is the same scopemap installed on its nodes?")
 
 
 def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Worker]:

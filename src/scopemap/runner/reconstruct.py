@@ -78,7 +78,8 @@ def reconstruct(
             if folder is None:
                 run.track(observers)
             else:
-                _track_with_checkpoints(run, observers, folder, identity)
+                with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
+                    run.track(observers, checkpoints)
             result = run.result(notices)
         content = result.provenance["input_content"] = input_checksum(sequence.path)
         changes = input_changes(identity, content, sequence.path)
@@ -92,11 +93,6 @@ def reconstruct(
                 owner.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     return result
-
-
-def _track_with_checkpoints(run: Run, observers: tuple[Observer, ...], folder: Path, identity: dict[str, Any]) -> None:
-    with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
-        run.track(observers, checkpoints)
 
 
 def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:

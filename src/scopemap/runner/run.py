@@ -1,8 +1,4 @@
-"""One run: the loop that passes the frames of a sequence through the pipeline, and the result.
-
-The stages of the pipeline overlap: while a frame is fused in this thread, later ones are read and go through the
-networks, are matched, and tracked, each in a thread of its own. So do the stages after the last frame.
-"""
+"""One run: the loop that passes the frames of a sequence through the stages of the pipeline, each in a thread."""
 
 from __future__ import annotations
 
@@ -250,10 +246,7 @@ class _Finishing:
     def _written(
         self, frames: Iterator[Frame], checked: SpreadFrames, moving: MovingTissue, count: int
     ) -> Iterator[Frame]:
-        """Yield the final frames of a submap, written; `checked` keeps some, `moving` counts them all.
-
-        count : of the frames of all submaps.
-        """
+        """Yield the final frames of a submap, written; `checked` keeps some, `moving` counts; count : of all."""
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
                 usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)

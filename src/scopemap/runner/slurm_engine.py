@@ -40,10 +40,7 @@ class SlurmEngine:
         limits: ProcessLimits,
         started: Callable[[int], None] = lambda number: None,
     ) -> Generator[tuple[int, Outcome], None, None]:
-        """Yield (number, outcome) of each task, as they end; `limits.processes` bounds the jobs, queued or running.
-
-        started : called when a job is submitted.
-        """
+        """Yield (number, outcome) as tasks end, `limits.processes` jobs at once; started : called when submitted."""
         if limits.seconds is None:
             raise InputError("Slurm plans by the time of jobs: limit the seconds for one video (--time-limit)")
         one = replace(limits, processes=1)

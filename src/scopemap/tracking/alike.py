@@ -1,10 +1,4 @@
-"""ALIKE-t: learned local features (Zhao et al., IEEE Transactions on Multimedia 2022, arXiv 2112.02906).
-
-The network is an ONNX graph that comes with the package (`training/alike.py` writes it; the weights are its authors',
-under BSD-3-Clause: `alike.LICENSE.txt`). It gives a score per pixel and features at four scales. Keypoints are local
-maxima of the scores, moved by a soft argmax of their surroundings (differentiable keypoint detection); descriptors are
-what the head makes of the features there.
-"""
+"""ALIKE-t: learned local features (Zhao et al., arXiv 2112.02906), an ONNX graph (BSD-3, `alike.LICENSE.txt`)."""
 
 from __future__ import annotations
 
@@ -40,10 +34,7 @@ class AlikeFeatures:
     name, descriptor_size, max_ratio = "alike", 64, 1.0
 
     def detect(self, frame: Frame) -> Features:
-        """Return at most 1000 features in the usable pixels of a frame, with depth where the frame has it.
-
-        Raises `WeightsError` where the installation lacks the network.
-        """
+        """Return at most 1000 features in the usable pixels of a frame, with depth if known; raises `WeightsError`."""
         height, width = frame.valid.shape
         scores, maps, head = network_answer(evenly_lit(frame.rgb))
         scores = scores[:height, :width]

@@ -1,8 +1,4 @@
-"""Features with depth, their matching, and the relative pose of two frames by PnP in RANSAC.
-
-Learned features are in `alike.py`; here SIFT (Lowe, IJCV 2004) with RootSIFT descriptors (Arandjelovic and Zisserman,
-CVPR 2012). Tissue has few distinctive corners: the detection threshold is low, and RANSAC rejects the wrong matches.
-"""
+"""Features with depth (RootSIFT, Arandjelovic, Zisserman, CVPR 2012), matching, relative pose by PnP in RANSAC."""
 
 from __future__ import annotations
 
@@ -80,10 +76,7 @@ class SiftFeatures:
 
 @dataclass(frozen=True)
 class RelativePose:
-    """Relative pose (4, 4), mm of the reference's depth, and its inliers.
-
-    pairs : (M, 2) int, indices of the inlier features in the reference and in the current frame.
-    """
+    """Relative pose (4, 4), mm of the reference's depth, and its inliers (M, 2) int, in reference and current frame."""
 
     T_current_reference: np.ndarray
     pairs: np.ndarray
@@ -115,10 +108,7 @@ def match_features(reference: Features, current: Features) -> np.ndarray:
 def relative_pose_pnp(
     reference: Features, current: Features, camera: PinholeCamera, min_inliers: int
 ) -> RelativePose | None:
-    """Return the relative pose from the reference's 3D points and the current pixels; None below `min_inliers` inliers.
-
-    Deterministic: OpenCV's RANSAC uses a fixed seed.
-    """
+    """Return the relative pose from the reference's points and current pixels; or None below `min_inliers`."""
     pairs = match_features(reference, current)
     pairs = pairs[np.isfinite(reference.points_mm[pairs[:, 0]]).all(1)]
     if len(pairs) < max(min_inliers, 6):

@@ -52,10 +52,7 @@ class Keyframe:
 
 
 class MotionModel:
-    """Constant motion: the pose that was tracked last, the step to it, and how many frames were lost since.
-
-    map : number of the map whose world `T_world_last` (4, 4) is in.
-    """
+    """Constant motion: the pose tracked last, (4, 4) in the world of `map`, the step to it, frames lost since."""
 
     def __init__(self) -> None:
         self.map, self._maps = 0, 1
@@ -122,10 +119,7 @@ class KeyframeAligner:
         return (best if by_corners is None else replace(best, coverage=by_corners.coverage)), pyramid
 
     def align_from(self, keyframe: Keyframe, frame: Frame, pyramid: list[View], relative: RelativePose) -> Alignment:
-        """Return the alignment from the pose by features: by corners, their flow searched from there, else photometric.
-
-        pyramid : of the frame.
-        """
+        """Return the alignment from the pose by features: by corners, else photometric; pyramid : of the frame."""
         T_start, matches = relative.T_current_reference, len(relative.pairs)
         if self.has_corners(keyframe):
             self.set_keyframe(keyframe, frame, T_start)
@@ -189,10 +183,7 @@ class KeyframeAligner:
 
 
 def is_obscured(sharpness: float, alignment: Alignment, least: float) -> bool:
-    """Return whether an image is too unsharp for its alignment to be reliable.
-
-    sharpness : over the usual one. least : below which an alignment without much evidence does not count.
-    """
+    """Return whether an image, by its `sharpness` over the usual one, is too unsharp for a reliable alignment."""
     # Pixels of smoke fit smoke; its features match by chance alone. Below half of it neither is evidence.
     is_evident = alignment.inlier_share >= _DOUBTFUL_INLIER_SHARE or alignment.matches >= _CLEAR_MATCHES
     return sharpness < (least / 2 if is_evident else least)

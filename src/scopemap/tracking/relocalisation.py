@@ -59,10 +59,7 @@ def depth_ratio(keyframe: Keyframe, frame: Frame, T_world_camera: np.ndarray) ->
 
 
 def nearer_keyframe(keyframes: Iterable[Frame], T_world_camera: np.ndarray, current: Keyframe) -> Frame | None:
-    """Return the keyframe nearest to a view (4, 4), where it is clearly nearer than the current one; else None.
-
-    The distance of two views is the rotation, rad, plus the translation over the scene's depth.
-    """
+    """Return the keyframe clearly nearer to a view (4, 4), by rad plus translation over depth, or None."""
 
     def distance(T_world_other: np.ndarray | None) -> float:
         assert T_world_other is not None
@@ -89,10 +86,7 @@ class RotationFollower:
         self._rotation: np.ndarray | None = None
 
     def follow(self, track: Track, frame: Frame, correspondence: DenseCorrespondence | None) -> Track:
-        """Return the track of each frame, in order, with its rotation where it is lost and followed.
-
-        frame : of the size of the correspondence with the frame before, with raw depth.
-        """
+        """Return the track of each frame, in order, with its rotation where it is lost and followed, by raw depth."""
         before_mm, self._depth_mm = self._depth_mm, np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
         if track.status != "lost":
             self._rotation = np.eye(3)
@@ -107,10 +101,7 @@ class RotationFollower:
 def rotation_by_flow(
     depth_mm: np.ndarray, camera: PinholeCamera, correspondence: DenseCorrespondence
 ) -> np.ndarray | None:
-    """Return R_current_previous (3, 3) by flow and the previous frame's depth; None where they do not support one.
-
-    depth_mm : (H, W), any scale, NaN = unknown or not usable.
-    """
+    """Return R_current_previous (3, 3) by flow and depth (H, W) of any scale, NaN = unknown; None if unsupported."""
     some = slice(_FLOW_EVERY_PX // 2, None, _FLOW_EVERY_PX)
     height, width = depth_mm.shape
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)[some, some].reshape(-1, 2).astype(float)

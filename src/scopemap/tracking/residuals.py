@@ -90,10 +90,7 @@ def _unprojected(depth_mm, K, row, column):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def _projected(point, T, G, usable):  # type: ignore[no-untyped-def]
-    """Return X', its projection (offset in its cell; the cell's column and row), and the weight there (0 = outside).
-
-    G, usable : intrinsics and weights of the current image.
-    """
+    """Return X', its projection (offset in its cell; the cell's column and row), and its weight (0 = outside)."""
     X, Y, Z = point
     x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
     y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
@@ -122,10 +119,7 @@ def _bilinear(image, c, place):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
-    """Return L of a point X with slope (a, b) that is now at X', and -d ln L / dX' for translations.
-
-    The lamp is in the camera's centre: rotations change nothing.
-    """
+    """Return L of a point X with slope (a, b) that is now at X', and -d ln L / dX' for translations."""
     (X, Y, Z), (x, y, z), (a, b) = point, moved, slope
     # The plane R m in the current camera, and 1 + m . R^T t.
     c = (1.0 - a * X - b * Y) / Z
@@ -207,10 +201,7 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
 
 @njit(cache=True, nogil=True)
 def compared_pixels(reference, current, T_current_reference):  # type: ignore[no-untyped-def]
-    """Return the last channel's expected values (N,) and residuals (N,) float32, and how many pixels are usable.
-
-    N pixels of the reference project into usable pixels of the current image; the last channel has no gain, bias or L.
-    """
+    """Return the last channel's expected values, residuals (N,) float32, and the number of usable pixels."""
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
     image, usable, G = current.channels[-1:], current.weight, current.intrinsics
     shown = reference.channels[-1]

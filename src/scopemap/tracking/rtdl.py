@@ -1,8 +1,4 @@
-"""RTDL: rotation first, then the whole motion, by dog-leg on photometric residuals from coarse to fine.
-
-METHOD section WEMA-RTDL. The reference is a keyframe with depth; its points are moved, not the tracked frame's (the
-paper's formula lifts with the tracked frame's depth, which is not known yet when tracking comes first).
-"""
+"""RTDL: rotation first, then the whole motion, by dog-leg on a keyframe's photometric residuals, coarse to fine."""
 
 from __future__ import annotations
 
@@ -73,11 +69,7 @@ class Alignment:
 
 
 def align(reference: list[View], current: list[View], T_start: np.ndarray, settings: TrackingSettings) -> Alignment:
-    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4).
-
-    Finer levels are left out where a coarser one correlates too little for the alignment to be accepted: on finer
-    levels images that fit correlate less.
-    """
+    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4)."""
     motion, iterations, coarse = Motion(T_start, np.array([1.0, 0.0])), 0, math.inf
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
@@ -120,15 +112,11 @@ def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
     return Loss(sigma, settings.constants.huber, np.array(share), _LIT, settings.constants.lamp_gamma)
 
 
-def _residuals(reference: View, current: View, motion: Motion, settings: TrackingSettings) -> np.ndarray:
-    loss = _loss(np.ones(len(reference.channels)), settings)
-    return residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
-
-
 def _align_level(
     reference: View, current: View, motion: Motion, settings: TrackingSettings, rotation_only: bool, unit_mm: float
 ) -> tuple[Motion, int]:
-    start = _residuals(reference, current, motion, settings)
+    loss = _loss(np.ones(len(reference.channels)), settings)
+    start = residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
     loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _MIN_SIGMA) for r in start]), settings)
     if settings.constants.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)

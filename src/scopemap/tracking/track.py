@@ -71,10 +71,7 @@ class Track:
 
     @property
     def moving(self) -> tuple[float, float, float]:
-        """The share of the measured regions whose tissue moves on its own, and their mean place, x and y over the size.
-
-        NaN where no region is measured, the place also where none moves.
-        """
+        """Share of the measured regions whose tissue moves on its own, their mean place, x, y over the size; or NaN."""
         if self.nonrigidity is None or not np.isfinite(self.nonrigidity).any():
             return np.nan, np.nan, np.nan
         moves = np.nan_to_num(self.nonrigidity) > MOVING_SIGMAS
@@ -100,10 +97,7 @@ class FrameTracker(Protocol):
     """Protocol of trackers, which take frames in order: `Tracker`, and those that derive from it, as baselines do."""
 
     def track(self, frame: Frame) -> Track:
-        """Return the pose of a frame, whose `depth_mm` is its raw depth, or the reason why it is lost.
-
-        The first usable frame is "initial" and fixes the world.
-        """
+        """Return a frame's pose by its raw `depth_mm`, or why it is lost; the first usable one is "initial"."""
 
     def needs_keyframe(self) -> bool:
         """Return whether the frame that was tracked last should become a reference for those to come."""

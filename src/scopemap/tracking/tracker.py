@@ -38,10 +38,7 @@ _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
 class KeyframeChoice:
-    """When the next keyframe is due: by the frames since the last one, and by how well they still fit it.
-
-    A frame of lower quality than others since the keyframe waits for a better one.
-    """
+    """When the next keyframe is due: by the frames since the last one, and by how well they still fit it."""
 
     def __init__(self, settings: TrackingSettings) -> None:
         self._settings = settings
@@ -175,10 +172,7 @@ class Tracker(FrameTracker):
         return (self._is_revisited or self._choice.is_due()) and not self._is_unsharp
 
     def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Make a tracked frame, with its depth, the keyframe; False, and nothing changes, where its depth is unknown.
-
-        measured : whether the depth is measured, not predicted; only then tangent planes are taken from it.
-        """
+        """Make a tracked frame the keyframe, with planes if `measured`; False, changing nothing, without depth."""
         if frame.depth_mm is None or frame.T_world_camera is None:
             raise ValueError("a keyframe needs a depth and a pose")
         if self._is_revisited:
@@ -194,10 +188,7 @@ class Tracker(FrameTracker):
         return True
 
     def _against_earlier_keyframe(self, frame: Frame, alignment: Alignment) -> Alignment:
-        """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces.
-
-        Errors of poses and scale since then are gone: a camera that goes to and fro does not drift.
-        """
+        """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces."""
         current = self._keyframe
         assert current is not None
         self._is_revisited = False

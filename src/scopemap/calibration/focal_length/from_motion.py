@@ -1,17 +1,10 @@
 """Focal length of a sequence and its standard deviation, combined from the bundle adjustments of its windows.
 
-A window is adjusted with an unknown focal length and distortion. It starts without motion and with one depth for all
-points, which converges for small motion (Ha et al., "High-quality depth from uncalibrated small motion clip", CVPR
-2016), first without distortion and from two focal lengths. Neither a translation nor a rotation about the optical axis
-determines the focal length; a tilt of the axis does. The standard deviation of ln f is a cluster-robust sandwich over
-blocks of the image, because the errors of neighbouring corners are correlated.
-
-Windows differ by more than their standard deviations, so the variance between them is estimated, too (DerSimonian and
-Laird, "Meta-analysis in clinical trials", 1986). They also have a common error: a lamp that moves with the camera
-biases the flow, and the estimated rotation, by about 0.4 degrees. If the optical axis tilts by T degrees, the relative
-error of the focal length is 0.4 / T, for any number of windows. The assumed focal length of an unknown camera is kept
-unless the estimate contradicts it significantly. Where the motion does not tell, or the lens bends straight lines, the
-same windows are tried through lenses of several kinds (`trial`).
+A window is adjusted with an unknown focal length and distortion, from no motion and one depth for all points (Ha et
+al., CVPR 2016). The standard deviation of ln f is a cluster-robust sandwich over blocks of the image, because the
+errors of neighbouring corners are correlated. The variance between windows is estimated, too (DerSimonian and Laird
+1986). A lamp that moves with the camera biases the rotation by about 0.4 degrees: where the optical axis tilts by T
+degrees, the relative error of the focal length is 0.4 / T in all windows.
 """
 
 from __future__ import annotations
@@ -58,10 +51,7 @@ class WindowFit:
 
 
 def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
-    """Return the fit to a window from the best start; None where the focal length is undetermined.
-
-    assumed_focal_px : mean of its prior, whose standard deviation is a factor of e.
-    """
+    """Return the fit to a window from the best start, None where undetermined; ln f has a prior of deviation 1."""
     problem = _problem(window, assumed_focal_px)
     starts = [np.log(window.half_width_px / np.tan(np.radians(fov_deg) / 2)) for fov_deg in _START_FOV_DEG]
     states = [problem.tracked._replace(lens=np.array([log_focal, 0.0])) for log_focal in starts]
@@ -230,10 +220,7 @@ def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> 
 
 
 def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
-    """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior.
-
-    windows : to which those that are used are appended.
-    """
+    """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior."""
     camera, scale = sequence.camera, 1.0
     # Flow, of the next window, and the adjustment of this one take about equally long.
     with ThreadPoolExecutor(max_workers=1) as adjusting:

@@ -1,14 +1,8 @@
 """The lens of an unknown camera by trial: windows are adjusted through lenses of several kinds and focal lengths.
 
-A lens that bends straight lines tells its focal length by how strongly it bends them, even where the camera does not
-turn; a straight one tells it where the camera turns and the tissue's depth is about known, which keeps a turn from
-being taken for a translation. The depth is scopenet's, without rays: it hardly depends on the lens. The kinds have no
-parameter but the focal length: the radius of a ray at the angle t from the axis is f tan t, f t or f sin t.
-
-The cost of a lens is that of its reprojection errors, in pixels of the picture, by Cauchy's kernel. Errors of
-neighbouring corners, and those of a corner in successive frames, are alike: `_CORRELATED` of them count as one, a
-number chosen on phantoms (scopemap_bench/scripts/focal_length.py). The costs give a probability over kinds and focal
-lengths.
+The radius of a ray at the angle t from the axis is f tan t, f t or f sin t. Depth is scopenet's, without rays. The cost
+of a lens is that of its reprojection errors, px, by Cauchy's kernel, `_CORRELATED` of which count as one
+(scopemap_bench/scripts/focal_length.py). The costs give a probability over kinds and focal lengths.
 """
 
 from __future__ import annotations
@@ -133,11 +127,7 @@ def _lens(kind: str, plane: PinholeCamera) -> CameraModel:
 
 
 def _adjusted(window: Window, camera: CameraModel, start: State | None) -> tuple[np.ndarray, State]:
-    """Return the reprojection errors, px of the picture, (n,) of all observations, and the adjusted state.
-
-    Errors are NaN where the lens sees the observation, or its corner, too far out, and `_OUTSIDE_PX` where it sees
-    nothing.
-    """
+    """Return the reprojection errors (n,), picture px, NaN too far out, `_OUTSIDE_PX` if unseen; and the state."""
     focal_px = camera.central.fx
     corner, partner = np.nonzero(np.isfinite(window.seen).all(-1))
     pixel = window.seen[corner, partner]

@@ -1,8 +1,4 @@
-"""Windows of a sequence: corners of a host frame and their observations in the frames after it.
-
-Corners are followed by pyramidal Lucas-Kanade (Bouguet, 2001) on locally normalised brightness: dense flow costs five
-times as much, and what is smooth in it reduces parallax, which biases the focal length.
-"""
+"""Windows of a sequence: corners of a host frame, followed by pyramidal Lucas-Kanade (Bouguet 2001) in later frames."""
 
 from __future__ import annotations
 
@@ -129,10 +125,7 @@ def _window(frames: list[Frame], patterns: list[np.ndarray]) -> Window | None:
 def _followed(
     image_from: np.ndarray, image_to: np.ndarray, corners: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where corners (n, 2) of an image are in another one, (n, 2) float32, and which are found there and back.
-
-    image_from, image_to : (H, W) uint8. start : (n, 2) px where the search begins.
-    """
+    """Return where corners (n, 2) are in another image (H, W) uint8, float32 px, and which are found there and back."""
     places = corners.astype(np.float32)
     there, found = _searched(image_from, image_to, places, start)
     back, found_back = _searched(image_to, image_from, there, places)

@@ -45,11 +45,7 @@ class Calibration:
 
 
 def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Size) -> tuple[PinholeCamera, SizeOrigin]:
-    """Return the pinhole camera of fx fy cx cy, and where its size is from.
-
-    The size is `stated`, else that of the images. Numbers with cx and cy up to 1 and focal lengths below 10 are shares
-    of width and height.
-    """
+    """Return the pinhole of fx fy cx cy, px or (cx and cy up to 1) shares of the size, and where its size is from."""
     fx, fy, cx, cy = intrinsics
     width, height = check_size(*(stated or image_size))
     are_shares = max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL

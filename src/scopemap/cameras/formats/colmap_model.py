@@ -1,8 +1,4 @@
-"""COLMAP models: cameras and images with their poses, text or binary, in a folder or a zip archive.
-
-Formats: colmap.github.io/format.html, colmap.github.io/cameras.html. Binary files are little-endian. COLMAP's pixels
-count from the corner of the image, so principal points are half a pixel larger than here.
-"""
+"""COLMAP models (colmap.github.io/format.html), text or binary; pixels count from the corner: half a px more."""
 
 from __future__ import annotations
 
@@ -63,10 +59,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """An image of a model: path below the folder of the images, camera, qw qx qy qz tx ty tz world to camera.
-
-    `where` is the file and the place in it, for errors.
-    """
+    """An image of a model: path below the folder of the images, camera, qw qx qy qz tx ty tz world to camera."""
 
     name: str
     camera: int
@@ -114,10 +107,7 @@ def read_images(file: Path) -> list[ModelImage]:
 
 
 def read_largest_model(archive: Path) -> tuple[list[ModelImage], int, int]:
-    """Return the images of the largest model `sparse/<M>/images.bin` in a zip archive, M, and the number of models.
-
-    Of equals the first is taken. Raises `InputError` for an archive that is damaged or holds no model.
-    """
+    """Return the images of the largest model `sparse/<M>/images.bin` in a zip archive, M, and how many there are."""
     try:
         with zipfile.ZipFile(archive) as opened:
             numbers = {name: int(m[1]) for name in opened.namelist() if (m := _MODEL_IN_ARCHIVE.fullmatch(name))}
@@ -165,10 +155,7 @@ def only_camera(file: Path) -> CameraModel:
 
 
 def camera_model(camera: ModelCamera, name: str) -> CameraModel:
-    """Return the camera for pixel centres that count from 0; `name` is its name in errors.
-
-    Raises `CalibrationError` for a model that has no counterpart here, and for parameters that fit no such images.
-    """
+    """Return the camera for pixel centres that count from 0; `CalibrationError` for what has no counterpart here."""
     if camera.model not in _READ:
         raise CalibrationError(f"{name} is of the model {camera.model}, which is not read: {_ADVICE}")
     found, wanted = len(camera.parameters), _PARAMETERS[camera.model]

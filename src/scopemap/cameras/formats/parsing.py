@@ -45,10 +45,7 @@ def calibration_bytes(file: Path) -> bytes:
 
 
 class Fields:
-    """A mapping of a file. Case, `-`, `_`, blanks and ORB-SLAM's `Camera.` do not matter in names.
-
-    A name that is there twice is an error only where it is asked for.
-    """
+    """A mapping of a file; case, `-`, `_`, blanks and ORB-SLAM's `Camera.` do not matter in names."""
 
     def __init__(self, pairs: Iterable[tuple[Any, Any]]) -> None:
         self.pairs = [(name, node) for name, node in pairs if isinstance(name, str)]
@@ -101,10 +98,7 @@ def as_number(node: Any, name: str) -> float:
 
 
 def numbers_in(node: Any, name: str) -> list[float] | None:
-    """Return the numbers of a list, rows of them, OpenCV's or ROS' matrix, or a text of several; None for all else.
-
-    Raises `ValueError` for anything in a list that is no finite number, and for a matrix of another count.
-    """
+    """Return the numbers of a list, rows, a matrix or a text; None for all else, `ValueError` for infinite ones."""
     counts: list[float] = []
     if isinstance(node, Fields):
         counts = [count for side in ("rows", "cols") if (count := node.number((side,))) is not None]
@@ -130,10 +124,7 @@ def is_number(leaf: Any) -> bool:
 
 
 def number_rows(text: str) -> list[list[float]] | None:
-    """Return the numbers of each line that has some, comments after # aside; None where there is anything else.
-
-    Commas, semicolons and square brackets may stand between them.
-    """
+    """Return the numbers of each line that has some, comments after # aside; None where there is anything else."""
     lines = (line.partition("#")[0].translate(_SEPARATORS) for line in text.splitlines() if line.strip())
     try:
         return [row for line in lines if (row := [float(word) for word in line.split()])]

@@ -62,10 +62,7 @@ def read_calibration(camera: Path | str, image_size: Size, fit: str = "exact") -
 
 
 def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
-    """Return the camera at the file's own size, or that of the images where it has none.
-
-    Raises `CalibrationError` where it cannot be read.
-    """
+    """Return the camera at the file's own size, or that of the images where it has none; raises `CalibrationError`."""
     typed, file = number_rows(str(camera)), Path(camera)
     if typed and len(typed[0]) > 1 and not os.path.isfile(file):
         try:
@@ -102,10 +99,7 @@ def _read(file: Path, image_size: Size) -> Calibration:
 
 
 def of_fields(fields: Fields, image_size: Size) -> Calibration:
-    """Return the camera of a mapping: OpenCV, ROS, Kalibr, ORB-SLAM, VINS, nerfstudio, OneSLAM and their likes.
-
-    Raises `ValueError` where it holds none.
-    """
+    """Return the camera of a mapping: OpenCV, ROS, Kalibr, ORB-SLAM, VINS, nerfstudio, OneSLAM; or `ValueError`."""
     cameras = sorted(name for name, _ in fields.pairs if _KALIBR_CAMERA.fullmatch(name))
     chain = fields.inner(cameras)
     levels = [chain[0], fields] if chain else [fields, *fields.inner(_INNER)]
@@ -191,10 +185,7 @@ def _sizes_in(levels: Sequence[Fields], cx: float, cy: float) -> Iterator[tuple[
 
 
 def _read_out(fields: Fields, calibration: Calibration) -> Calibration:
-    """Return the camera of the images that ROS publishes of a sensor (sensor_msgs/CameraInfo): a region of it, binned.
-
-    Raises `ValueError` where the region is no part of the sensor.
-    """
+    """Return the camera of a binned region of a sensor (ROS CameraInfo); `ValueError` where that is no part of it."""
     sensor = calibration.camera
     roi = next(iter(fields.inner(("roi",))), Fields([]))
     x, y, width, height = (_whole(roi, name) for name in ("x_offset", "y_offset", "width", "height"))

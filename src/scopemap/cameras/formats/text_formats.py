@@ -22,10 +22,7 @@ _STEREO_LEFT = "StereoLeft"
 
 
 def of_numbers(rows: list[list[float]], image_size: Size) -> Calibration:
-    """Return the camera of lines of numbers: a matrix, fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or OCamCalib's.
-
-    Raises `ValueError` for any other count.
-    """
+    """Return the camera of a matrix, fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]] or OCamCalib's; else `ValueError`."""
     values = [value for row in rows for value in row]
     if not np.isfinite(values).all():
         raise ValueError("it holds NaN or infinity")
@@ -44,11 +41,7 @@ def of_numbers(rows: list[list[float]], image_size: Size) -> Calibration:
 
 
 def intrinsics_of(K: np.ndarray) -> tuple[list[float], str]:
-    """Return fx fy cx cy of a camera matrix (3, 3), and a note on what was done; `ValueError` where it is none.
-
-    The transposed matrix, as MATLAB and Open3D write it, is transposed back. A skew of up to a hundredth of the focal
-    length is left out.
-    """
+    """Return fx fy cx cy of a camera matrix (3, 3), transposed or not, and a note; `ValueError` where it is none."""
     note = ""
     if not K.any():
         raise ValueError("its camera matrix is all zero, which ROS writes for a camera that was not calibrated")

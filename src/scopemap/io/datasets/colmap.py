@@ -1,9 +1,4 @@
-"""COLMAP: images with the model that structure from motion made of them, text or binary.
-
-The images are in `images`, or beside the model's files; the model in the folder itself, in `sparse/0`, `sparse` or
-`colmap/sparse/0`. Where several models were made of the images, the folder of any of them (`sparse/1`) can be given.
-Schoenberger and Frahm, "Structure-from-motion revisited", CVPR 2016; colmap.github.io/format.html.
-"""
+"""COLMAP: images (in `images` or beside the model) and their model, in `.`, `sparse/0`, `sparse`, `colmap/sparse/0`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""DICOM: endoscopic video (MPEG), multi-frame images, and folders with one of these or one series of single frames.
+"""DICOM: endoscopic video, multi-frame images, series (PS3.3, A.32.5, C.7.6.3 and C.7.6.5; PS3.5, A); by `pydicom`.
 
-Files are read by `pydicom` (the extra `dicom`). Of a header only the tags that describe images are read: no names,
-dates and numbers of patients; messages do not repeat a header's content, and frames are named by their numbers. Tags
-and transfer syntaxes are those of DICOM PS3.3, A.32.5, C.7.6.3 and C.7.6.5, and PS3.5, A.
+Only the tags that describe images are read, and messages do not repeat them: no names, dates and numbers of patients.
 """
 
 from __future__ import annotations
@@ -245,10 +243,7 @@ def _read_header(file: Path) -> Header:
 
 
 def _images(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | None]]:
-    """Yield number, from 0, and image (rows, columns, 3) uint8, of those `wanted`; None where it cannot be decoded.
-
-    Grey images show the window that the file states, else all stored levels. One decoded image is held at a time.
-    """
+    """Yield number, from 0, and image (rows, columns, 3) uint8, of those `wanted`; None where it cannot be decoded."""
     for number, content in enumerate(islice(_packed(header), min(wanted.stop, header.frames))):
         if number in wanted:
             rgb = None
@@ -258,10 +253,7 @@ def _images(header: Header, wanted: range) -> Iterator[tuple[int, np.ndarray | N
 
 
 class EncapsulatedVideo(VideoFile):
-    """A video (MPEG-2, MPEG-4 AVC, HEVC) in the pixel data of a DICOM file, decoded in place.
-
-    `stated_hz` is its rate by the header or None; it is used where the stream holds no time stamps.
-    """
+    """A video (MPEG-2, AVC, HEVC) in a DICOM file; `stated_hz`, where not None, replaces missing time stamps."""
 
     def __init__(self, header: Header, stated_hz: float | None) -> None:
         names = [f"subfile,,start,{at},end,{at + length},,:{header.path}" for at, length in header.fragments if length]

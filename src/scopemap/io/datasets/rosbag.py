@@ -1,8 +1,6 @@
-"""ROS recordings: `FILE.bag` (ROS 1), a folder with `metadata.yaml` and `.db3` or `.mcap` files (ROS 2), `FILE.mcap`.
+"""ROS recordings: `FILE.bag`, a folder with `metadata.yaml` and `.db3` or `.mcap` files, `FILE.mcap`; by `rosbags`.
 
-Images are those of one topic, `sensor_msgs/Image` or `CompressedImage`; the camera is that of its `camera_info`. Depth
-is used where its topic's name says that it is aligned to the colour images. Poses are not used: no message says which
-frame is the camera's. Bags are read by `rosbags` (the extra `ros`), by the message definitions of the distributions.
+Images of one topic, its `camera_info`, and depth whose topic's name says that it is aligned. Poses are not used.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Images, depth and cameras of ROS messages: `sensor_msgs/Image`, `CompressedImage` and `CameraInfo`.
-
-Names of encodings are those of ROS's `sensor_msgs/image_encodings.hpp`; units of depth are those of REP 118: whole
-numbers are mm, floating-point numbers m.
-"""
+"""Images, depth (REP 118: integers mm, floats m) and cameras of ROS messages, by `sensor_msgs/image_encodings.hpp`."""
 
 from __future__ import annotations
 
@@ -50,10 +46,7 @@ def is_grey(encoding: str) -> bool:
 
 
 def bit_depth(wide: np.ndarray) -> int:
-    """Return how many bits of a uint16 image are used, by its brightest sample: 8, 10, 12, 14 or 16.
-
-    Cameras of 10 or 12 bits put them into the lower part of 16.
-    """
+    """Return how many bits of a uint16 image are used, by its brightest sample: 8, 10, 12, 14 or 16."""
     return next(bits for bits in _BIT_DEPTHS if int(wide.max()) < 1 << bits)
 
 
@@ -63,10 +56,7 @@ def eight_bit(wide: np.ndarray, bits: int) -> np.ndarray:
 
 
 def image_of(message: Any) -> np.ndarray:
-    """Return an image message as (h, w, 3) RGB, uint8 or, where its samples have 16 bits, uint16.
-
-    Raises `InputError` for an unknown encoding and for data that do not make the image.
-    """
+    """Return a message as (h, w, 3) RGB, uint8 or uint16; `InputError` for an unknown encoding or wrong data."""
     if hasattr(message, "format"):
         return _compressed_image(message)
     encoding = _OPENCV.get(message.encoding, message.encoding)
@@ -85,10 +75,7 @@ def image_of(message: Any) -> np.ndarray:
 
 
 def depth_of(message: Any) -> np.ndarray:
-    """Return a depth message as (h, w) float32, mm along the optical axis, NaN = unknown.
-
-    Raises `InputError` for what holds no depth, and for data that do not make the image.
-    """
+    """Return a message as (h, w) float32, mm along the axis, NaN = unknown; `InputError` for what is no depth."""
     if hasattr(message, "format"):
         depth_mm = _compressed_depth(message)
     elif message.encoding in _DEPTH:

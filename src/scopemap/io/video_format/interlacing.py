@@ -1,9 +1,7 @@
 """Interlaced pictures: even and odd rows taken at two times (PAL 576i, NTSC 480i, 1080i), and how to undo it.
 
-Where the scene moves, the odd rows of an interlaced picture show it elsewhere than the even rows do: edges look like
-combs. The difference between the odd rows and the mean of the even rows around them counts as combing where a motion
-between the two fields explains it (as in Lucas and Kanade's optical flow) and it exceeds the difference between rows of
-one field; else it is texture or noise.
+Combing is the odd rows less the mean of the rows around, where a motion between the fields explains it (Lucas and
+Kanade) and it exceeds the difference between rows of one field; else it is texture or noise.
 """
 
 from __future__ import annotations
@@ -31,10 +29,7 @@ _LEAST_PICTURES_SHARE = 0.25
 
 
 def combing(picture: np.ndarray) -> float:
-    """Return how much of what the two fields of a picture (h, w, 3) uint8 differ is motion between them, 0 to 1.
-
-    0 for pictures that are too small, of scenes at rest, and of next to no contrast.
-    """
+    """Return what share, 0 to 1, of the difference of a picture's fields (h, w, 3) uint8 is motion between them."""
     height, width = picture.shape[0] // 2 * 2, picture.shape[1]
     if min(height, width) < _SHORTEST_SIDE_PX:
         return 0.0
@@ -52,10 +47,7 @@ def is_interlaced(pictures: Sequence[np.ndarray]) -> bool:
 
 
 def deinterlaced(picture: np.ndarray) -> np.ndarray:
-    """Return the even field of a picture (h, w, 3) uint8 at its size: odd rows are the mean of those above and below.
-
-    Even rows stay where they are, so that nothing is shifted and a calibration still fits.
-    """
+    """Return the even field of a picture (h, w, 3) uint8 at its size: odd rows are the mean of those around."""
     out = picture.copy()
     even = picture[::2]
     above, below = even[: len(picture) // 2], np.concatenate([even[1:], even[-1:]])[: len(picture) // 2]

@@ -1,9 +1,7 @@
 """Two views packed into one picture: side by side or above each other, whole or squeezed to half their width or height.
 
-The halves of a stereo picture show the same tissue, shifted sideways by a few percent and not vertically. The fine
-detail of both halves is compared, since illumination is similar in the halves of any endoscopic picture. Reflections of
-two lamps and text over both halves are similar, too: saturated pixels and those that never change are left out, bright
-ones count no more than others, and the halves must agree in several tiles.
+Fine detail of both halves must agree, shifted sideways by a few percent, in several tiles. Saturated and constant
+pixels are left out: reflections of two lamps and text are similar.
 """
 
 from __future__ import annotations
@@ -52,11 +50,8 @@ _STILL_LEVELS, _LEAST_STILL_PICTURES, _MOST_STILL_SHARE = 3, 3, 0.5
 class Packing:
     """The packing of two views into one picture.
 
-    Attributes
-    ----------
-    layout : side by side, the left eye's on the left; or above each other, the left eye's on top.
-    squeezed : whether each has only half its width (left-right) or height (top-bottom).
-    correlation : of the detail of both views, median over the pictures; NaN where it was not measured.
+    layout : left-right or top-bottom, the left eye's first. squeezed : to half the width or height. correlation : of
+    both views' detail, median over the pictures; NaN where not measured.
     """
 
     layout: Layout
@@ -100,10 +95,7 @@ def squeezed_views(width: int, height: int, layout: Layout, pixel_aspect: float 
 
 
 def packing(pictures: Sequence[np.ndarray], pixel_aspect: float = 1.0) -> Packing | None:
-    """Return how two views are packed into pictures (h, w, 3) uint8 of one video; None: they show one view.
-
-    `pixel_aspect` is the width of a pixel over its height.
-    """
+    """Return how two views are packed into (h, w, 3) uint8 of one video, or None; pixel_aspect : width over height."""
     if not pictures:
         return None
     height, width = pictures[0].shape[:2]
@@ -129,10 +121,7 @@ def _correlations(pictures: Sequence[np.ndarray], layout: Layout) -> list[float]
 
 
 def _comparable(views: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return each view as a small grey picture (h, w) and which of its pixels are compared (h, w), 0 or 1, float32.
-
-    Left out are those that are black or saturated, and what stays the same while most of the view changes.
-    """
+    """Return each view as a small grey picture (h, w), and which of its pixels are compared (h, w), 0 or 1, float32."""
     size = (_WIDTH_PX, max(16, round(_WIDTH_PX * views[0].shape[0] / views[0].shape[1])))
     full = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in views]
     greys = np.stack([_reduced(grey, size) for grey in full]).astype(np.float32)
@@ -156,10 +145,7 @@ def _eroded(mask: np.ndarray) -> np.ndarray:
 
 
 def _alike(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
-    """Return the correlation of the detail of two halves, 0 where they agree in no one shift or in too few parts.
-
-    Each half is a grey picture and the pixels of it that are compared; None: nothing to compare.
-    """
+    """Return the correlation of the detail of two halves, 0 where they agree in no one shift or in too few parts."""
     (first, used), (second, other_used) = _detail(*one), _detail(*other)
     height, width = first.shape
     across, up = round(_MOST_SHIFT_SHARE * width), round(_MOST_SHIFT_SHARE * height)
