@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.report.canvas import ESTIMATE_COLOUR, TRUTH_COLOUR
-from scopemap.report.depth_figures import DepthScene, colour_depth, draw_depth_change, draw_depths
+from scopemap.report.depth_figures import DepthScene, colour_depth, draw_depth_change
 from scopemap.report.mesh_figures import (
     draw_mesh,
     draw_path,
@@ -108,22 +108,6 @@ def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:
         colour_depth(depth, 10, 10)
 
 
-def test_depth_sheet_has_a_column_per_kind(tmp_path: Path) -> None:
-    images = [np.full((60, 80, 3), (250, 0, 250), np.uint8)] * 2
-    depths = [np.linspace(10, 50, 4800).reshape(60, 80)] * 2
-    draw_depths(images, {"raw depth": depths, "refined depth": depths}, tmp_path / "three.png")
-    four = {"raw depth": depths, "refined depth": depths, "true depth": [depths[0], None]}
-    draw_depths(images, four, tmp_path / "four.png")
-    three = read(tmp_path / "three.png")
-    assert read(tmp_path / "four.png").shape[1] > three.shape[1]
-    assert count_colour(three, "#fa00fa") > 2 * 150 * 150
-    unknown = [np.full((60, 80), np.nan)]
-    draw_depths(images[:1], {"raw depth": unknown, "refined depth": unknown}, tmp_path / "unknown.png")
-    assert count_colour(read(tmp_path / "unknown.png"), "#000000") > 2 * 150 * 150
-    with pytest.raises(ValueError, match="as many"):
-        draw_depths(images, {"raw depth": depths[:1]}, tmp_path / "bad.png")
-
-
 def test_a_ball_is_painted_where_it_projects() -> None:
     view = inside_view(np.eye(4))
     picture = mesh_picture(coloured_ball((10.0, -5.0, 50.0), 8.0, (200, 40, 30)), view)
@@ -149,38 +133,7 @@ def test_outside_views_hold_the_whole_mesh() -> None:
         assert (mesh_picture(mesh, view) != 255).any(-1).mean() > 0.15
 
 
-def test_mesh_picture_shows_mesh_and_truth(tmp_path: Path) -> None:
-    mesh, truth = coloured_ball((0, 0, 60.0), 20.0, (0, 0, 220)), coloured_ball((0, 0, 60.0), 20.0, (220, 0, 0))
-    empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
-    draw_mesh(mesh, tmp_path / "with.png", np.eye(4), truth)
-    draw_mesh(mesh, tmp_path / "without.png")
-    draw_mesh(empty, tmp_path / "empty.png", np.eye(4))
-    both, alone = read(tmp_path / "with.png").astype(int), read(tmp_path / "without.png").astype(int)
-    assert ((both[..., 2] > 60) & (both[..., 0] < 5)).sum() > 5000
-    assert ((both[..., 0] > 60) & (both[..., 2] < 5)).sum() > 5000
-    assert ((alone[..., 0] > 60) & (alone[..., 2] < 5)).sum() == 0
-    assert (read(tmp_path / "empty.png") > 250).mean() > 0.95
-
-
 # ---- depth
-
-
-def test_depth_changes_share_one_scale(tmp_path: Path) -> None:
-    image = np.full((40, 60, 3), (250, 0, 250), np.uint8)
-    flat = np.full((40, 60), 30.0)
-    ramp = flat + np.linspace(0, 10, 60)
-    steady, jumpy, unknown = (flat, flat), (flat, ramp), (flat, np.full_like(flat, NAN))
-    scene = DepthScene("colon", (image, image), {"MAPIS": steady, "plain": jumpy, "lost": unknown})
-    draw_depth_change(scene, tmp_path / "depth.png")
-    picture = read(tmp_path / "depth.png")
-    assert count_colour(picture, "#fa00fa") > 2 * 150 * 100  # the two frames
-    no_change, most = "#ffffcc", "#800026"
-    assert count_colour(picture, no_change) > 150 * 100
-    assert count_colour(picture, most) > 50
-    # Black are the unknown depth and its difference: as many panels as there are frames.
-    assert count_colour(picture, "#000000") > 0.9 * count_colour(picture, "#fa00fa")
-    draw_depth_change(DepthScene("colon", (image, image), {"MAPIS": steady}), tmp_path / "steady.png")
-    assert count_colour(read(tmp_path / "steady.png"), no_change) > 150 * 100
 
 
 # ---- paths over meshes
@@ -204,17 +157,6 @@ def test_a_path_is_drawn_where_it_projects() -> None:
     # The gap: nothing between the two stretches but the ball.
     assert not green[int(pixels[4, 1]) + 5 : int(pixels[0, 1]) - 5].any()
     assert (rows.min(), rows.max()) == pytest.approx((pixels[3, 1], pixels[0, 1] + 4), abs=3)
-
-
-def test_outside_views_hold_the_path_too() -> None:
-    path = np.array([[0.0, 0.0, -200.0], [NAN] * 3, [50.0, 0.0, 0.0]])
-    for view in outside_views(BALL, np.eye(4), path).values():
-        local = (path[[0, 2]] - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
-        pixels = view.camera.project(local)
-        assert (local[:, 2] > 0).all()
-        assert pixels.min() >= 0
-        assert pixels.max() <= view.camera.width - 1
-    assert len(outside_views(trimesh.Trimesh(), None, np.full((3, 3), NAN))) == 2
 
 
 @settings(max_examples=30, deadline=None)
@@ -246,9 +188,3 @@ def test_a_reconstruction_shows_estimate_green_and_truth_red(tmp_path: Path) -> 
     assert is_colour(alone, ESTIMATE_COLOUR).sum() > 500
     assert is_colour(alone, TRUTH_COLOUR).sum() == 0
     assert (is_colour(both, "#7878dc") | ((both[..., 2] > 60) & (both[..., 0] < 0.7 * both[..., 2]))).sum() > 3000
-
-
-def test_a_reconstruction_of_nothing_is_white(tmp_path: Path) -> None:
-    lost = np.full((4, 3), NAN)
-    draw_reconstruction(trimesh.Trimesh(), lost, lost, tmp_path / "nothing.png", np.eye(4))
-    assert (read(tmp_path / "nothing.png") > 250).mean() > 0.95
