@@ -7,13 +7,15 @@ from pathlib import Path
 import fsspec
 import pytest
 from front_door import call
-from test_batch import QUICK, _files, _rows
+from result_files import batch_rows, compared_files
 from tiny_phantom import write_tiny
 
 from scopemap.cli.batch import videos_of
 from scopemap.errors import InputError
 from scopemap.io.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
+
+QUICK = ["--set", "mapping.method=no-triangulation"]
 
 
 @pytest.fixture
@@ -72,17 +74,17 @@ def test_a_video_is_known_by_its_address_and_content(store: fsspec.AbstractFileS
     assert key() != first
 
 
-def test_results_are_those_of_files(tmp_path: Path) -> None:
+def test_results_are_those_ofcompared_files(tmp_path: Path) -> None:
     """`file://` goes the way of every store; s3:// is in test_engines.py."""
     write_videos(tmp_path / "videos", 2)
     write_tiny(tmp_path / "videos" / "no video", frames=2)
     options = ("--camera", CAMERA, "--quiet", *QUICK)
     folder = (tmp_path / "videos").as_uri()
     assert call("batch", f"{folder}/*.mp4", "--out", tmp_path / "fetched", "--workers", 1, *options) == 0
-    rows = _rows(tmp_path / "fetched" / "batch.csv")
+    rows = batch_rows(tmp_path / "fetched" / "batch.csv")
     assert {name: row["input"] for name, row in rows.items()} == {
         f"colon_0{number}": f"{folder}/colon_0{number}.mp4" for number in range(2)
     }
     assert not (tmp_path / "fetched" / ".fetched").exists()
     assert call("batch", tmp_path / "videos" / "colon_01.mp4", "--out", tmp_path / "files", *options) == 0
-    assert _files(tmp_path / "fetched" / "colon_01") == _files(tmp_path / "files" / "colon_01")
+    assert compared_files(tmp_path / "fetched" / "colon_01") == compared_files(tmp_path / "files" / "colon_01")

@@ -19,7 +19,6 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, FrameCorrection, TrackedPose
 from scopemap.mapping.bundle_problem import Observations, Points
-from scopemap.mapping.depth_correction import depth_disagreement, depth_grid
 from scopemap.mapping.feature_tracks import FeatureTracks
 
 POSES = [
@@ -192,18 +191,3 @@ def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkey
     before = _errors(tracked, POSES)
     after = _errors([correction.pose(10 * n, T) for n, T in enumerate(tracked)], POSES)
     assert after == before if zoom else after < (0.3 * before[0], 0.3 * before[1])
-
-
-def test_disagreement_of_depth_is_that_of_keyframes_that_see_the_same() -> None:
-    T = np.stack([plane_scene.pose(at_mm=(x, 0.0, 0.0)) for x in (0.0, 4.0, 8.0)])
-    views = [plane_scene.see(pose) for pose in T]
-    grids = [depth_grid(view.depth_mm, plane_scene.EVERYWHERE) for view in views]
-    assert max(depth_disagreement(CAMERA, T, grids, (1, 2))) < 1e-3
-    grids[2] = grids[2] * np.float32(1.1)
-    every, far = depth_disagreement(CAMERA, T, grids, (1, 2))
-    assert far == pytest.approx(np.log(1.1), abs=0.01)
-    assert 0.01 < every < 0.1
-    # Keyframes that look elsewhere, and a single one, are not compared.
-    T[:, :3, 3] += [[0, 0, 0], [500, 0, 0], [1000, 0, 0]]
-    assert np.isnan(depth_disagreement(CAMERA, T, grids, (1, 2))).all()
-    assert np.isnan(depth_disagreement(CAMERA, T[:1], grids[:1], (1, 2))).all()

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
+from result_files import frame_rows
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.runner.backwards import _agree
 from scopemap.tracking.keyframe_alignment import Keyframe, KeyframeAligner
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track, TrackingLoss
@@ -60,8 +59,7 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
 
 def _rows(result: Reconstruction, folder: Path) -> list[dict[str, str]]:
     result.save(folder)
-    with (folder / "frames.csv").open(newline="", encoding="utf-8") as table:
-        return list(csv.DictReader(table))
+    return frame_rows(folder)
 
 
 def _off(result: Reconstruction, phantom: Path, frames: range) -> tuple[float, float]:
@@ -104,13 +102,3 @@ def test_nothing_goes_back_where_it_is_not_wanted(
 ) -> None:
     result = _run(phantom, monkeypatch, **changes)
     assert [result.trajectory.status[k] for k in LOST] == ["lost"] * len(LOST)
-
-
-def test_motions_that_differ_join_nothing() -> None:
-    here, turned, moved = np.eye(4), np.eye(4), np.eye(4)
-    turned[:2, :2] = [[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]
-    moved[0, 3] = 11.0
-    assert _agree([here, here, here], 50.0)
-    assert not _agree([here, turned, here], 50.0)
-    assert not _agree([here, here, moved], 50.0)
-    assert _agree([here, here, moved], 60.0)

@@ -17,8 +17,6 @@ from functools import partial
 from pathlib import Path
 
 import av
-import cv2
-import numpy as np
 import pytest
 import trimesh
 from drawn_datasets import WRITERS
@@ -67,24 +65,6 @@ def test_content_decides_not_names(tmp_path: Path) -> None:
     assert "2.png cannot be read and was left out" in sequence.warnings[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("notes.mp4", b"a line of text\n" * 300, r"notes.mp4"),
-        ("empty.mp4", b"", r"empty.mp4"),
-        ("one.png", cv2.imencode(".png", picture(0))[1].tobytes(), "holds one frame, two are needed"),
-        ("page.mov", b"<html><body>404 Not Found</body></html>", r"page.mov"),
-        ("zeros.avi", bytes(5000), r"zeros.avi"),
-    ],
-)
-def test_a_file_that_is_no_video_is_refused(
-    name: str, content: bytes, said: str, capfd: Capture, tmp_path: Path
-) -> None:
-    (tmp_path / name).write_bytes(content)
-    assert said in refused(capfd, "run", tmp_path / name, "--out", tmp_path / "out", "--quiet")
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_video_that_changes_its_size_is_refused_with_both(tmp_path: Path) -> None:
     """Two transport streams one behind the other, as recorders write them when the source is switched."""
     joined = tmp_path / "joined.ts"
@@ -101,43 +81,6 @@ def test_a_video_that_changes_its_size_is_refused_with_both(tmp_path: Path) -> N
 
 
 # ---- poses
-
-
-_SOUND = [f"{number} 1 2 3 0 0 0 1" for number in range(5)]
-
-
-def _tum(row: str) -> str:
-    return "\n".join([*_SOUND[:2], row, *_SOUND[3:]]) + "\n"
-
-
-def _kitti(matrix: np.ndarray) -> str:
-    rows = [np.eye(4)[:3]] * 2 + [matrix[:3]] + [np.eye(4)[:3]] * 2
-    return "\n".join(" ".join(f"{x:g}" for x in row.ravel()) for row in rows) + "\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (_tum("2 nan 2 3 0 0 0 1"), "line 3"),
-        (_tum("2 1 2 3 0 0 0 0"), "line 3"),
-        (_tum("2 1 2 3 9 9 9 9"), "line 3"),
-        (_tum("1 1 2 3 0 0 0 1"), "line"),
-        (_tum("two 1 2 3 0 0 0 1"), "line 3"),
-        (_tum("2 1 2 3 0 0 0"), "line 3"),
-        (_kitti(np.diag([-1.0, 1, 1, 1])), "line 3"),
-        (_kitti(np.diag([2.0, 2, 2, 1])), "line 3"),
-        (_kitti(np.full((4, 4), np.nan)), "line 3"),
-        ("", "it holds no pose"),
-        ("\0\1\2" * 99, "line 1"),
-    ],
-)
-def test_evaluate_refuses_poses_that_are_none(text: str, said: str, capfd: Capture, tmp_path: Path) -> None:
-    (tmp_path / "bad.txt").write_text(text)
-    (tmp_path / "sound.txt").write_text("\n".join(_SOUND) + "\n")
-    for files in (("bad.txt", "sound.txt"), ("sound.txt", "bad.txt")):
-        found = refused(capfd, "evaluate", tmp_path / files[0], "--truth", tmp_path / files[1])
-        assert "bad.txt" in found
-        assert said in found
 
 
 # ---- folders that may not be read, and that lead in circles
@@ -206,21 +149,6 @@ def test_links_in_a_circle_change_nothing(name: str, tmp_path: Path) -> None:
         (folder / "back").symlink_to("there")
     assert [frame.index for frame in open_sequence(entry).frames()] == found
     survey(open_sequence(entry))
-
-
-def test_a_link_to_an_ancestor_leads_nowhere(tmp_path: Path) -> None:
-    """The data set beside the folder is not found in it, and the link hides no pictures."""
-    WRITERS["c3vd"](tmp_path / "other")
-    inner = tmp_path / "study" / "mine"
-    inner.mkdir(parents=True)
-    (inner / "up").symlink_to(tmp_path)
-    (inner / "up1").symlink_to("..")
-    with pytest.raises(InputError, match="there is no image"):
-        open_sequence(tmp_path / "study")
-    (inner / "pictures").mkdir()
-    for number in range(3):
-        save(inner / "pictures" / f"{number}.png", picture(number))
-    assert open_sequence(tmp_path / "study").path == inner / "pictures"
 
 
 def test_a_path_in_a_circle_or_too_long_is_a_sentence(capfd: Capture, tmp_path: Path) -> None:

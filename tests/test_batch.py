@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from front_door import call, refused
+from result_files import batch_rows, compared_files
 from tiny_phantom import write_tiny
 
 from scopemap.cli.batch import videos_of
@@ -20,19 +20,7 @@ from scopemap.io.inputs import named_inputs
 from scopemap.report.batch_page import BatchRow, write_batch_page
 from scopemap.runner.batch import folder_names
 
-# They hold times, or what holds times.
-NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
 QUICK = ["--set", "mapping.method=no-triangulation"]
-
-
-def _files(folder: Path) -> dict[str, bytes]:
-    names = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in names.items() if name not in NOT_COMPARED}
-
-
-def _rows(file: Path) -> dict[str, dict[str, str]]:
-    with file.open(newline="") as table:
-        return {row["folder"]: row for row in csv.DictReader(table)}
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +60,7 @@ def test_results_are_those_of_single_runs_and_failures_are_named(
 ) -> None:
     out, code, killed = done
     assert (code, len(killed)) == (1, 1)
-    rows = _rows(out / "batch.csv")
+    rows = batch_rows(out / "batch.csv")
     assert {name: row["status"] for name, row in rows.items()} == {
         **{f"colon_{number}": "done" for number in range(3)},
         "poisoned": "failed",
@@ -81,7 +69,7 @@ def test_results_are_those_of_single_runs_and_failures_are_named(
     assert [rows[f"colon_{number}"]["frames"] for number in range(3)] == ["4", "5", "6"]
     single = tmp_path / "single"
     assert call("run", folder / "colon 0", "--out", single, "--quiet", *QUICK) == 0
-    expected, found = _files(single), _files(out / "colon_0")
+    expected, found = compared_files(single), compared_files(out / "colon_0")
     assert sorted(found) == sorted(expected)
     assert [name for name in expected if found[name] != expected[name]] == []
     assert (out / "colon_0" / "report.html").stat().st_size > 10_000
@@ -92,8 +80,8 @@ def test_a_part_is_every_nth_video_with_a_table_of_its_own(folder: Path, tmp_pat
     (tmp_path / "table.csv").write_text(f"input,tracking.keyframe_every\n{inputs}")
     asked = ("batch", tmp_path / "table.csv", "--out", tmp_path / "out", "--quiet", *QUICK)
     assert call(*asked, "--part", "2/3") == 0
-    assert list(_rows(tmp_path / "out" / "batch-2-of-3.csv")) == ["colon_1"]
-    rows = _rows(tmp_path / "out" / "batch.csv")
+    assert list(batch_rows(tmp_path / "out" / "batch-2-of-3.csv")) == ["colon_1"]
+    rows = batch_rows(tmp_path / "out" / "batch.csv")
     assert {name: row["status"] for name, row in rows.items()} == {
         **{"colon_0": "waiting", "colon_1": "done", "colon_2": "waiting"}
     }
@@ -104,17 +92,17 @@ def test_a_restart_does_nothing_twice(folder: Path, done: tuple[Path, int, list[
     before = {path: path.stat().st_mtime_ns for path in out.glob("colon_*/**/*")}
     assert call("batch", folder / "colon*", "--out", out, "--workers", 2, "--quiet", *QUICK) == 0
     assert {path: path.stat().st_mtime_ns for path in out.glob("colon_*/**/*")} == before
-    assert sorted(_rows(out / "batch.csv")) == ["colon_0", "colon_1", "colon_2", "poisoned"]
+    assert sorted(batch_rows(out / "batch.csv")) == ["colon_0", "colon_1", "colon_2", "poisoned"]
 
 
 def test_other_settings_do_not_pass_for_the_same(
     folder: Path, done: tuple[Path, int, list[int]], capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = done[0]
-    before = _files(out / "colon_0")
+    before = compared_files(out / "colon_0")
     assert call("batch", folder / "colon 0", "--out", out, "--frames", "0:3", *QUICK) == 1
     assert "a result of another input or of other settings" in capfd.readouterr().err
-    assert _files(out / "colon_0") == before
+    assert compared_files(out / "colon_0") == before
     assert call("batch", folder / "colon 0", "--out", out, "--quiet", *QUICK) == 0
 
 
@@ -198,11 +186,6 @@ def test_a_table_that_cannot_be_meant_is_refused(
     (tmp_path / "t.csv").write_text(text)
     assert said in refused(capfd, "batch", tmp_path / "t.csv", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("part", ["0/3", "4/3", "a/b"])
-def test_a_part_that_there_is_not_is_refused(part: str, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert "cannot read the part" in refused(capfd, "batch", "a.mp4", "--out", tmp_path / "o", "--part", part)
 
 
 def test_the_page_escapes_names_and_asks_no_network(tmp_path: Path) -> None:

@@ -21,25 +21,21 @@ from scopemap.io.opening import open_sequence
 LARGE = PinholeCamera(200.0, 201.0, 140.0, 105.0, 270, 216)
 
 
+@pytest.mark.parametrize(
+    ("fit", "size", "at", "said"),
+    [("scale", (320, 240), (200.5, 160.5), "rescaled from 640x480 px"),
+     ("crop:150,100", (400, 300), (250.0, 180.0), "cut out of 640x480 px at 150,100 px")],
+)  # fmt: skip
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: type(c).__name__)
-def test_scale_keeps_the_view_of_every_model_and_says_so(camera: CameraModel, tmp_path: Path) -> None:
+def test_the_view_of_every_model_is_kept_and_it_is_said(
+    camera: CameraModel, fit: str, size: tuple[int, int], at: tuple[float, float], said: str, tmp_path: Path
+) -> None:
+    """The pixel (100, 80) of the images sees what the pixel `at` of the calibrated ones saw."""
     write_calibration(camera, tmp_path / "camera.yaml")
-    found = read_calibration(tmp_path / "camera.yaml", (320, 240), "scale")
-    assert found.source.endswith("rescaled from 640x480 px")
-    np.testing.assert_allclose(
-        found.camera.unproject(np.array([100.0, 80.0])), camera.unproject(np.array([200.5, 160.5])), rtol=1e-12
-    )
-    assert read_calibration(tmp_path / "camera.yaml", SIZE, "scale").camera == camera
-
-
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: type(c).__name__)
-def test_crop_keeps_the_view_of_every_model_and_says_so(camera: CameraModel, tmp_path: Path) -> None:
-    write_calibration(camera, tmp_path / "camera.yaml")
-    found = read_calibration(tmp_path / "camera.yaml", (400, 300), "crop:150,100")
-    assert found.source.endswith("cut out of 640x480 px at 150,100 px")
-    np.testing.assert_allclose(
-        found.camera.unproject(np.array([100.0, 80.0])), camera.unproject(np.array([250.0, 180.0])), rtol=1e-12
-    )
+    found = read_calibration(tmp_path / "camera.yaml", size, fit)
+    assert found.source.endswith(said)
+    rays = found.camera.unproject(np.array([100.0, 80.0])), camera.unproject(np.array(at))
+    np.testing.assert_allclose(*rays, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

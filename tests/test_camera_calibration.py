@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
-from PIL import Image
 
 from scopemap.calibration.camera_calibration import (
     FORMS,
@@ -21,7 +20,6 @@ from scopemap.calibration.camera_calibration import (
     warnings_about,
     with_deviations,
 )
-from scopemap.calibration.residual_picture import draw_calibration
 from scopemap.calibration.targets import (
     BoardView,
     CharucoBoard,
@@ -199,16 +197,6 @@ def test_stray_corners_go_and_shortcomings_are_said(pinhole_search: Search, pinh
 # ---- what cannot serve
 
 
-def test_corners_without_sense_are_refused(pinhole_search: Search) -> None:
-    rng = np.random.default_rng(0)
-    noisy = [
-        replace(view, corners=Corners(view.corners.board_mm, rng.permutation(view.corners.pixels)))
-        for view in pinhole_search.views
-    ]
-    with pytest.raises((InputError, CalibrationError), match=r"^(calibrating|fitting the camera)"):
-        save_calibration(calibrate(replace(pinhole_search, views=noisy), CHECKERBOARD, "pinhole"), Path("no.yaml"))
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -258,10 +246,3 @@ def test_a_camera_that_commands_would_refuse_is_not_written(pinhole: CameraCalib
     with pytest.raises(CalibrationError, match="no file was written: the fitted camera does not fit"):
         save_calibration(narrow, file)
     assert [each.read_text() for each in tmp_path.iterdir()] == ["the earlier one"]
-
-
-def test_the_picture(pinhole: CameraCalibration, tmp_path: Path) -> None:
-    draw_calibration(pinhole, tmp_path / "calibration.png")
-    assert Image.open(tmp_path / "calibration.png").size == (1100, 500)
-    with pytest.raises(InputError, match="drawing the calibration"):
-        draw_calibration(pinhole, tmp_path / "none" / "calibration.png")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from result_files import through_checkpoint
 
 from scopemap.config import TrackingSettings
 from scopemap.errors import InputError
@@ -50,21 +51,10 @@ def _same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and (one == other or (one != one and other != other))
 
 
-def _through(file: Path, value: object, now: object = None) -> Any:
-    written = SavedState(file)
-    written.put("part", value)
-    written.commit({"last": 1})
-    written.close()
-    read = SavedState(file)
-    found = read.restore("part", now)
-    read.close()
-    return found
-
-
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(value=_VALUES)
 def test_values_come_back(tmp_path: Path, value: object) -> None:
-    found = _through(tmp_path / "state", value)
+    found = through_checkpoint(tmp_path / "state", value)
     assert type(found) is type(value)
     assert _same(value, found)
 
@@ -84,7 +74,7 @@ def test_own_objects_come_back_shared_and_keep_what_is_not_stored(tmp_path: Path
         **{"settings": TrackingSettings(keyframe_every=3), "flow": before, "foreign": _Foreign(1), "kind": Track},
     }
     now = {"flow": flow, "foreign": _Foreign(2)}
-    found = _through(tmp_path / "state", state, now)
+    found = through_checkpoint(tmp_path / "state", state, now)
     assert found["b"][0] is found["a"]
     assert found["b"][1] is found["a"].T_world_camera
     assert found["column"].flags.f_contiguous
@@ -100,7 +90,7 @@ def test_own_objects_come_back_shared_and_keep_what_is_not_stored(tmp_path: Path
 
 def test_no_class_but_scopemaps_is_made(tmp_path: Path) -> None:
     file = tmp_path / "state"
-    _through(file, Track(3, "ok", "", np.eye(4), 1))
+    through_checkpoint(file, Track(3, "ok", "", np.eye(4), 1))
     for name in ("subprocess:Popen", "scopemap.errors:sys", "scopemap.tracking.track:Nothing"):
         forged = SavedState(file)
         forged.put("part", Track(3, "ok", "", np.eye(4), 1))
@@ -120,7 +110,7 @@ def test_a_checkpoint_cut_anywhere_is_refused_or_whole(tmp_path: Path) -> None:
         "names": [f"frame {n}" for n in range(300)],
         "mask": rng.random(900) > 1,
     }
-    assert _same(_through(tmp_path / "whole", value), value)
+    assert _same(through_checkpoint(tmp_path / "whole", value), value)
     content, refused = (tmp_path / "whole").read_bytes(), 0
     cut = tmp_path / "cut"
     for length in range(0, len(content), 64):

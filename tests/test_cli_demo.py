@@ -15,7 +15,6 @@ from front_door import call
 from scopemap.actions import demo as demonstration
 from scopemap.actions.demo import Demonstration
 from scopemap.config import Config
-from scopemap.errors import InputError
 from scopemap.io import weights
 
 COUNT = 12
@@ -49,15 +48,6 @@ def test_the_run_is_near_the_truth(demo: Demonstration) -> None:
         assert (run / name).stat().st_size > 0
     parts = demo.result.provenance["estimators"]
     assert [name for name in parts if "sha256" in name] == ["sha256 scopenet.onnx", "features sha256 alike.onnx"]
-
-
-def test_an_earlier_run_is_kept_unless_told(demo: Demonstration, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--overwrite"):
-        demonstration.prepare_out(demo.clip.parent, overwrite=False)
-    assert demonstration.prepare_out(demo.clip.parent, overwrite=True) == demo.clip
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(InputError):
-        demonstration.prepare_out(tmp_path / "taken", overwrite=True)
 
 
 def test_the_command(demo: Demonstration, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -85,11 +85,3 @@ def test_nothing_is_replaced_unasked_and_what_cannot_be_written_is_refused(
         code, out, err = say(video, "--out", tmp_path / name, "--quiet")
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert why in err
-
-
-def test_no_video_is_one_line(say: Say, tmp_path: Path) -> None:
-    (tmp_path / "zero.mp4").write_bytes(b"")
-    for path in ("zero.mp4", "absent.mp4", "."):
-        code, out, err = say(tmp_path / path, "--quiet")
-        assert (code, out, err.count("\n")) == (1, "", 1)
-    assert not list(Path().iterdir())

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
-from numba import njit
 
 from scopemap.cli import progress
 from scopemap.cli.options import (
@@ -92,19 +91,6 @@ def test_lost_frames_and_those_of_other_maps_are_counted_apart(capfd: pytest.Cap
         assert shown.observers == ()
 
 
-def test_kernels_that_no_cache_holds_are_told_once(capfd: pytest.CaptureFixture[str]) -> None:
-    first, second = njit(lambda x: x + 1), njit(lambda x: x + 2)
-    with run_progress(3, silent=False):
-        assert (first(1), second(1)) == (2, 3)
-        assert first(2) == 3
-    assert capfd.readouterr().err == "compiling kernels, once\n"
-    third = njit(lambda x: x + 3)
-    assert third(1) == 4
-    with run_progress(3, silent=False):
-        assert third(2) == 5
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize("total", [100, None])
 def test_progress_comes_now_and_then_and_preparing_slows_no_rate(
     total: int | None, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -120,20 +106,4 @@ def test_progress_comes_now_and_then_and_preparing_slows_no_rate(
     assert capfd.readouterr().err.splitlines() == [
         f"frame 1{of}: lost: too dark",
         f"frame 21{of}: 2.0 frames/s, {left}lost: too dark",
-    ]
-
-
-def test_what_follows_the_last_frame_is_shown(capfd: pytest.CaptureFixture[str]) -> None:
-    with run_progress(2, silent=False) as (observers, tell):
-        tell("estimating the focal length", 0, 0)
-        for _ in range(2):
-            observers[0](_step())  # type: ignore[arg-type]
-        tell("adjusting keyframes", 0, 0)
-        for done in range(1, 4):
-            tell("fusing", done, 3)
-        tell("writing", 0, 0)
-    lines = capfd.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        *("estimating the focal length", "frame 1 of 2", "frame 2 of 2", "adjusting keyframes"),
-        *("fusing frame 1 of 3", "fusing frame 3 of 3", "writing"),
     ]

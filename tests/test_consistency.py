@@ -217,6 +217,3 @@ def test_unusable_arguments_are_refused() -> None:
         ConsistencyMeter(CAMERA, 0.0)
     with pytest.raises(ValueError, match="depth_mm"):
         ConsistencyMeter(CAMERA).add(np.ones((3, 3)), EVERYWHERE)
-
-
-# ---- real truth

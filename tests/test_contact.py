@@ -9,22 +9,17 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
-import trimesh
 from chosen_settings import chosen
-from drawn_run import placed_frames
 from plane_scene import CAMERA, EVERYWHERE
-from test_checkpoint import _through
+from result_files import through_checkpoint
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import Config, TrackingSettings
+from scopemap.config import TrackingSettings
 from scopemap.depth.mapis import DenseCorrespondence
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.mapping.submaps import Submap
-from scopemap.reconstruction import Reconstruction
-from scopemap.report.losses import losses
-from scopemap.report.verdict import verdict
 from scopemap.runner.submap_frames import frames_of_submap
 from scopemap.tracking.relocalisation import RotationFollower, rotation_by_flow
 from scopemap.tracking.track import Track
@@ -88,7 +83,7 @@ def test_rotations_add_up_until_flow_ends_and_a_restored_follower_goes_on_alike(
     lost = follower.follow(_track("lost"), _small(SECOND), _seen(FIRST, SECOND))
     assert lost.rotation is not None
     assert _deg(lost.rotation @ TURN) < 0.1
-    restored = _through(tmp_path / "state", follower, RotationFollower())
+    restored = through_checkpoint(tmp_path / "state", follower, RotationFollower())
     step = _track("lost"), _small(third), _seen(SECOND, third)
     later, again = follower.follow(*step), restored.follow(*step)
     assert later.rotation is not None
@@ -190,12 +185,3 @@ def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.T_world_camera, result.trajectory.T_world_camera, atol=2e-6)
     assert found.tracked.tolist() == [True] * 3 + [False] * 3 + [True, False]
     assert result.frames.place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
-
-
-def test_the_report_tells_them_from_other_lost_frames() -> None:
-    place = [0] * 40 + [ROTATED] * 3 + [LOST] * 2 + [0] * 40
-    frames = placed_frames(place, cause=["" if number == 0 else "contact with the wall" for number in place])
-    run = Reconstruction(CAMERA, frames, trimesh.Trimesh(), Config(), {"camera": {"source": "file"}})
-    assert [(loss.first, loss.frames) for loss in losses(frames)] == [(40, 5)]
-    texts = " ".join(reason.text for reason in verdict(run).reasons)
-    assert "In 5 frames the camera could not be followed but for its rotation in 3." in texts

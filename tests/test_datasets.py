@@ -138,14 +138,12 @@ def _one_image(folder: Path) -> Path:
     return folder
 
 
-def _empty_file(folder: Path) -> Path:
-    (folder / "v.mp4").write_bytes(b"")
-    return folder / "v.mp4"
+def _no_video(content: bytes) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        (folder / "v.mp4").write_bytes(content)
+        return folder / "v.mp4"
 
-
-def _noise_file(folder: Path) -> Path:
-    (folder / "v.mp4").write_bytes(np.random.default_rng(0).bytes(4000))
-    return folder / "v.mp4"
+    return write
 
 
 def _headless_video(folder: Path) -> Path:
@@ -166,8 +164,8 @@ def _broken_images(folder: Path) -> Path:
         (lambda folder: folder / "nowhere", "no such file or folder"),
         (lambda folder: folder, "there is no image"),
         (_one_image, "two are needed"),
-        (_empty_file, r"v\.mp4"),
-        (_noise_file, r"v\.mp4"),
+        (_no_video(b""), r"v\.mp4"),
+        (_no_video(np.random.default_rng(0).bytes(4000)), r"v\.mp4"),
         (_headless_video, r"v\.mp4"),
         (_broken_images, "none of the 3 images can be read"),
         (lambda folder: write_video(folder / "v.mp4", 1), "holds one frame, two are needed"),
@@ -186,36 +184,6 @@ def test_frames_of_changing_size_are_named(tmp_path: Path) -> None:
         save(tmp_path / f"{i}.png", picture(i, SIZE if i < 2 else (64, 48)))
     with pytest.raises(InputError, match=r"2\.png: it is 64x48 px"):
         frames_of(open_sequence(tmp_path))
-
-
-def test_one_broken_image_is_left_out_with_a_warning(tmp_path: Path) -> None:
-    for i in range(4):
-        save(tmp_path / f"{i}.png", picture(i))
-    (tmp_path / "1.png").write_bytes(b"")
-    sequence = open_sequence(tmp_path)
-    assert [f.index for f in frames_of(sequence)] == [0, 2, 3]
-    assert "1.png" in sequence.warnings[0]
-
-
-def test_options_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    folder = write_c3vd(tmp_path / "c")
-    video = write_video(tmp_path / "v.mp4", 4)
-    with pytest.raises(InputError, match=r"choose one of scared-c, scared, .*, c3vd, .*, images"):
-        open_sequence(folder, dataset="nosuch")
-    with pytest.raises(InputError, match="it is a folder"):
-        open_sequence(folder, dataset="video")
-    with pytest.raises(InputError, match="it is a file"):
-        open_sequence(video, dataset="c3vd")
-    with pytest.raises(InputError, match="step must be positive"):
-        open_sequence(folder, frames=slice(None, None, -1))
-    with pytest.raises(InputError, match="1 frame"):
-        open_sequence(folder, frames=slice(3, 4))
-    with pytest.raises(InputError, match="1 readable frame"):
-        frames_of(open_sequence(video, frames=slice(3, 4)))
-    with pytest.raises(InputError, match="too small"):
-        open_sequence(folder, size=(8, 6))
-    with pytest.raises(InputError, match="field of view"):
-        open_sequence(video, fov_deg=0)
 
 
 # ---- the real folders

@@ -276,15 +276,3 @@ def test_several_series_are_refused(tmp_path: Path) -> None:
     native(tmp_path / "b" / "fourth", film(1)[:, :24], **tags)
     with pytest.raises(InputError, match="image 3 is 64x24 px, those before it are 64x48 px"):
         pictures(tmp_path / "b")
-
-
-def test_an_empty_video_is_one_sentence(tmp_path: Path) -> None:
-    file = write_dicom_video(tmp_path / "a")
-    content = file.read_bytes()
-    start = content.rindex(b"\xfe\xff\x00\xe0" + bytes(4)) + 8
-    file.write_bytes(content[:start])
-    with pytest.raises(InputError, match="the video in the DICOM file is empty"):
-        open_sequence(file)
-    file.write_bytes(content[: start + 200])
-    with pytest.raises(InputError, match="reading the video"):
-        open_sequence(file)

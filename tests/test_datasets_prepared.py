@@ -15,7 +15,6 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
-from scopemap.io.frame_choice import is_repeat, mean_difference
 from scopemap.io.opening import open_sequence
 from scopemap.io.video_format.interlacing import combing
 from scopemap.notices import Notice
@@ -83,14 +82,6 @@ def _calibration(file: Path, width: int, height: int) -> Path:
     return file
 
 
-def test_a_camera_is_that_of_one_view(tmp_path: Path) -> None:
-    file = _video(tmp_path / "v.mp4", beside)
-    of_one = open_sequence(file, camera=_calibration(tmp_path / "one.yaml", WIDTH, HEIGHT))
-    assert of_one.calibrated
-    with pytest.raises(CalibrationError, match=rf"the camera must be that of one, {WIDTH}x{HEIGHT} px \(--stereo none"):
-        open_sequence(file, camera=_calibration(tmp_path / "both.yaml", 2 * WIDTH, HEIGHT))
-
-
 def test_the_calibration_beside_stereo_images_is_that_of_one_view(tmp_path: Path) -> None:
     for number in range(4):
         save(tmp_path / f"{number}.png", above(5 * number))
@@ -143,20 +134,6 @@ def test_pictures_that_repeat_are_skipped(tmp_path: Path) -> None:
     assert len(sequence.skipped) == 5
 
 
-def test_black_borders_do_not_dilute_a_difference_and_noise_repeats_nothing() -> None:
-    still, rng = tissue(0).astype(float), np.random.default_rng(0)
-    noisy = [np.clip(still + rng.normal(0, 1.5, still.shape), 0, 255).astype(np.uint8) for _ in range(2)]
-    assert not is_repeat(*noisy)
-    assert is_repeat(noisy[0], noisy[0])
-    assert not is_repeat(*[np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * 2)
-    one = tissue(0)
-    other = np.clip(one + 1, 0, 255).astype(np.uint8)
-    assert mean_difference(one, other) == pytest.approx(1, abs=0.01)
-    for view in (one, other):
-        view[:, 40:] = 0
-    assert mean_difference(one, other) == pytest.approx(1, abs=0.01)
-
-
 def test_what_creeps_adds_up(tmp_path: Path) -> None:
     """Each picture differs from the one before by less than counts as new, the third from the first by more."""
     for number in range(7):
@@ -172,20 +149,6 @@ def test_a_still_is_one_frame_and_says_so(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"frame 3 repeats frame 0; .*input\.skip_duplicates=false"):
         _indices(tmp_path)
     assert _indices(tmp_path, skip_duplicates=False) == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize(
-    ("fps", "kept"),
-    [
-        (25.0, list(range(20))),
-        (12.5, list(range(0, 20, 2))),
-        (10.0, [0, 3, 5, 8, 10, 13, 15, 18]),
-        (2.0, [0, 13]),
-    ],
-)
-def test_at_most_so_many_frames_a_second(fps: float, kept: list[int], tmp_path: Path) -> None:
-    file = write(tmp_path / "v.mp4", clip(20, size=(64, 48)))
-    assert _indices(file, fps=fps) == kept
 
 
 def test_the_rate_is_that_of_the_time_stamps(tmp_path: Path) -> None:

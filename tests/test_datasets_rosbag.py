@@ -157,16 +157,6 @@ def test_the_calibrated_then_the_coloured_then_the_left_then_the_longest_topic_i
     assert any("the only camera_info, /x/camera_info" in n for n in source.notes) == ("/x/camera_info" in infos)
 
 
-def test_times_without_stamps_are_those_of_recording(tmp_path: Path) -> None:
-    bag = Bag()
-    for number in range(3):
-        bag.image(IMAGE, number, picture(number, SIZE), "rgb8", stamp_ns=0)
-    source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
-    expected = [(START_NS + number * STEP_NS + 5) / 1e9 for number in range(3)]
-    np.testing.assert_allclose([time for _, time in source.stamps(slice(None))], expected)
-    assert any("when they were recorded" in note for note in source.notes)
-
-
 # ---- cameras
 
 PINHOLE, EIGHT = PinholeCamera(60, 61, 31, 24, *SIZE), (0.1, 0.2, 0.01, 0.02, 0.3, 0.01, 0.02, 0.03)

@@ -173,15 +173,3 @@ def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("scopemap.io.datasets.rosbag.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install -e '\.\[ros\]'"):
         open_sequence(file)
-
-
-def test_messages_of_another_serialization_are_named(tmp_path: Path) -> None:
-    file = small_bag().write_ros2(tmp_path / "a", "MCAP") / "a.mcap"
-    content = file.read_bytes()
-    assert content[17:25] == b"\x04\0\0\0ros2"
-    file.write_bytes(content[:21] + b"ros1" + content[25:])
-    with pytest.raises(InputError, match="Profile is not ros2"):
-        open_sequence(file)
-    file.write_bytes(content.replace(b"\x03\0\0\0cdr", b"\x03\0\0\0pb3"))
-    with pytest.raises(InputError, match="holds no images"):
-        open_sequence(file)

@@ -124,23 +124,6 @@ def test_mended_times_increase(stamps: list[float | None]) -> None:
     assert (mend.first_repaired is None) == (mend.repaired == 0)
 
 
-@pytest.mark.parametrize(
-    ("stamps", "expected", "repaired"),
-    [
-        ([0.0, 0.04, 0.09, 0.2], [0.0, 0.04, 0.09, 0.2], 0),
-        ([None, None, None], [0.0, 0.04, 0.08], 3),
-        ([0.0, None, 0.08], [0.0, 0.04, 0.08], 1),
-        ([0.0, 0.04, 0.04, 0.08], [0.0, 0.04, 0.08, 0.12], 2),
-        ([0.0, 2.0, 0.0, 0.04], [0.0, 2.0, 2.04, 2.08], 1),
-        ([0.0, 0.04, 1e5, 1e5 + 0.04], [0.0, 0.04, 0.08, 0.12], 1),
-    ],
-)
-def test_how_times_are_mended(stamps: list[float | None], expected: list[float], repaired: int) -> None:
-    mend = TimeStamps(25.0)
-    assert [mend(index, stamp) for index, stamp in enumerate(stamps)] == pytest.approx(expected)
-    assert mend.repaired == repaired
-
-
 def test_a_stream_without_a_clock_counts_frames(tmp_path: Path) -> None:
     file = encode(tmp_path / "v.h264", clip(6, size=(64, 48)), pix_fmt="yuv420p")
     source = VideoFile(file)

@@ -15,7 +15,6 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimate
-from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 
 CAMERA = PinholeCamera(60.0, 60.0, 29.5, 19.5, 60, 40)
@@ -110,30 +109,6 @@ def test_without_shift_it_is_the_papers_baseline_and_frame_1_keeps_the_metric_de
     np.testing.assert_allclose(second_mm[known], (75.0 * baseline_mm / estimate.values)[known], rtol=1e-4)
 
 
-def test_an_anchor_beyond_the_limit_says_so() -> None:
-    metric = anchored(anchor="depth-pro", max_depth_mm=5.0).metric(disparity(), frame())
-    assert np.isnan(metric.depth_mm).all()
-    assert metric.limit_note.startswith("no scale by depth-pro: 100% of its depth is beyond depth.max_depth_mm = 5 (")
-    own = anchored(backend="depth-pro", max_depth_mm=5.0).metric(DepthEstimate(TRUTH_MM, "depth"), frame())
-    assert own.limit_note.startswith("100% of its depth is beyond depth.max_depth_mm = 5 (")
-    assert anchored(anchor="depth-pro").metric(disparity(), frame()).limit_note == ""
-
-
-@pytest.mark.parametrize(
-    ("focal_px", "whose", "words"),
-    [
-        (75.0, "camera", ", times 0.800: the camera's focal length is 60 px, it finds 75 px"),
-        (75.0, "network", ", by the focal length that it finds, 75 px"),
-        (60.0, "camera", ", by the focal length that it finds, 60 px"),
-        (None, "camera", ""),
-    ],
-)
-def test_the_description_says_what_scaled_depth_pro(focal_px: float | None, whose: str, words: str) -> None:
-    anchor = anchored(Metric(focal_px=focal_px), anchor="depth-pro", depth_pro_focal=whose)
-    depth_of(anchor, disparity(), frame())
-    assert anchor.description == f"Depth Pro on frame 0{words}"
-
-
 @pytest.mark.parametrize("factor", [0.02, 1.0, 40.0])
 def test_predicted_depth_is_scaled_to_the_anchor(factor: float) -> None:
     floating = DepthEstimate((factor * TRUTH_MM).astype(np.float32), "depth")
@@ -165,19 +140,6 @@ def test_an_unusable_first_frame_leaves_the_anchor_to_the_next() -> None:
     assert "not anchored" in anchor.description
     assert np.isfinite(depth_of(anchor, disparity(), frame(1))).all()
     assert anchor.description.startswith("Depth Pro on frame 1")
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"anchor": "near-far"}, "needs a range"),
-        ({"near_far_mm": (50.0, 20.0)}, "smaller than farthest"),
-        ({"near_far_mm": (0.0, 20.0)}, "positive"),
-    ],
-)
-def test_impossible_ranges_are_refused(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
-        anchored(**values)
 
 
 @pytest.mark.parametrize(("factor", "nearest_mm"), [(30.0, 1000 / 30), (100.0, 10.0), (1000.0, 1.0)])

@@ -16,10 +16,8 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.backends import create_anchor, create_depth
 from scopemap.depth.files import FilesDepth
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError
 from scopemap.frame import Frame
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
@@ -159,13 +157,3 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
     write(tmp_path, "00.png", ramp(np.uint8, 255))
     with pytest.raises(InputError, match="have the same number"):
         files(tmp_path)
-
-
-def test_the_registry_knows_its_names(tmp_path: Path) -> None:
-    write(tmp_path, "0.png", ramp(np.uint8, 255))
-    assert create_depth(DepthSettings(), SAME, "cpu").name == "scopenet"
-    assert create_depth(chosen(DepthSettings, backend="shading"), SAME, "cpu").name == "shading"
-    assert isinstance(create_depth(chosen(DepthSettings, backend=f"files:{tmp_path}"), SAME, "cpu"), FilesDepth)
-    assert isinstance(create_anchor(DepthSettings(), "cpu"), AnchoredDepth)
-    with pytest.raises(SettingsError, match="shading, depth-anything, depth-pro or files:FOLDER"):
-        create_depth(chosen(DepthSettings, backend="midas"), SAME, "cpu")

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
-from scopemap.depth.guided import masked_mean
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
 
@@ -107,16 +106,3 @@ def test_smoothing_removes_texture_and_keeps_a_step_in_depth() -> None:
     assert np.median(far) / np.median(near) == pytest.approx(4.0, rel=0.1)
     assert np.std(near) / np.mean(near) < 0.03
     assert np.median(values[30:98, 81:83]) > 2 * np.median(values[30:98, 77:79])
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), radius_px=st.integers(1, 4))
-def test_masked_mean_is_the_mean_of_the_known_pixels(seed: int, radius_px: int) -> None:
-    rng = np.random.default_rng(seed)
-    image, known = rng.normal(size=(13, 17)).astype(np.float32), rng.random((13, 17)) < 0.3
-    image[~known] = np.nan
-    found = masked_mean(image, known, radius_px)
-    for y, x in ((6, 8), (5, 5), (8, 12)):
-        window = image[y - radius_px : y + radius_px + 1, x - radius_px : x + radius_px + 1]
-        expected = np.nan if np.isnan(window).all() else np.nanmean(window)
-        assert found[y, x] == pytest.approx(expected, abs=1e-4, nan_ok=True)

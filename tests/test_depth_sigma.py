@@ -171,6 +171,3 @@ def test_a_fused_pixel_counts_by_its_trust_and_never_more_than_without() -> None
     assert weighed.weight[0, 0, 0] == pytest.approx(share * plain.weight[0, 0, 0], rel=1e-4)
     assert weighed.weight[8, 0, 0] == pytest.approx(plain.weight[8, 0, 0], rel=1e-6)
     assert weighed.weight[15, 0, 0] == pytest.approx(plain.weight[15, 0, 0], rel=1e-6)
-
-
-# ---- the whole story

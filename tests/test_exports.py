@@ -111,14 +111,8 @@ def test_rgbd_as_endogslam_reads_it(run: Path, tmp_path: Path) -> None:
     facts = yaml.safe_load((folder / "camera.yaml").read_text())
     known = facts["camera_params"]
     assert facts["dataset_name"] == "c3vd"
-    assert [known[name] for name in ("image_height", "image_width", "fx", "fy", "cx", "cy")] == [
-        64,
-        80,
-        60,
-        60,
-        39.5,
-        31.5,
-    ]
+    names = ("image_height", "image_width", "fx", "fy", "cx", "cy")
+    assert [known[name] for name in names] == [64, 80, 60, 60, 39.5, 31.5]
     colours, depths = sorted((folder / "color").glob("*.png")), sorted((folder / "depth").glob("*.tiff"))
     assert len(colours) == len(depths) == IN_RESULT
     for index in (0, 13):

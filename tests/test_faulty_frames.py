@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from front_door import warned
+from result_files import frame_rows
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
@@ -48,8 +48,7 @@ def _break(patch: pytest.MonkeyPatch, kind: type, name: str, calls: set[int], er
 
 def _lost(out: Path) -> dict[int, str]:
     """The reasons by the numbers of the frames that a result calls lost."""
-    with (out / "frames.csv").open(newline="", encoding="utf-8") as table:
-        return {int(row["index"]): row["reason"] for row in csv.DictReader(table) if row["status"] == "lost"}
+    return {int(row["index"]): row["reason"] for row in frame_rows(out) if row["status"] == "lost"}
 
 
 @pytest.mark.parametrize(

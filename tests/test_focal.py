@@ -10,17 +10,16 @@ import cv2
 import numpy as np
 import pytest
 from front_door import said
-from turning_clip import SIZE, focal_of, write_clip
+from turning_clip import focal_of, write_clip
 
 from scopemap.calibration.focal_length.from_motion import (
     FocalEstimate,
     WindowFit,
     adjust_window,
     combine,
-    focal_from_motion,
     with_focal_from_motion,
 )
-from scopemap.calibration.focal_length.windows import Window, windows_of
+from scopemap.calibration.focal_length.windows import Window
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.geometry.se3 import so3_exp
@@ -149,17 +148,6 @@ def test_less_tilt_and_disagreement_increase_the_deviation() -> None:
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clips") / "turning", 100.0, 48)
-
-
-def test_the_focal_length_is_estimated_from_images_of_a_rotating_camera(turning: Path) -> None:
-    sequence = open_sequence(turning)
-    estimate = focal_from_motion(sequence, Config())
-    assert estimate.reason == ""
-    assert estimate.share < 0.06
-    assert estimate.focal_px == pytest.approx(focal_of(100.0), rel=2 * estimate.share)
-    window = next(windows_of(sequence, Config()))
-    assert window.seen.shape == (len(window.start), 6, 2)
-    assert window.half_width_px == SIZE[0] / 2
 
 
 def test_a_run_uses_the_estimate_and_saves_its_deviation(turning: Path, tmp_path: Path) -> None:

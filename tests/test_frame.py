@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import check_shape
 from scopemap.frame import Frame, percentiles
 
 CAMERA = PinholeCamera(50.0, 50.0, 19.5, 14.5, 40, 30)
@@ -35,23 +34,6 @@ def _frame(**parts: object) -> Frame:
 def test_a_part_of_another_shape_is_refused_by_name(part: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=rf"Frame\.{part}: expected an array of shape .* got \({shape[0]}, "):
         _frame(**{part: np.zeros(shape)})
-
-
-@pytest.mark.parametrize(
-    ("found", "wanted", "fits"),
-    [
-        ((2, 3), (None, 3), True),
-        ((2, 3), (None, None), True),
-        ((2, 3), (2,), False),
-        ((2, 3), (None, 2), False),
-    ],
-)
-def test_check_shape(found: tuple[int, ...], wanted: tuple[int | None, ...], fits: bool) -> None:
-    if fits:
-        check_shape("it", np.zeros(found), wanted)
-        return
-    with pytest.raises(ValueError, match=r"^it: expected an array of shape"):
-        check_shape("it", np.zeros(found), wanted)
 
 
 @pytest.mark.parametrize("count", [1, 2, 1001])

@@ -11,13 +11,10 @@ from chosen_settings import chosen
 from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, plane_frame, sphere_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
 from scopemap.config import FusionSettings
-from scopemap.frame import Frame
 from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.geometry.se3 import se3, so3_exp
 
 
 def _lenient(**advanced: float) -> FusionSettings:
@@ -67,49 +64,6 @@ def test_slanted_plane_is_exact_and_ends_with_the_view(tilt_x: float, tilt_y: fl
     assert (mesh.face_normals @ normal < 0).all()
 
 
-def brute_force_field(frames: list[Frame], points: np.ndarray, given: FusionSettings) -> tuple[np.ndarray, np.ndarray]:
-    """The field at `points` (N, 3) by plain array operations: one smooth surface, no depth edges."""
-    total, weights = np.zeros(len(points)), np.zeros(len(points))
-    for frame in frames:
-        camera, depth = frame.camera, frame.depth_mm.astype(np.float64)
-        local = transform(inverse(frame.T_world_camera), points)
-        u, v = camera.project(local).T
-        inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1) & (local[:, 2] > 0)
-        surface = camera.unproject(np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1))
-        surface *= depth[..., None]
-        tangent_u, tangent_v = np.gradient(surface, axis=1), np.gradient(surface, axis=0)
-        normals = np.cross(tangent_u, tangent_v)
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        col, row = np.round(u[inside]).astype(int), np.round(v[inside]).astype(int)
-        n, z = normals[row, col], local[inside, 2]
-        seen = 1 / map_coordinates(1 / depth, [v[inside], u[inside]], order=1)
-        hit = local[inside] * (seen / z)[:, None]
-        distance = np.clip(np.einsum("ij,ij->i", n, hit - local[inside]), -given.truncation_mm, given.truncation_mm)
-        far = np.linalg.norm(surface[row, col], axis=1)
-        weight = np.einsum("ij,ij->i", n, surface[row, col]) / far / (1 + (2 * far / given.max_depth_mm) ** 2)
-        weight *= np.clip((given.truncation_mm + seen - z) / (0.8 * given.truncation_mm), 0, 1)
-        total[inside] += weight * distance
-        weights[inside] += weight
-    return total / np.maximum(weights, 1e-9), weights
-
-
-def test_field_agrees_with_brute_force() -> None:
-    poses = [se3(so3_exp(np.array([0.1 * k, -0.2 * k, 0.3])), np.array([k, -k, 2.0 * k])) for k in range(3)]
-    frames = [sphere_frame(T, 25.0) for T in poses]
-    volume = TsdfVolume(LENIENT)
-    for frame in frames:
-        volume.integrate(frame)
-    voxels = volume._blocks.dense(np.array([-1, -1, 2]), 2)
-    i, j, k = np.meshgrid(*[np.arange(16)] * 3, indexing="ij")
-    points = np.stack([i - 8, j - 8, k + 16], -1).reshape(-1, 3).astype(np.float64)
-    field, weight = brute_force_field(frames, points, LENIENT)
-    # Farther in front, blocks are made only where a ray passes within the truncation.
-    known = (weight > 0.5) & (np.abs(field) < 2.5)
-    assert known.sum() > 1000
-    assert np.abs(voxels.weight.ravel() - weight)[known].max() < 0.02
-    assert np.abs(voxels.tsdf.ravel() - field)[known].max() < 0.03
-
-
 def test_no_wall_grows_behind_a_silhouette() -> None:
     depth = np.full((VIEW.height, VIEW.width), 60.0)
     depth[:, :80] = 40.0
@@ -120,15 +74,6 @@ def test_no_wall_grows_behind_a_silhouette() -> None:
     assert np.minimum(np.abs(z - 40), np.abs(z - 60)).max() < 0.3
     assert (np.abs(z - 40) < 0.3).sum() > 300
     assert (np.abs(z - 60) < 0.3).sum() > 300
-
-
-def test_far_from_the_origin_nothing_changes(sphere: TsdfVolume) -> None:
-    # 10 m away and in negative coordinates, by whole voxels: the same mesh, moved.
-    centre = np.array([-9999.0, 4321.0, -777.0])
-    moved, mesh = sphere_volume(25.0, centre).extract_mesh(), sphere.extract_mesh()
-    assert len(moved.vertices) == pytest.approx(len(mesh.vertices), rel=0.001)
-    assert cKDTree(mesh.vertices).query(moved.vertices - centre)[0].max() < 0.01
-    assert moved.is_watertight
 
 
 def test_colours_come_from_the_pixels() -> None:
@@ -175,17 +120,6 @@ def test_pixels_that_must_not_count_do_not() -> None:
     strict = TsdfVolume(_lenient(min_incidence=0.5))
     strict.integrate(grazing)
     assert strict.block_count == 0
-
-
-def test_frames_without_depth_or_pose_are_refused() -> None:
-    volume, frame = TsdfVolume(LENIENT), plane_frame(AHEAD, 40.0)
-    with pytest.raises(ValueError, match="no depth_mm"):
-        volume.integrate(replace(frame, depth_mm=None))
-    with pytest.raises(ValueError, match="no T_world_camera"):
-        volume.integrate(replace(frame, T_world_camera=None))
-    for bad in (np.nan, np.inf, 1e9):
-        with pytest.raises(ValueError, match="pose"):
-            volume.integrate(replace(frame, T_world_camera=se3(np.eye(3), np.array([0.0, bad, 0.0]))))
 
 
 def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:

@@ -36,14 +36,6 @@ def test_what_is_set_stays_and_the_rest_follows_it() -> None:
     assert choose_parameters(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
 
 
-def test_a_volume_without_sizes_is_refused() -> None:
-    for median_mm in (None, float("nan"), 0.0):
-        with pytest.raises(ValueError, match="median depth must be known"):
-            choose_parameters(FusionSettings(), median_mm)
-    with pytest.raises(ValueError, match=r"fusing without fusion\.voxel_mm"):
-        TsdfVolume(FusionSettings())
-
-
 def test_the_store_returns_what_it_was_given_in_order_and_by_number(tmp_path: Path) -> None:
     store, frames = FrameStore(tmp_path), [wall(depth_mm, n) for n, depth_mm in enumerate((20_000.0, 30.0, 40.0))]
     frames[1] = replace(frames[1], depth_sigma_mm=np.full((120, 160), 0.3, np.float32), T_world_camera=None)
@@ -65,16 +57,6 @@ def test_the_store_returns_what_it_was_given_in_order_and_by_number(tmp_path: Pa
     assert store.median_depth_mm({3}) is None
     # Depth beyond the range is unknown.
     assert np.isnan(store.frame(3).depth_mm).all()
-
-
-def test_the_store_keeps_one_unnamed_file(tmp_path: Path) -> None:
-    store = FrameStore(tmp_path)
-    store.put(wall(30.0))
-    assert list(tmp_path.iterdir()) == []
-    store.close()
-    for advice, words in (("", "free space there"), ("or fuse at once", "free space there, or fuse at once")):
-        with pytest.raises(InputError, match=rf"cannot store frames in .*gone: No such file.*; {words}$"):
-            FrameStore(tmp_path / "gone", advice).put(wall(30.0))
 
 
 _KIND = np.dtype([("number", np.int64), ("at", np.float64, (2,))])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -30,11 +29,9 @@ from drawn_clips import (
     write,
 )
 from drawn_dicom import write_dicom_video
-from hypothesis import given
-from hypothesis import strategies as st
 
 from scopemap.errors import InputError
-from scopemap.inspection.clip import VideoFinding, covered, segments_of
+from scopemap.inspection.clip import VideoFinding
 from scopemap.inspection.inspecting import Inspection, inspect
 from scopemap.inspection.inspection_sheet import write_mask
 from scopemap.io.opening import open_sequence
@@ -276,18 +273,6 @@ def test_soft_frames_and_missing_texture_are_reported(tmp_path: Path) -> None:
     bare = inspect(images(tmp_path / "bare", moved(ramp.astype(np.uint8), 3)))
     assert "texture-low" in by_code(bare)
     assert bare.forecast.startswith("poor: walls without texture")
-
-
-@given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(0, 4))
-def test_segments_cover_what_they_are_of(flags: list[bool], least: int, gap: int) -> None:
-    true = np.array(flags, bool)
-    segments = segments_of(true, least, gap)
-    assert all(true[first] and true[last] and last - first + 1 >= least for first, last in segments)
-    assert all(b[0] - a[1] > gap + 1 for a, b in pairwise(segments))
-    if least == 1:
-        assert not (true & ~covered(segments, len(true))).any()
-        if gap == 0:
-            np.testing.assert_array_equal(covered(segments, len(true)), true)
 
 
 @pytest.mark.real

@@ -14,11 +14,8 @@ from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingConstants
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping import TrackedPose
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
-from scopemap.mapping.bundle_problem import BundleProblem
 from scopemap.mapping.loop_closure import Loop, LoopFinder
-from scopemap.mapping.pose_graph import optimise_pose_graph, tracked_pairs
+from scopemap.mapping.pose_graph import optimise_pose_graph
 
 # Out to the side and back again.
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
@@ -118,15 +115,6 @@ def _loop(past: int, new: int, T_new_past: np.ndarray) -> Loop:
     return Loop(past, new, T_new_past, 0.0, *(np.zeros((0, 2)),) * 4)
 
 
-def test_keyframes_are_paired_with_their_reference_keyframes() -> None:
-    tracked = [(0, 0, 0), (10, 0, 0), (15, 1, 15), (20, 1, 15), (30, 0, 0), (40, 0, 17), (50, 1, 20)]
-    frames, poses = [frame for frame, *_ in tracked], [TrackedPose(m, of, np.eye(4)) for _, m, of in tracked]
-    # Keyframe 40 was aligned to a frame that is no keyframe: the one before it in its map is used.
-    expected = [[0, 1], [2, 3], [0, 4], [4, 5], [3, 6]]
-    np.testing.assert_array_equal(tracked_pairs(frames, poses), expected)
-    assert tracked_pairs(frames[:1], poses[:1]).shape == (0, 2)
-
-
 def test_one_false_loop_is_an_outlier() -> None:
     poses = np.stack(POSES)
     true = [_loop(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
@@ -157,23 +145,6 @@ def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
     counts = np.bincount([loop.past for loop in loops])
     assert counts.max() <= 3
     assert max(len(loop.pixels_past) for loop in loops) <= 60
-
-
-def test_an_adjustment_that_fails_with_loops_is_repeated_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The repeated adjustment starts from the poses as tracked."""
-    starts = []
-
-    def failing(problem: BundleProblem) -> BundleSolution:
-        starts.append(problem.start)
-        found = adjust(problem)
-        return found if problem.start is None else found._replace(state=found.state._replace(sigma_px=9.9))
-
-    monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
-    correction = plane_scene.adjusted((_frame(number) for number in range(12)), SETTINGS)
-    assert [start is None for start in starts] == [False, True]
-    assert not correction.refused
-    assert correction.loops == 0
-    assert _off(correction.pose(110, POSES[11]), POSES[11])[1] < 0.3
 
 
 def test_a_loop_that_drift_cannot_explain_is_not_accepted() -> None:

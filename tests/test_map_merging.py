@@ -10,11 +10,8 @@ from hypothesis import strategies as st
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
-from scopemap.mapping.backend import _Adjusted
 from scopemap.mapping.loop_closure import Loop
 from scopemap.mapping.map_merging import merge_maps
-from scopemap.mapping.pose_interpolation import FrameCorrection
-from scopemap.notices import Notice
 
 DEPTH_MM = 50.0
 # Of nine keyframes; the second map is left and entered again.
@@ -82,19 +79,3 @@ def test_single_or_contradicting_loops_are_not_accepted() -> None:
     # Nor is an impossible scale.
     scene.S_map_true[1] = replace(scene.S_map_true[1], scale=3.0)
     assert list(merge_maps(scene.poses, MAP_OF, [scene.loop(0, 3), scene.loop(2, 7)], 0, DEPTH_MM)) == [0]
-
-
-def _adjusted(is_refused: bool, graph_px: float, support: int) -> _Adjusted:
-    refused = Notice("mapping-not-rigid", {"reason": "0.98 px", "merged": ""}) if is_refused else None
-    still = FrameCorrection(np.arange(2), np.tile(np.eye(4), (2, 1, 1)), np.zeros(2), 1.0, refused=refused, loops=9)
-    return _Adjusted(still, 0.5, 0.5, 0.5, graph_px, support)
-
-
-def test_where_tissue_moves_the_pose_graph_merges_maps_that_several_keyframes_connect() -> None:
-    alone = _adjusted(True, 2.0, 0)
-    assert _adjusted(True, 2.2, 4).accepted(alone, 0.8)
-    assert not _adjusted(True, 2.2, 3).accepted(alone, 0.8)
-    assert not _adjusted(True, 4.0, 9).accepted(alone, 0.8)
-    # A rigid map is merged by an adjustment that is accepted, and by nothing else.
-    assert not _adjusted(True, 2.0, 9).accepted(_adjusted(False, 2.0, 0), 0.8)
-    assert _adjusted(False, 9.0, 0).accepted(_adjusted(False, 2.0, 0), 0.8)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
-from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +12,10 @@ import plane_scene
 import pytest
 import trimesh
 from front_door import said, warned
+from result_files import frame_rows
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.cli.run import summary_lines
 from scopemap.config import Config, MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
@@ -26,10 +24,7 @@ from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.depth_maps import DepthReader
-from scopemap.mapping import Backend, FrameCorrection, Mapper, TrackedPose
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust
-from scopemap.mapping.bundle_problem import BundleProblem
-from scopemap.mapping.map_merging import split_maps
+from scopemap.mapping import Backend, Mapper, TrackedPose
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
@@ -116,16 +111,9 @@ def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: 
     assert written.indices.tolist() == list(range(FIRST))
     assert written.tracked.all()
     assert read_trajectory(out).tracked.tolist() == (result.frames["map"] == 0).tolist()
-    with (out / "frames.csv").open(newline="") as file:
-        assert [row["map"] for row in csv.DictReader(file)][:FIRST] == ["1"] * FIRST
+    assert [row["map"] for row in frame_rows(out)][:FIRST] == ["1"] * FIRST
     mesh = trimesh.load_mesh(out / "maps" / "1" / "mesh.ply")
     np.testing.assert_allclose(mesh.bounds, other.mesh.bounds, atol=1e-3)
-
-
-def test_the_summary_has_the_maps_in_order_of_time(result: Reconstruction) -> None:
-    line = next(line for line in summary_lines(result) if line.startswith("maps in order of time"))
-    assert line.index("maps/1 with") < line.index("the result with")
-    assert f"maps/1 with {FIRST} frames (0 to {FIRST - 1}, " in line
 
 
 def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: Path, tmp_path: Path) -> None:
@@ -204,31 +192,6 @@ def test_a_map_that_does_not_fit_is_not_merged(swelling: bool) -> None:
     assert sorted(backend.adjust(0).S_common_map) == ([0, 2] if swelling else [0, 1, 2])
 
 
-def test_the_submap_with_most_frames_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    def merging(
-        self: Backend, main: int, tracked: Mapping[int, TrackedPose], among: Collection[int]
-    ) -> FrameCorrection:
-        """Merge maps 1 and 2."""
-        maps = [number for number in ((1, 2) if main in (1, 2) else (main,)) if number in among]
-        merged = {number: Similarity.identity() for number in maps}
-        return FrameCorrection(np.zeros(1, int), np.eye(4)[None], np.zeros(1), S_common_map=merged)
-
-    monkeypatch.setattr(Backend, "keyframes", lambda self, number: 1)
-    monkeypatch.setattr(Backend, "adjust", merging)
-    of_map = [0] * 11 + [1] * 8 + [2] * 7 + [3] * 9 + [4] * 10
-    for method, expected in (
-        ("none", [((0,), 11), ((4,), 10)]),
-        ("full", [((1, 2), 15), ((0,), 11), ((4,), 10)]),
-    ):
-        mapper = Mapper(MappingSettings(method=method), DisFlow())
-        for index, number in enumerate(of_map):
-            mapper.observe(Track(index, "ok", "", np.eye(4), 0, map=number))
-        submaps, (notice,) = mapper.submaps()
-        assert [(submap.maps, len(submap.frames)) for submap in submaps] == expected
-        counts = (notice.values["submaps"], notice.values["frames"], notice.values["tracked"])
-        assert counts == (5 if method == "none" else 4, expected[0][1], 45)
-
-
 @pytest.mark.parametrize(("far", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)])
 def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(far: bool, found: bool, split: bool) -> None:
     mapper = Mapper(MappingSettings(), DisFlow())
@@ -254,26 +217,6 @@ def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(far: bo
         np.testing.assert_allclose(poses[1, :3, 3], [4, 0, 0], atol=0.1)
 
 
-def test_parts_of_maps_stay_together_by_what_they_observe_in_common() -> None:
-    segments = ((0, 0), (0, 0), (0, 3), (1, 3), (0, 4), (0, 9))
-    tracked = [TrackedPose(number, 0, np.eye(4), segment) for number, segment in segments]
-    few, half = [(1, 2)] * 19, [(1, 4), (4, 2)] * 10
-    own = [(0, 1), (1, 0), (2, 3), (3, 5)] * 50  # within a part, and of other maps
-    parts = [(0, 0), (0, 3), (1, 3), (0, 4), (0, 9)]
-    for pairs, relocalised, expected in (
-        ([], (), [0, 2, 1, 3, 4]),
-        (few + own, (), [0, 2, 1, 3, 4]),
-        ([*few, (2, 0), *own], (), [0, 0, 1, 2, 3]),
-        # The last part but one ties two others together.
-        ([(4, 0)] * 20 + [(4, 2)] * 20, (), [0, 0, 1, 0, 2]),
-        (half, (), [0, 2, 1, 3, 4]),
-        ([(0, 2)] * 20 + half, (), [0, 0, 1, 0, 2]),
-        ([], (((0, 9), (0, 0)), ((0, 8), (0, 0))), [0, 2, 1, 3, 0]),
-    ):
-        found = split_maps(tracked, np.array(pairs, int).reshape(-1, 2), relocalised)
-        assert [found[part] for part in parts] == expected, pairs
-
-
 def test_dirt_on_the_lens_merges_no_maps() -> None:
     backend = Backend(MappingSettings(), DisFlow())
     dirt = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32), (0, 0), 1.5)
@@ -285,22 +228,6 @@ def test_dirt_on_the_lens_merges_no_maps() -> None:
     assert list(backend.adjust().S_common_map) == [0]
     with pytest.raises(ValueError, match="no keyframe"):
         backend.adjust(2)
-
-
-def test_maps_whose_adjustment_is_refused_are_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = Backend(MappingSettings(), DisFlow())
-    for number in range(10):
-        backend.add(*_keyframe(number, (2.0 * number, 0.0, 0.0), Similarity.identity(), 1.0 + 0.2 * (number % 2)))
-
-    def failing(problem: BundleProblem) -> BundleSolution:
-        found = adjust(problem)
-        return found._replace(state=found.state._replace(sigma_px=9.9)) if len(problem.T_camera_world) > 5 else found
-
-    monkeypatch.setattr("scopemap.mapping.backend.adjust_in_windows", failing)
-    correction = backend.adjust()
-    assert not correction.refused
-    np.testing.assert_array_equal(correction.index, [0, 20, 40, 60, 80])
-    assert list(correction.S_common_map) == [0]
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 from drawn_surfaces import all_around, sphere_frame
-from front_door import call
+from front_door import call, refused
 from tiny_phantom import SIZE, write_tiny
 
 from scopemap import open_sequence
-from scopemap.cli.options import parse_memory
 from scopemap.config import Config, FusionSettings
 from scopemap.errors import InputError, SettingsError
 from scopemap.fusion.frame_store import FrameStore
@@ -34,13 +33,6 @@ def _plan(folder: Path, memory_mb: int | None, size: tuple[int, int] = SIZE, **s
     return memory_plan(Config.load(settings=given), open_sequence(folder, size=size))
 
 
-def test_sizes_are_read_and_what_is_no_size_is_refused() -> None:
-    assert [parse_memory(text) for text in ("2GB", "1500MB", "0.7 g")] == [2000, 1500, 700]
-    for text in ("2", "GB", "-1GB", "1e9GB", "2TB"):
-        with pytest.raises(SettingsError, match="expected a size such as 2GB"):
-            parse_memory(text)
-
-
 def test_more_memory_is_more_of_everything_up_to_what_is_used_without_a_limit(folder: Path) -> None:
     assert _plan(folder, None) == MemoryPlan(blocks=None)
     plans = [_plan(folder, memory_mb) for memory_mb in (800, 1000, 4000)]
@@ -51,10 +43,14 @@ def test_more_memory_is_more_of_everything_up_to_what_is_used_without_a_limit(fo
     assert large.blocks < plans[2].blocks
 
 
-def test_too_little_is_refused_with_the_least_that_works(folder: Path) -> None:
-    with pytest.raises(InputError, match="MB are the least for 9 frames of 160x128 px") as caught:
-        _plan(folder, 100)
-    least = int(re.search(r"(\d+) MB are the least", str(caught.value))[1])
+def test_too_little_is_refused_with_the_least_that_works_before_anything_is_written(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ask = ("run", folder, "--out", tmp_path / "new" / "out", "--quiet", "--memory", "100MB")
+    said = refused(capfd, *ask)
+    assert "MB are the least for 9 frames of 160x128 px" in said
+    assert list(tmp_path.iterdir()) == []
+    least = int(re.search(r"(\d+) MB are the least", said)[1])
     assert _plan(folder, least).ahead == 1
     with pytest.raises(InputError, match=f"{least} MB are the least"):
         _plan(folder, least - 1)

@@ -150,13 +150,3 @@ def test_the_options_of_a_run(tmp_path: Path) -> None:
     fusion = Config.load(file=tmp_path / "run" / "config.toml").fusion
     assert (fusion.mesh_faces, fusion.mesh_smooth, fusion.colours, fusion.holes) == (900, 2, "raw", "small")
     assert 500 < len(trimesh.load(tmp_path / "run" / "mesh.ply", process=False).faces) <= 900
-
-
-def test_a_plate_gets_its_back_closed_and_its_front_stays_in_view() -> None:
-    plate = _plate()
-    whole = finished(plate, FusionSettings(voxel_mm=1.0, holes="watertight"))
-    assert whole.is_watertight
-    side = np.asarray(plate.face_normals)[0, 2]
-    assert (side * whole.vertices[:, 2]).max() < 0.5
-    ahead = np.asarray(whole.vertex_attributes["confidence"]) == 1
-    assert (side * whole.vertices[~ahead, 2]).min() < -3

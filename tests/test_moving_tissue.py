@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from front_door import said
+from result_files import frame_rows
 from tiny_phantom import write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
@@ -127,8 +127,7 @@ def run(pushed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushed: Path) -> None:
-    with (run / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = frame_rows(run)
     assert [row["status"] for row in rows] == ["initial"] + ["ok"] * 9
     share = np.array([float(row["moving_share"] or "nan") for row in rows])
     assert np.nanmax(share[:5]) == 0.0
@@ -222,10 +221,3 @@ def test_the_surface_as_seen_at_a_second_has_no_other_state(at_s: float, expecte
     # All frames count where nothing moves, and without a time the states are all there.
     assert all(frame.weight is None or frame.weight[120, 40] == 1.0 for frame in weighted)
     assert np.ptp(_fused(frames)[:, 2]) > 15.0
-
-
-def test_where_nothing_moves_every_frame_counts() -> None:
-    still = [replace(frame, nonrigidity=np.zeros(REGIONS, np.float32)) for frame in _states()]
-    seen_at = SeenAt(still, 9.0, 8.0)
-    assert all(seen_at.weighted(frame).weight is None for frame in still)
-    assert "nowhere" in seen_at.notice.text

@@ -97,14 +97,6 @@ def test_tissue_that_rests_while_the_rest_breathes_is_no_overlay() -> None:
     assert finder.count > 20
 
 
-def test_the_light_going_up_and_down_before_a_camera_at_rest_moves_nothing() -> None:
-    still, finder = with_vessels(clip(1)[0]), OverlayFinder()
-    for number in range(60):
-        gain = 0.75 + 0.45 * np.sin(2 * np.pi * number / 30)
-        assert finder(noisy(gain * still, number), EVERYWHERE) is None
-    assert finder.count == 1
-
-
 def test_an_overlay_that_has_gone_is_not_kept_by_a_camera_at_rest() -> None:
     menu, finder = text("MENU", (60, 150)), OverlayFinder()
     pictures = clip(40, text())

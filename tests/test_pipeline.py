@@ -13,12 +13,11 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 from spied_depth import SpyDepth, spied
-from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_black, write_tiny
+from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
-from scopemap.config import PRESETS, DepthSettings
-from scopemap.depth.anchor import depth_downscale
-from scopemap.errors import InputError, WeightsError
+from scopemap.config import PRESETS
+from scopemap.errors import WeightsError
 from scopemap.estimators import create_estimators
 from scopemap.frame import Frame
 from scopemap.odometry import Step
@@ -91,16 +90,6 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
     # Files are read at their own size.
     reconstruct(open_sequence(folder), with_true_depth(folder))
     assert {frame.valid.shape for frame in spies.pop().seen} == {SIZE[::-1]}
-
-
-@pytest.mark.parametrize(
-    ("settings", "longest_px", "expected"),
-    [({}, 319, 1), ({}, 337, 2), ({}, 1280, 8), ({"backend": "shading"}, 1280, 1)],
-)
-def test_scopenet_sees_images_of_about_its_training_size(
-    settings: dict[str, Any], longest_px: int, expected: int
-) -> None:
-    assert depth_downscale(DepthSettings(**settings), longest_px) == expected
 
 
 def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
@@ -199,13 +188,6 @@ def test_smoothing_is_of_the_result_alone_and_forgets_what_was_before_a_loss(int
     np.testing.assert_array_equal(smooth[[0, 1, 5, 6]], rough[[0, 1, 5, 6]])
 
 
-def test_nothing_but_black_is_an_input_error(tmp_path: Path) -> None:
-    black = write_black(tmp_path / "black")
-    with pytest.raises(InputError, match=r"no frame of .*black could be used: .*usable"):
-        reconstruct(open_sequence(black), out=tmp_path / "out")
-    assert not (tmp_path / "out" / "trajectory.tum").exists()
-
-
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_tracks_all_frames(preset: str, folder: Path) -> None:
     config = with_true_depth(folder, preset, **WITHOUT_NETWORKS, depth__anchor="auto")
@@ -225,18 +207,6 @@ def test_the_warped_depth_is_moved_only_where_the_motion_is_known(order: str, mo
     assert _status(reconstruct(sequence, config, observers=(steps.append,))) == ["initial", "ok", "ok"]
     centre = [float(np.nanmedian(step.refined.depth_mm[50:70, 60:100])) for step in steps]
     assert centre == pytest.approx([60.0, 58.0, 56.0] if moved else [60.0, 60.0, 60.0], abs=0.6)
-
-
-def test_depth_files_take_the_scale_of_the_inputs_calibration(folder: Path, tmp_path: Path) -> None:
-    """Depth maps kept apart from the frames mean what the frames' camera.yaml says of them."""
-    for file in folder.glob("*_depth.tiff"):
-        units = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        assert cv2.imwrite(str(tmp_path / file.with_suffix(".png").name), units)
-    steps: list[Step] = []
-    reconstruct(open_sequence(folder), with_true_depth(tmp_path), observers=(steps.append,))
-    truth = next(iter(open_sequence(folder)))[1]
-    assert truth is not None
-    np.testing.assert_allclose(steps[0].raw_mm, truth.depth_mm, rtol=1e-5)
 
 
 def test_overlapping_stages_change_no_bit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,12 +237,3 @@ def test_a_known_error_ahead_comes_out(fails_at: int, folder: Path, monkeypatch:
         reconstruct(open_sequence(folder), with_true_depth(folder), observers=(steps.append,))
     assert len(steps) == fails_at - 1
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("preprocess")]
-
-
-def test_an_observers_error_ends_the_run(folder: Path) -> None:
-    def stop(step: Step) -> None:
-        if step.frame.index == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct(open_sequence(folder), with_true_depth(folder), observers=(stop,))

@@ -110,13 +110,6 @@ def test_the_mesh_agrees_with_adjusted_poses_and_depth(run: _Run) -> None:
     assert np.median(distances) < 1.5
 
 
-def test_the_provenance_reports_the_adjustment(run: _Run) -> None:
-    notes = said(run.adjusted.provenance)
-    assert any("keyframes adjusted" in note for note in notes)
-    assert not any(note.startswith("mapping:") for note in said(run.tracked.provenance))
-    assert run.adjusted.provenance["seconds"]["back end"] > 0
-
-
 def test_measured_depth_is_not_adjusted(run: _Run) -> None:
     result = reconstruct(open_sequence(run.phantom), with_true_depth(run.phantom, **SETTINGS))
     assert not any(note.startswith("mapping:") for note in said(result.provenance))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from front_door import said, warned
+from result_files import frame_rows
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
@@ -54,33 +54,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
     return _Run(phantom, folder / "out", result, steps)
 
 
-def _rows(out: Path) -> list[dict[str, str]]:
-    with (out / "frames.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_contents(run: _Run) -> None:
-    names = [
-        "SHA256SUMS",
-        "camera.yaml",
-        "config.toml",
-        "depth",
-        "depth_preview",
-        "depth_sigma",
-        "frames.csv",
-        "mesh.glb",
-        "mesh.ply",
-        "provenance.json",
-        "source_camera.yaml",
-        "trajectory.tum",
-    ]
-    assert sorted(path.name for path in run.out.iterdir()) == names
+    names = "SHA256SUMS camera.yaml config.toml depth depth_preview depth_sigma frames.csv mesh.glb mesh.ply"
+    names += " provenance.json source_camera.yaml trajectory.tum"
+    assert sorted(path.name for path in run.out.iterdir()) == names.split()
     depth = [f"{i:06d}.png" for i in range(FRAMES)]
     assert sorted(path.name for path in (run.out / "depth").iterdir()) == [*depth, "depth.json"]
 
 
 def test_frames_table(run: _Run) -> None:
-    rows = _rows(run.out)
+    rows = frame_rows(run.out)
     assert list(rows[0]) == COLUMNS.split()
     assert [int(row["index"]) for row in rows] == list(range(FRAMES))
     expected = ["initial", *["ok"] * (FRAMES - 1)]
@@ -102,17 +85,6 @@ def test_the_folder_is_read_back_and_its_table_written_the_same(run: _Run, tmp_p
     np.testing.assert_allclose(folder.camera.matrix, run.result.camera.matrix)
     assert (folder.config, folder.scale_known) == (run.result.config, True)
     assert folder.frames.counts == run.result.frames.counts
-
-
-def test_numbers_that_do_not_exist_are_empty(run: _Run) -> None:
-    rows = _rows(run.out)
-    for name in ("residual", "inlier_share", "correlation", "overlap"):
-        assert rows[0][name] == ""
-        told = [float(row[name]) for row in rows if row["status"] == "ok"]
-        known = run.result.frames[name][run.result.frames["status"] == "ok"]
-        np.testing.assert_allclose(told, known, rtol=1e-4)
-    assert [int(row["iterations"]) for row in rows] == run.result.frames["iterations"].tolist()
-    assert {float(row["depth_scale"]) for row in rows} == {1.0}
 
 
 def test_trajectory_is_read_back(run: _Run) -> None:
@@ -277,7 +249,7 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
     told = json.loads((out / "provenance.json").read_text())
     assert told["interrupted_at_frame"] == result.frames["index"][-1] == last
     assert f"interrupted at frame {last}: the result is of the frames until then" in warned(told)
-    assert [int(row["index"]) for row in _rows(out)] == list(range(last + 1))
+    assert [int(row["index"]) for row in frame_rows(out)] == list(range(last + 1))
     assert len(read_trajectory(out)) == last + 1
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) > 100
     assert run.result.provenance["interrupted_at_frame"] is None
@@ -298,7 +270,7 @@ def test_overwrite_takes_away_the_earlier_run_and_nothing_else(run: _Run, tmp_pa
     assert (out / "mine" / "a.png").read_text() == "keep"
     assert not (out / "mesh.glb").exists()
     assert sorted(path.name for path in (out / "depth").glob("*.png")) == [f"{i:06d}.png" for i in (5, 6, 7)]
-    assert [row["index"] for row in _rows(out)] == ["5", "6", "7"]
+    assert [row["index"] for row in frame_rows(out)] == ["5", "6", "7"]
 
 
 @pytest.mark.parametrize(
@@ -316,19 +288,6 @@ def test_the_unit_of_depth_grows_with_the_largest_depth(
     np.testing.assert_allclose(image * scale_mm, largest_mm, atol=0.501 * scale_mm)
 
 
-def test_what_cannot_be_written_is_an_input_error(run: _Run, tmp_path: Path) -> None:
-    writer = DepthWriter(tmp_path)
-    (tmp_path / "depth" / "depth.json").unlink()
-    (tmp_path / "depth").rmdir()
-    with pytest.raises(InputError, match=r"cannot write .*000000\.png"):
-        writer(run.steps[0].frame)
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(InputError, match="cannot write depth to"):
-        DepthWriter(tmp_path / "file")
-    with pytest.raises(InputError, match=r"cannot write the result to"):
-        run.result.save(tmp_path / "file")
-
-
 def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) -> None:
     """Measured depth is known however far it is: ten centimetres of phantom, taken as ten metres, in larger voxels."""
     config = with_true_depth(run.phantom, depth__files_scale_mm=0.15)
@@ -341,24 +300,3 @@ def test_a_room_of_several_metres_is_kept_and_told(run: _Run, tmp_path: Path) ->
     assert not any("not fused" in text for text in warned(result.provenance))
     assert result.config.fusion.voxel_mm == pytest.approx(100 * run.result.config.fusion.voxel_mm, rel=0.1)
     assert np.ptp(result.mesh.vertices, axis=0).max() > 1000
-
-
-def test_what_is_too_far_for_a_stated_reach_is_told(run: _Run) -> None:
-    config = with_true_depth(run.phantom, fusion__max_depth_mm=20.0)
-    result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
-    assert any("raise fusion.max_depth_mm and fusion.voxel_mm" in text for text in warned(result.provenance))
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a full disk is played by /dev/full")
-def test_a_full_disk_is_a_sentence(run: _Run, tmp_path: Path) -> None:
-    writer = DepthWriter(tmp_path)
-    name = f"{run.steps[0].frame.index:06d}.png"
-    (tmp_path / "depth" / name).symlink_to("/dev/full")
-    with pytest.raises(InputError, match=rf"cannot write .*{name}: No space left"):
-        writer(run.steps[0].frame)
-    for file in ("trajectory.tum", "mesh.ply", "frames.csv", "provenance.json"):
-        folder = tmp_path / file.replace(".", "_")
-        folder.mkdir()
-        (folder / file).symlink_to("/dev/full")
-        with pytest.raises(InputError, match=r"cannot write the result to .*No space left"):
-            run.result.save(folder)

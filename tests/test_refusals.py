@@ -45,17 +45,6 @@ def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: 
     assert status == ["lost", "lost", "initial"] + ["ok"] * (FRAMES - 3)
 
 
-@pytest.mark.parametrize("source", ["frames", "depth"])
-def test_a_run_never_overwrites_what_it_reads(folder: Path, tmp_path: Path, source: str) -> None:
-    out = tmp_path / "out"
-    reconstruct(open_sequence(folder), with_true_depth(folder), out=out)
-    kept = sorted(out.rglob("*"))
-    config = with_true_depth(out / "depth") if source == "depth" else with_true_depth(folder)
-    with pytest.raises(InputError, match=r"its input .* is in it"):
-        reconstruct(open_sequence(folder), config, out=out if source == "depth" else folder, overwrite=True)
-    assert sorted(out.rglob("*")) == kept
-
-
 def test_masked_pixels_are_not_linked(folder: Path) -> None:
     config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
     sequence = open_sequence(folder)

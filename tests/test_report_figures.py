@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.report.depth_figures import colour_depth, draw_depths
+from scopemap.report.depth_figures import colour_depth
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     TRUTH_COLOUR,
@@ -92,20 +92,6 @@ def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:
         colour_depth(depth, 10, 10)
 
 
-def test_depth_sheet_has_a_column_per_kind(tmp_path: Path) -> None:
-    images = [np.full((60, 80, 3), (250, 0, 250), np.uint8)] * 2
-    depths = [np.linspace(10, 50, 4800).reshape(60, 80)] * 2
-    draw_depths(images, {"raw depth": depths, "refined depth": depths}, tmp_path / "three.png")
-    four = {"raw depth": depths, "refined depth": depths, "true depth": depths}
-    draw_depths(images, four, tmp_path / "four.png")
-    three = read(tmp_path / "three.png")
-    assert read(tmp_path / "four.png").shape[1] > three.shape[1]
-    assert count_colour(three, "#fa00fa") > 2 * 150 * 150
-    unknown = [np.full((60, 80), np.nan)]
-    draw_depths(images[:1], {"raw depth": unknown, "refined depth": unknown}, tmp_path / "unknown.png")
-    assert count_colour(read(tmp_path / "unknown.png"), "#000000") > 2 * 150 * 150
-
-
 def test_a_ball_is_painted_where_it_projects() -> None:
     view = inside_view(np.eye(4))
     picture = mesh_picture(coloured_ball((10.0, -5.0, 50.0), 8.0, (200, 40, 30)), view)
@@ -149,17 +135,6 @@ def test_a_path_is_drawn_where_it_projects() -> None:
     # The gap: nothing between the two stretches but the ball.
     assert not green[int(pixels[4, 1]) + 5 : int(pixels[0, 1]) - 5].any()
     assert (rows.min(), rows.max()) == pytest.approx((pixels[3, 1], pixels[0, 1] + 4), abs=3)
-
-
-def test_outside_views_hold_the_path_too() -> None:
-    path = np.array([[0.0, 0.0, -200.0], [NAN] * 3, [50.0, 0.0, 0.0]])
-    for view in outside_views(BALL, np.eye(4), path).values():
-        local = (path[[0, 2]] - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
-        pixels = view.camera.project(local)
-        assert (local[:, 2] > 0).all()
-        assert pixels.min() >= 0
-        assert pixels.max() <= view.camera.width - 1
-    assert len(outside_views(trimesh.Trimesh(), np.eye(4), np.full((3, 3), NAN))) == 2
 
 
 @settings(max_examples=30, deadline=None)

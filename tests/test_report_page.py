@@ -6,7 +6,6 @@ import json
 import os
 import re
 from base64 import b64decode
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, draw_run, drawn_result, pose_of, tube
 
-from scopemap.errors import InputError
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import page_html, write_comparison, write_report
@@ -162,11 +160,6 @@ def test_a_run_without_pictures_mesh_or_depth_has_a_page(tmp_path: Path) -> None
     assert data["verdict"]["word"] == "not usable"
 
 
-def test_no_run_no_report(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no finished run"):
-        write_report(tmp_path)
-
-
 def test_several_runs_share_a_page(tmp_path: Path, folder: Path) -> None:
     other = draw_run(tmp_path / "other", surface={"coverage_mean": 0.3, "coverage_least": 0.1})
     write_comparison([folder, other], ["ours", "theirs"], tmp_path / "compare.html")
@@ -245,9 +238,3 @@ def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> No
     assert inline.shape[0] < 1000
     assert np.abs(inline[-380:] - written[-380:]).mean() < 4
     assert np.abs(inline[:100] - written[:100]).mean() < 4
-
-
-def test_a_result_without_a_surface_has_a_picture() -> None:
-    result = replace(drawn_result(), mesh=trimesh.Trimesh(), provenance={}, others=[])
-    assert repr(result).startswith("<Reconstruction, not usable: 14 of 24 frames in one map; scale unknown; no surface")
-    assert "data:image/jpeg" in result._repr_html_()

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import trimesh
 from drawn_run import CAMERA, GOOD_SURFACE, placed_frames, tube
@@ -17,9 +16,9 @@ from scopemap.config import Config
 from scopemap.notices import KINDS, Notice, fields_of_kind, notices_of
 from scopemap.reconstruction import Reconstruction
 from scopemap.report import verdict as rules
-from scopemap.report.submap_summaries import doubt_words, most_doubtful, submaps_in_time
-from scopemap.report.verdict import longest_segment, scale_is_known, verdict
-from scopemap.trajectory.frame_table import ELSEWHERE, LOST, NOT_USED
+from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
+from scopemap.report.verdict import verdict
+from scopemap.trajectory.frame_table import LOST, NOT_USED
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
@@ -48,13 +47,6 @@ def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     assert found.sentence == "100 of 100 frames in one map; scale unknown; surface covers 94 % of what was seen"
     assert [reason.level for reason in found.reasons] == ["good", "good", "good"]
     assert found.advice == "The shape can be used. Sizes are unknown: compare shapes, do not measure."
-
-
-def test_what_a_result_may_be_used_for() -> None:
-    known = {"scale": {"known": True, "source": "measured depth"}}
-    assert verdict(run_of([0] * 50, **known)).advice.endswith("can be used. Sizes are known (by measured depth).")
-    assert verdict(run_of([0] * 50 + [LOST] * 50)).advice.startswith("Use it with care: read the cautions first.")
-    assert verdict(run_of([0] * 5)).advice == "Do not use this result."
 
 
 def notices(*found: Notice) -> dict[str, Any]:
@@ -129,13 +121,6 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
     assert words in found.reasons[0].text
 
 
-def test_lost_frames_and_other_maps_are_told_apart() -> None:
-    texts = " ".join(reason.text for reason in verdict(run_of([0] * 90 + [LOST] * 4 + [ELSEWHERE] * 6)).reasons)
-    assert "6 more frames form submaps of their own" in texts
-    assert "In 4 frames the camera could not be followed" in texts
-    assert "Longest gap: 10 frames" in texts
-
-
 def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:
     """A run of submaps: number of the map, its frames, and their inlier share; in the order of the frames."""
     place = [number for number, frames, _ in submaps for _ in range(frames)]
@@ -155,30 +140,11 @@ def test_submaps_are_in_order_of_time_and_the_worst_is_named() -> None:
     assert most_doubtful(submaps) is submaps[2]
 
 
-def test_one_submap_is_not_compared() -> None:
-    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2)).frames)) == ""
-    assert doubt_words(submaps_in_time(run_of_submaps((0, 50, 0.2), (1, 20, float("nan"))).frames)) == ""
-    assert "doubtful" not in " ".join(reason.text for reason in verdict(run_of([0] * 50)).reasons)
-
-
 def test_frames_that_were_not_used_are_no_gap() -> None:
     places = [0, NOT_USED, NOT_USED] * 40
     assert "Longest gap" not in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
     places[30:45] = [LOST, NOT_USED, NOT_USED] * 5
     assert "Longest gap: 5 frames" in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
-
-
-def test_scale_is_known_where_the_run_says_so() -> None:
-    assert not scale_is_known({})
-    facts = {"scale": {"known": True, "measured": True, "source": "measured depth"}}
-    assert scale_is_known(facts)
-    assert "scale known" in verdict(run_of([0] * 50, **facts)).sentence
-
-
-def test_the_longest_segment() -> None:
-    assert longest_segment(np.array([1, 1, 0, 1, 1, 1, 0], bool)) == 3
-    assert longest_segment(np.zeros(4, bool)) == 0
-    assert longest_segment(np.zeros(0, bool)) == 0
 
 
 def test_the_document_states_the_thresholds() -> None:
@@ -189,32 +155,11 @@ def test_the_document_states_the_thresholds() -> None:
     assert f"fewer than {rules.LEAST_FRAMES} frames" in text
 
 
-AT_REST, MOMENT = Notice("camera-at-rest-stated"), Notice("fusion-at-one-moment", {"second": 3.0, "where": "nowhere"})
-
-
-@pytest.mark.parametrize(
-    ("others", "expected"),
-    [
-        ([], "There the surface is a mean. Tissue that moves as a whole looks like a moving camera."),
-        ([MOMENT], "There the surface is as seen at one moment. Tissue"),
-        ([AT_REST], "There the surface is a mean."),
-    ],
-)
-def test_moving_tissue_is_said_and_does_not_change_the_word(others: list[Notice], expected: str) -> None:
-    counts = {"frames": 41, "measured": 62, "threshold": 0.1}
-    moving = Notice("tissue-moves", counts | {"most": 47, "share": 0.94, "x": 0.5, "y": 0.5})
-    found = verdict(run_of([0] * 62, **notices(moving, *others)))
-    (said,) = [reason for reason in found.reasons if reason.code == "tissue-moves"]
-    assert said.level == "note"
-    assert f"moves on its own in 41 of 62 frames. {expected}" in said.text
-    assert found.word == "good"
-    assert ("looks like a moving camera" in said.text) == (AT_REST not in others)
-
-
 def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
     of_the_data = Notice("camera-at-rest")
     assert verdict(run_of([0] * 62, **notices(of_the_data))).word == "doubtful"
-    found = verdict(run_of([0] * 62, **notices(of_the_data, AT_REST)))
+    stated = Notice("camera-at-rest-stated")
+    found = verdict(run_of([0] * 62, **notices(of_the_data, stated)))
     assert found.word == "good"
     assert any(reason.code == "camera-at-rest-stated" for reason in found.reasons)
 

@@ -16,7 +16,6 @@ from tiny_phantom import FRAMES, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
 from scopemap.errors import InputError
-from scopemap.io import result_folder
 from scopemap.io.checkpoint import CHECKPOINT
 from scopemap.io.result_folder import LOCK, UNFINISHED
 from scopemap.odometry import Step
@@ -104,34 +103,6 @@ def test_a_run_killed_after_the_last_frame_tracks_none_again(
     _run(folder, out, preset, observers=(seen.append,))
     assert not seen
     assert _bytes(out) == _bytes(wanted)
-
-
-def test_a_run_killed_at_any_move_into_its_place_is_put_there_again(folder: Path, tmp_path: Path) -> None:
-    """The earlier result is there again before the next run begins."""
-    out = tmp_path / "run"
-    _run(folder, out, "realtime")
-    before, unfinished, real = _bytes(out), out / UNFINISHED, result_folder._move
-    unfinished.mkdir()
-    (unfinished / "mesh.ply").write_text("new")
-    for most in range(12):
-        count = iter(range(most))
-
-        def move(names: list[str], source: Path, target: Path, count: Any = count) -> None:
-            for name in names:
-                if next(count, None) is None:
-                    raise _Killed
-                real([name], source, target)
-
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(result_folder, "_move", move)
-            patched.setattr(result_folder, "_undo_moves", lambda unfinished, folder: None)
-            with pytest.raises(_Killed):
-                result_folder._put_in_place(unfinished, out)
-        result_folder._undo_moves(unfinished, out)
-        assert (unfinished / "mesh.ply").read_text() == "new"
-        assert {name: content for name, content in _bytes(out).items() if UNFINISHED not in name} == before
-    _run(folder, out, "realtime", overwrite=True)
-    assert _bytes(out) == before
 
 
 def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from drawn_videos import encode
 from front_door import call, said
+from result_files import frame_rows
 from tiny_phantom import only_images, write_tiny
 
 from scopemap.cameras.camera import PinholeCamera
@@ -38,17 +38,12 @@ def video(pictures: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) 
     return encode(tmp_path_factory.mktemp("video") / "v.mp4", shown)
 
 
-def _rows(out: Path) -> list[dict[str, str]]:
-    with (out / "frames.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def test_skipped_frames_are_named_counted_and_have_no_pose(
     video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     assert call("run", video, "--out", out, "--preset", "realtime") == 0
-    rows = _rows(out)
+    rows = frame_rows(out)
     assert [int(row["index"]) for row in rows] == list(range(10))
     skipped = {int(row["index"]): row for row in rows if row["status"] == "skipped"}
     assert {index: row["reason"] for index, row in skipped.items()} == {3: "repeats frame 2", 7: "repeats frame 6"}
@@ -68,14 +63,14 @@ def test_skipped_frames_are_named_counted_and_have_no_pose(
 def test_options_choose_frames(video: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert call("run", video, "--out", out, "--fps", 12.5, *FAST) == 0
-    rows = _rows(out)
+    rows = frame_rows(out)
     used = [int(row["index"]) for row in rows if row["status"] != "skipped"]
     assert used == [0, 2, 4, 6, 8]
     assert {row["reason"] for row in rows if row["status"] == "skipped"} == {"beyond 12.5 frames/s"}
     assert Config.load(file=out / "config.toml").input.fps == 12.5
     other = tmp_path / "all"
     assert call("run", video, "--out", other, "--set", "input.skip_duplicates=false", *FAST) == 0
-    assert "skipped" not in {row["status"] for row in _rows(other)}
+    assert "skipped" not in {row["status"] for row in frame_rows(other)}
 
 
 def test_stereo_and_fields_by_option(pictures: list[np.ndarray], tmp_path: Path) -> None:

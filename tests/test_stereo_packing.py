@@ -10,7 +10,7 @@ import pytest
 from drawn_clips import circle, inside, tissue
 from drawn_videos import HEIGHT, WIDTH, above, above_squeezed, beside, beside_squeezed, stereo
 
-from scopemap.io.video_format.stereo_packing import packing, squeezed_views, suspected
+from scopemap.io.video_format.stereo_packing import packing
 
 NUMBERS = range(0, 40, 5)
 Draw = Callable[[int], np.ndarray]
@@ -94,12 +94,6 @@ def test_stereo_with_text_over_both_views_is_found() -> None:
     assert packing(pictures) is not None
 
 
-@pytest.mark.parametrize("flip", [np.fliplr, np.flipud])
-def test_a_symmetric_picture_is_not_stereo(flip: Draw) -> None:
-    stack = np.hstack if flip is np.fliplr else np.vstack
-    assert packing([stack([tissue(n), flip(tissue(n))]) for n in NUMBERS]) is None
-
-
 def test_a_lumen_is_not_stereo() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     radius = np.hypot(u - WIDTH / 2, v - HEIGHT / 2)
@@ -115,19 +109,3 @@ def test_what_is_too_little_is_not_stereo() -> None:
     assert packing([tissue(0)[:1]]) is None
     # One picture of many that happens to look like two views proves nothing.
     assert packing([beside(0)] + [np.zeros_like(beside(0))] * 9) is None
-
-
-@pytest.mark.parametrize(
-    ("size", "layout", "squeezed"),
-    [
-        ((1280, 2048), "top-bottom", False),
-        ((1920, 1080), "top-bottom", True),
-        ((2560, 1024), "left-right", False),
-        ((1920, 1080), "left-right", True),
-        ((1280, 1024), "left-right", True),
-    ],
-)
-def test_sizes_tell_squeezed_views(size: tuple[int, int], layout: str, squeezed: bool) -> None:
-    assert squeezed_views(*size, layout) == squeezed  # type: ignore[arg-type]
-    usual = size in ((1920, 1080), (1280, 1024))
-    assert suspected(*size) == (None if usual else layout)

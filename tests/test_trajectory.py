@@ -145,34 +145,6 @@ def test_seven_scenes_is_metres_and_numbered_by_file(tmp_path: Path, trajectory:
     np.testing.assert_allclose(found.T_world_camera, poses, atol=1e-9)
 
 
-def test_what_was_assumed_is_said(tmp_path: Path, trajectory: Trajectory) -> None:
-    tracked = trajectory.rows(trajectory.tracked)
-    poses = tracked.T_world_camera
-    write_run(tmp_path / "run", trajectory)
-    write_c3vd(tmp_path / "c3vd", poses)
-    write_tum(tmp_path / "ours.tum", trajectory)
-    write_kitti(tmp_path / "kitti.txt", tracked)
-    (tmp_path / "numbered.tum").write_text("3 0 0 0 0 0 0 1\n5 0 0 0 0 0 0 1\n")
-    (tmp_path / "row_major.txt").write_text("".join(" ".join(map(repr, T.ravel().tolist())) + "\n" for T in poses))
-    (tmp_path / "7scenes").mkdir()
-    np.savetxt(tmp_path / "7scenes" / "frame-000000.pose.txt", poses[0])
-    sources = {
-        "run": "run of scopemap, camera-to-world, mm (stated)",
-        "ours.tum": "TUM, camera-to-world, mm (stated), stamps are seconds",
-        "numbered.tum": "TUM, camera-to-world, m (assumed), whole stamps taken for frame numbers",
-        "kitti.txt": "KITTI, camera-to-world, m (assumed), row = frame",
-        "c3vd": "C3VD pose.txt, stored transposed, camera-to-world, mm, row = frame",
-        "row_major.txt": "C3VD pose.txt, row-major, camera-to-world, mm, row = frame",
-        "7scenes": "7-Scenes, camera-to-world, m",
-    }
-    assert {name: read_trajectory(tmp_path / name, unit="m").source for name in sources} == sources
-    assert (
-        read_trajectory(tmp_path / "kitti.txt").rows(np.arange(3)).source
-        == "KITTI, camera-to-world, mm (assumed), row = frame"
-    )
-    assert trajectory.source == ""
-
-
 @pytest.mark.parametrize(
     ("kind", "wanted"), [("tum", 8), ("kitti", 12), ("c3vd", 16), ("oneslam", 8), ("bodyslam", 12)]
 )
@@ -219,16 +191,6 @@ def test_missing_empty_and_binary_paths(tmp_path: Path) -> None:
     (tmp_path / "movie.mp4").write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match="cannot read"):
         read_trajectory(tmp_path / "movie.mp4")
-
-
-def test_impossible_trajectories_are_refused(trajectory: Trajectory) -> None:
-    poses = trajectory.T_world_camera
-    with pytest.raises(ValueError, match="status"):
-        Trajectory(np.arange(6), np.arange(6.0), poses, np.array(["fine"] * 6))
-    with pytest.raises(ValueError, match="ascending"):
-        Trajectory(np.array([0, 1, 1, 2, 3, 4]), np.arange(6.0), poses, trajectory.status)
-    with pytest.raises(ValueError, match="times_s"):
-        Trajectory(np.arange(6), np.arange(5.0), poses, trajectory.status)
 
 
 @pytest.mark.real

@@ -75,13 +75,6 @@ def test_missing_weights_say_what_to_do(folder: Path) -> None:
         weights.locate("depth-pro")
 
 
-def test_first_of_several_that_is_there(folder: Path) -> None:
-    (folder / "toy.pth").write_bytes(CONTENT)
-    assert weights.locate("raft-small", "toy") == folder / "toy.pth"
-    assert weights.is_present("raft-small", "toy")
-    assert not weights.is_present("raft-small")
-
-
 def test_damaged_weights_are_refused(folder: Path) -> None:
     (folder / "toy.pth").write_bytes(CONTENT + b"!")
     with pytest.raises(WeightsError, match=r"damaged.*toy\.pth"):
@@ -133,16 +126,6 @@ def test_a_model_copied_by_hand_is_found_without_a_record(folder: Path) -> None:
     assert weights.recorded_revision("depth-pro") == ""
     said = CliRunner().invoke(models.app, ["verify", "depth-pro", "--json"]).stdout
     assert json.loads(said) == {"depth-pro": "by hand, no hash to check"}
-
-
-def test_pulling_records_a_model_that_was_copied_by_hand(folder: Path, hub: dict[str, bytes]) -> None:
-    place = folder / "depth-pro"
-    place.mkdir()
-    for name in ("config.json", "preprocessor_config.json", "model.safetensors"):
-        (place / name).write_bytes(b"an old copy")
-    weights.pull("depth-pro")
-    assert (place / "model.safetensors").read_bytes() == hub["model.safetensors"]
-    assert {one.name: state for one, state in weights.overview()}["depth-pro"] == "present"
 
 
 def test_pinned_repository_refuses_other_content(folder: Path, hub: dict[str, bytes]) -> None:
