@@ -38,7 +38,7 @@ TABLES: dict[str, tuple[str, str]] = {
         f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations",
         "ablations/tables/overview.md",
     ),
-    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --inputs 600 --videos 6", ""),
+    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --videos 6", ""),
     "long-runs": (
         f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5",
         "",
