@@ -34,8 +34,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.climb.check import submission_problems
-from scopemap_bench.climb.submission import write_submission
+from scopemap_bench.climb.submission import submission_problems, write_submission
 from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

@@ -27,10 +27,9 @@ def compare(
 ) -> list[FinishedRun]:
     """Return the figures of each run's folder, benchmark's run or trajectory file against `truth`.
 
-    A benchmark's run (a folder with result.json) brings its figures, measured by its own plan. The others are measured
-    here: against a data set's folder with their mesh and depth, against a trajectory file by their poses. `names` are
-    for the table, by default those of the folders. `unit` is that of files that state none. Raises `InputError`, also
-    where `truth` is needed.
+    A benchmark's run (a folder with result.json) brings its figures. The others are measured: against a data set's
+    folder with their mesh and depth, against a trajectory file by their poses. `names` are by default those of the
+    folders, `unit` is that of files that state none. Raises `InputError`, also where `truth` is needed.
     """
     if names and len(names) != len(paths):
         raise InputError(f"comparing {len(paths)} runs: {len(names)} names were given")

@@ -29,7 +29,7 @@ from scopemap.masking.masker import Masker
 from scopemap.report.depth_figures import DepthScene, draw_depth_change
 from scopemap.report.mesh_figures import draw_reconstruction, draw_registered_clouds
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.evaluation.correspondences import FrameMatcher, lifted_matches
+from scopemap_bench.evaluation.consistency import FrameMatcher, lifted_matches
 from scopemap_bench.pictures import (
     draw_ate,
     draw_displacement_bars,
@@ -39,8 +39,7 @@ from scopemap_bench.pictures import (
 )
 from scopemap_bench.plan import folder_name
 from scopemap_bench.result import RunResult
-from scopemap_bench.summary import joined, summarise
-from scopemap_bench.table import pd
+from scopemap_bench.table import joined, pd, summarise
 from scopemap_bench.tables import write_tables
 
 _MAX_DEPTHS = 6
@@ -49,13 +48,7 @@ _WORLD = {"reference": "world, true poses", "estimated": "world, own poses"}
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run whose figures are drawn.
-
-    Attributes
-    ----------
-    result : its figures. folder : of the run.
-    open : opens its frames and their truth; None where only poses are known.
-    """
+    """A run whose figures are drawn; `open` opens its frames and their truth, None where only poses are known."""
 
     result: RunResult
     folder: Path
@@ -65,10 +58,7 @@ class FinishedRun:
 def write_results(
     runs: Sequence[FinishedRun], out: Path, *, title: str, notes: Sequence[str] = (), paper_units: bool = False
 ) -> list[Path]:
-    """Write all tables, and every figure that the runs have values for, below `out`; return the files.
-
-    Raises `InputError` where they cannot be written.
-    """
+    """Write all tables, and every figure that the runs have values for, below `out`; return the files."""
     results = [run.result for run in runs]
     files = list(write_tables(results, out, paper_units=paper_units, title=title, notes=notes))
     folder = out / "figures"
@@ -142,11 +132,7 @@ def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
 
 
 def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
-    """Draw two frames in the middle: their depth, their registered point clouds, and ORB's matches between them.
-
-    Clouds are registered by each method's own poses (experiment 1 of arXiv 2508.11282), matches by the true ones where
-    they are known.
-    """
+    """Draw two frames in the middle: their depth, their clouds by each method's poses, ORB's matches in space."""
     (previous, true_previous), (current, true_current) = _middle(frames)
     depths, own_poses = {}, {}
     for run in runs[:_MAX_DEPTHS]:

@@ -70,7 +70,7 @@ def bench(
         _list_plans()
         return
     if dry_run:
-        from scopemap_bench.preview import describe
+        from scopemap_bench.runner import describe
 
         for line in describe(read_plan(plan), out or Path("."), data):
             typer.echo(line)

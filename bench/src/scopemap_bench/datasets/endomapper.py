@@ -91,10 +91,7 @@ class EndoMapperSequence(PosedVideo):
 
 
 def read_endoscope(info: Path) -> int | None:
-    """Return the endoscope's number in an info file, which writes it as 1, "1", "Endoscope_01" or "N/A" (None).
-
-    Raises `InputError` for anything else.
-    """
+    """Return the endoscope's number, written 1, "1", "Endoscope_01" or "N/A" (None); `InputError` for anything else."""
     with reporting(f"reading {info}: it is no JSON object"):
         stated = json.loads(info.read_text(encoding="utf-8-sig")).get("endoscope_number")
     text = "" if stated is None else str(stated).strip()

@@ -27,11 +27,7 @@ _REST_TOLERANCE = 1e-6
 
 
 class EndoNerfFolder(LayoutFolder):
-    """One EndoNeRF scene, or a folder in its layout.
-
-    Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
-    camera in it that cannot be is its `camera_fault`.
-    """
+    """One EndoNeRF scene; rows of `poses_bounds.npy` belong to the images in their order."""
 
     name = "endonerf"
     places = (Place("images", depths=("depth/",)),)

@@ -33,11 +33,7 @@ _TISSUE = 255
 
 
 class OneSlamFolder(LayoutFolder):
-    """A folder in OneSLAM's layout.
-
-    Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read;
-    a calibration that cannot be or does not fit is its `camera_fault`.
-    """
+    """A folder in OneSLAM's layout; `InputError` for poses, mask and frame rate that cannot be read."""
 
     name = "oneslam"
     places = (Place("images"),)

@@ -30,11 +30,7 @@ _BLUE = (0, 0, 255)
 
 
 class ServCtFolder(LayoutFolder):
-    """The left pictures of one experiment.
-
-    Each picture has a calibration of its own. Where these differ, pictures and depth are brought to the camera of the
-    first. Raises `InputError` for pictures that cannot be used; a calibration that cannot is its `camera_fault`.
-    """
+    """The left pictures of one experiment, with their depth brought to the camera of the first where theirs differ."""
 
     name = "serv-ct"
     places = (Place("Left_rectified", depths=tuple(f"{truth}/DepthL/{{}}.png" for truth in _TRUTHS)),)

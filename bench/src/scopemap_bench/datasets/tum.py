@@ -38,9 +38,8 @@ _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IG
 class TumRgbdFolder(ImageFolder):
     """One TUM RGB-D sequence, or a folder in its layout; `camera.yaml` beside rgb.txt replaces published constants.
 
-    Images that a list names but that are not there are left out with a warning; the others keep their numbers. Names
-    that lead out of the folder count as not there. Raises `InputError` for lists and poses that cannot be read; images
-    that no published camera fits are its `camera_fault`.
+    Images that a list names but that are not there, or lead out of the folder, are left out with a warning; the others
+    keep their numbers. `InputError` for lists and poses that cannot be read.
     """
 
     name = "tum"
@@ -121,10 +120,9 @@ class TumRgbdFolder(ImageFolder):
 
 
 def read_stamped(file: Path) -> NumberTable:
-    """Return the rows `stamp tx ty tz qx qy qz qw` of a file, by ascending stamp.
+    """Return the rows `stamp tx ty tz qx qy qz qw` of a file, by ascending stamp; NaN or a quaternion of 0 is no pose.
 
-    A row with NaN or with the quaternion 0 0 0 0 states that there is no pose, and is left out. Raises `InputError`,
-    with the line, for any other row that is none, for a stamp that comes again, and where no pose is left.
+    Raises `InputError`, with the line, for any other row, for a stamp that comes again, and where no pose is left.
     """
     table = read_numbers(file, missing=True).with_columns(8, "stamp tx ty tz qx qy qz qw")
     known = np.isfinite(table.values).all(axis=1) & table.values[:, 4:].any(axis=1)
@@ -134,10 +132,7 @@ def read_stamped(file: Path) -> NumberTable:
 
 
 def associated(stamps_s: list[float], others_s: list[float]) -> dict[int, int]:
-    """Return pairs of rows of two ascending lists of time stamps: the nearest first, each row in one pair at most.
-
-    As the data set's own tool does it: pairs are less than 0.02 s apart.
-    """
+    """Return pairs of rows of two ascending lists of time stamps, the nearest first, less than 0.02 s apart."""
     windows = np.searchsorted(others_s, np.add.outer(stamps_s, [-ASSOCIATED_WITHIN_S, ASSOCIATED_WITHIN_S]))
     gaps = sorted(
         (abs(stamp - others_s[k]), i, k)

@@ -31,8 +31,7 @@ EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
 CAMERA = ("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15", *EXPOSURE)
 PHANTOMS = {
     "fast: ten pixels a frame, two turns of 30 degrees": (
-        *("--scene", "colon", "--set", "speed=6"),
-        *("--events", "turn:40-48,turn:80-88"),
+        *("--scene", "colon", "--set", "speed=6", "--events", "turn:40-48,turn:80-88"),
     ),
     "cut: 30 degrees between two frames": ("--scene", "colon", "--events", "turn:60-60"),
     "instruments, twice": ("--scene", "laparoscopy", "--events", "instrument:15-60,instrument:70-110"),

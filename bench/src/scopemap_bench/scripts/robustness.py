@@ -1,12 +1,11 @@
-"""Runs that are killed, runs whose writing fails, and a disturbed batch.
+"""Runs that are killed, runs whose writing fails, and a disturbed batch (`batch`).
 
     python -m scopemap_bench.scripts.robustness [--kills N] [--failures N] [--videos N] [--seed N]
 
-Killed: a process that reconstructs a small phantom is killed (SIGKILL) at a random instant, from its start to the end
-of its result, and run again, until one ends. Writing fails: the N-th call that writes, renames or syncs raises
-`OSError` (a full disk), for N spread over all of them. Each time the files of the run that follows are compared with
-those of an undisturbed run. A checkpoint is written as often as there is time, where a user's run has one every five
-seconds at most. Needs `fork`. Disturbed batch: `batch.py`.
+Killed: a process that reconstructs a small phantom gets SIGKILL at a random instant and is run again, until one ends.
+Writing fails: the N-th call that writes, renames or syncs raises `OSError` (a full disk), for N spread over all of
+them. Each time the files of the run that follows are compared with those of an undisturbed run. A checkpoint is written
+as often as there is time, where a user's run has one every five seconds at most. Needs `fork`.
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import scopemap.runner.checkpoints as checkpoints
 from scopemap.config import Config
@@ -39,8 +37,7 @@ _OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
 _WRITING = ("write_bytes", "write_text", "replace", "mkdir", "open")
 
 
-@dataclass(frozen=True)
-class Undisturbed:
+class Undisturbed(NamedTuple):
     """A phantom, and by preset the content of a run of it and its seconds."""
 
     phantom: Path

@@ -30,10 +30,7 @@ _IMAGE_NAME = re.compile(r"(\d{1,9})\D*?(\.\w+)?")
 
 
 def read_climb(path: Path, unit: Unit) -> Trajectory:
-    """Read the submaps of a submission's run, in `unit`, or a reference, which `scales.csv` brings to mm.
-
-    The submap with the smallest number is returned, the rest are its `others`.
-    """
+    """Read a submission's run, its first submap with `others`, or a reference, which `scales.csv` brings to mm."""
     if (path / "results_txt").is_dir():
         return read_climb_reference(path)
     files = [path] if path.is_file() else sorted(path.glob(CLIMB_FILES[0]))
@@ -70,10 +67,7 @@ def _scale_mm(sequence: Path) -> float | None:
 
 
 def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
-    """Return the poses of one submap's file; rows without a finite position are left out, as the evaluation does.
-
-    Raises `InputError`, with the line, for a row that the evaluation cannot score.
-    """
+    """Return the finite poses of a submap; `InputError`, with the line, for a row that the evaluation cannot score."""
     rows: dict[int, list[float]] = {}
     where: list[str] = []
     for number, line in enumerate(text_lines(file), start=1):

@@ -37,11 +37,7 @@ _LARGEST_FILE_BYTES = 1 << 20  # a file of poses and calibrations holds 2 kB
 
 @dataclass(frozen=True)
 class FrameData:
-    """The content of one `frame_data` file.
-
-    index : number of the frame. T_world_camera : (4, 4), mm, None where it cannot be used, which `fault` explains.
-    stamp : `timestamp`.
-    """
+    """The content of one `frame_data` file: number, pose (4, 4), mm, `timestamp`, and why there is no pose."""
 
     index: int
     T_world_camera: np.ndarray | None = None
@@ -65,10 +61,9 @@ def read_frame_data(files: NumberedFiles) -> list[FrameData]:
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
-    """Return the time of each frame, s, frame 0 at 0, and the unit of the stamps in words.
+    """Return the time of each frame (ascending), s, frame 0 at 0, and the unit of the stamps in words.
 
-    frames : in ascending order of index. Empty where stamps are missing, do not ascend, or step by a whole power of
-    ten: those merely count frames.
+    Empty where stamps are missing, do not ascend, or step by a whole power of ten: those merely count frames.
     """
     stamps = [frame.stamp for frame in frames]
     numeric = all(isinstance(stamp, int | float) and abs(stamp) < _LARGEST_STAMP for stamp in stamps)
