@@ -22,12 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-BAR_COLOUR = "#4575b4"
-_NOTE_COLOUR = "#666666"
-_MEAN_COLOUR = "#d95f02"
-_PANELS_ACROSS = 4
-_LONGEST_NAME = 34
-_SHOWN_MATCHES = 400
+BAR_COLOUR, _NOTE_COLOUR, _MEAN_COLOUR = "#4575b4", "#666666", "#d95f02"
+_PANELS_ACROSS, _LONGEST_NAME, _SHOWN_MATCHES = 4, 34, 400
 
 
 def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:

@@ -23,22 +23,16 @@ from scopemap.io.sequence import Sequence
 from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.evaluation import depth as depth_errors
 from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher
-from scopemap_bench.evaluation.depth import (
-    DEPTH_RANGES_MM,
-    DepthPairs,
-    DepthScaling,
-    evaluate_depth_sequence,
-    fit_sequence,
-)
+from scopemap_bench.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
 from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.result import Figures
 
-_CONSISTENCY_PX = 1.0
-_MAX_VIEWS = 40
+_CONSISTENCY_PX, _MAX_VIEWS = 1.0, 40
 
 
 def score(
@@ -116,13 +110,11 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
     chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]}
+    truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
     views = {
         truth.index: (truth.T_world_camera, truth.depth_mm)
-        for frame, truth in sequence
-        if frame.index in chosen
-        and truth is not None
-        and truth.T_world_camera is not None
-        and truth.depth_mm is not None
+        for truth in truths
+        if truth.T_world_camera is not None and truth.depth_mm is not None
     }
     return surface.seen_by(sequence.camera, views) if views else surface
 
@@ -169,7 +161,7 @@ def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
 
 
 def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
-    report = evaluate_depth_sequence(
+    report = depth_errors.evaluate_depth_sequence(
         _true_pairs(depth, sequence),
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
@@ -184,7 +176,7 @@ def _consistency(
     depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan, flows: Path | None = None
 ) -> Figures:
     """Measure depth over time, after one scale factor for all frames where true depth is known."""
-    scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    scale = depth_errors.fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())

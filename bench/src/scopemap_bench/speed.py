@@ -1,8 +1,7 @@
 """Processor time of each stage of a run on this machine, and its comparison with an earlier measurement.
 
-Processor time, not time that passes: what else runs on the machine disturbs it less. A stage counts without the stages
-that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's DIS flow of a fixed pair of
-images: not this package's code, and like most of its work.
+A stage counts without the stages that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's
+DIS flow of a fixed pair of images: not this package's code, and like most of its work.
 """
 
 from __future__ import annotations
@@ -110,9 +109,8 @@ class Speed:
         return rounded
 
     def slower_than(self, before: Speed, tolerance: float) -> list[str]:
-        """Return a line for each stage whose ratio has grown by more than the share `tolerance` and a twentieth.
-
-        Raises `InputError` for another clip, number of frames or preset.
+        """Return a line for each stage slower by more than the share `tolerance`; `InputError` for other clips or
+        presets.
         """
         if before._measured != self._measured:
             raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")

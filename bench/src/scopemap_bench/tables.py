@@ -109,9 +109,6 @@ def _figure(column: dict[str, Any], paper_units: bool) -> Figure:
     return Figure(**column | {"unit": unit, "factor": factor})
 
 
-# ---- tables 1 to 3
-
-
 def _paper_tables(rows: pd.DataFrame, paper_units: bool) -> Iterator[Table]:
     if not rows.reindex(columns=["paper.t_avg_mm"]).notna().any(axis=None):
         return
@@ -152,9 +149,6 @@ def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-# ---- other tables
-
-
 def _protocol_table(group: str, rows: pd.DataFrame, results: Sequence[RunResult]) -> Table:
     """Return the figures of another paper's protocol: one row per sequence and figure, one column per method.
 
@@ -186,9 +180,6 @@ def _times(rows: pd.DataFrame) -> Table:
     keys = sorted(key for key in rows if key.startswith("timing.ms_of_") and not key.endswith(SPREAD))
     stages = [Figure(key, key.removeprefix("timing.ms_of_").replace("_", " "), "ms", 1, "") for key in keys]
     return replace(table, figures=(*table.figures[:-1], *stages, table.figures[-1]))
-
-
-# ---- files
 
 
 def _document(results: Sequence[RunResult], tables: Sequence[Table], title: str, notes: Sequence[str]) -> str:

@@ -35,8 +35,7 @@ _DEPTHS = ("Pixelwise Depths/", "Depths/Pixelwise Depths/", "Pixelwise Depths/Pi
 _POSES, _POSE_FILES = ("Poses", "Poses/Poses"), ("*position_rotation.csv", "*.xlsx")
 _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
 _COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
-_MM_PER_METRE = 1000.0
-_SAME = 1e-6
+_MM_PER_METRE, _SAME = 1000.0, 1e-6
 # Some hundred thousand cells; in memory they take many times as much.
 _MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
 

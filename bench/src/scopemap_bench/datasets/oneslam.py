@@ -28,8 +28,7 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped
 
 _CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
-_DEPTHS_PER_UNIT = 1000.0
-_TISSUE = 255
+_DEPTHS_PER_UNIT, _TISSUE = 1000.0, 255
 
 
 class OneSlamFolder(LayoutFolder):

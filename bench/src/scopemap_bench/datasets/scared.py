@@ -1,13 +1,11 @@
 """SCARED and SCARED-C: da Vinci stereo video of porcine abdomens, surface from structured light.
 
-SCARED, a keyframe's folder: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the right),
-`data/frame_data.tar.gz` (poses from robot kinematics), `data/scene_points.tar.gz` (X, Y, Z per pixel in the camera's
-frame, mm, left above right), or these archives unpacked. Frame number = order in the video, from 0. Copies hold the
-left views as images. Allan et al., "Stereo correspondence and reconstruction of endoscopic data challenge", arXiv
-2101.01133.
-
-SCARED-C: the left images with poses by structure from motion (github.com/juseonghan/SCARED-C): also
-`intrinsics_colmap.yaml`, `frame_log.json`, `data/rgb_frames.tar.gz`. Frames count from 1 and have gaps.
+A keyframe's folder: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the right), `data/frame_data.tar.gz`
+(poses from robot kinematics), `data/scene_points.tar.gz` (X, Y, Z per pixel in the camera's frame, mm, left above
+right), or these archives unpacked. Frame number = order in the video, from 0. Copies hold the left views as images.
+Allan et al., arXiv 2101.01133. SCARED-C: the left images with poses by structure from motion
+(github.com/juseonghan/SCARED-C), with `intrinsics_colmap.yaml`, `frame_log.json`, `data/rgb_frames.tar.gz`. Frames
+count from 1 and have gaps.
 """
 
 from __future__ import annotations
@@ -36,8 +34,7 @@ _VIDEOS = ("data/rgb.mp4", "rgb.mp4")
 _IMAGES = ("image_02/data", "left", "data/left", "left_finalpass")
 _SCENE_POINTS = ("data/scene_points", "scene_points", "image_02/data/groundtruth")
 _INTRINSICS, _LOG = "intrinsics_colmap.yaml", "frame_log.json"
-_BADLY_CALIBRATED = (4, 5)
-_STACKED_ASPECT = 1.4
+_BADLY_CALIBRATED, _STACKED_ASPECT = (4, 5), 1.4
 # COLMAP puts the centre of the top-left pixel at (0.5, 0.5).
 _COLMAP_CENTRE_PX = 0.5
 

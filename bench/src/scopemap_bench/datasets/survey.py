@@ -21,8 +21,7 @@ from scopemap.io.frame_choice import is_repeat
 from scopemap.io.sequence import Sequence
 from scopemap.trajectory.trajectory import path_length_mm
 
-LAGS = (10, 30, 90)
-LEAST_OVERLAP = 0.2
+LAGS, LEAST_OVERLAP = (10, 30, 90), 0.2
 _KEPT_EVERY, _MOST_POINTS = 5, 20_000
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LEFT_HANDED = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -32,10 +31,7 @@ _MOST_PIXELS = 200_000
 
 @dataclass(frozen=True)
 class Convention:
-    """One way to read a pair of poses, named by the `code` of its finding and what such poses look like.
-
-    T_b_a : the motion (4, 4) from camera a to camera b of the stored poses (T_a, T_b).
-    """
+    """One way to read a pair of poses, and T_b_a, the motion (4, 4) from camera a to b of stored poses (T_a, T_b)."""
 
     code: str
     looks_like: str

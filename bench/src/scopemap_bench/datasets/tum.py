@@ -1,9 +1,8 @@
 """TUM RGB-D: rooms seen by a Kinect, with poses by motion capture, and whatever else is written in its layout.
 
-`rgb.txt` and `depth.txt` list `timestamp filename`, `groundtruth.txt` lists `timestamp tx ty tz qx qy qz qw`, the pose
-of the colour camera in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. Optional
-`associations.txt`: `t_rgb rgb_file t_depth depth_file`, or depth first. Frame number = position in rgb.txt, from 0.
-Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+`rgb.txt` and `depth.txt` list `timestamp filename`, `groundtruth.txt` `timestamp tx ty tz qx qy qz qw`, colour camera
+in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. `associations.txt`: `t_rgb
+rgb_file t_depth depth_file`, or depth first. Frame number = position in rgb.txt, from 0. Sturm et al., IROS 2012.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ CAMERAS: dict[str, CameraModel] = {
 }
 """Of the colour images of freiburg1, 2 and 3 as published; those of freiburg3 were undistorted."""
 
-DEPTH_UNIT_MM = 0.2
-ASSOCIATED_WITHIN_S = 0.02
+DEPTH_UNIT_MM, ASSOCIATED_WITHIN_S = 0.2, 0.02
 _IMAGES, _DEPTHS, _POSES, _PAIRS = "rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt"
 _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IGNORECASE)
 

@@ -40,8 +40,7 @@ OrbFeatures = tuple[np.ndarray, np.ndarray]
 """ORB features of one image: pixels (N, 2) float64, px, and descriptors (N, 32) uint8."""
 _POSES = ("reference", "estimated")
 _CHANGES = ("same_pixel", "along_flow", "opw", "opw_reference", "opw_estimated")
-_CHANGE = ("mean_mm", "relative", "rtc")
-_RTC_RATIO = 1.01
+_CHANGE, _RTC_RATIO = ("mean_mm", "relative", "rtc"), 1.01
 
 
 @dataclass(frozen=True)

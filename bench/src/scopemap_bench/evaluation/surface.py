@@ -23,11 +23,10 @@ THRESHOLDS_MM = (1.0, 2.0, 5.0)
 
 _SAMPLES_PER_MM2 = 4.0
 _SAMPLES = (1_000, 200_000)
-_COVERED_MM = 2.0
+_COVERED_MM, _NEIGHBOURS = 2.0, 10
 _LARGEST_EDGE_MM, _MOST_TRIANGLES = 2.0, 1_000_000
 _CANDIDATES, _CHUNK = (8, 32, 128), 5_000
 _MOVED_POINTS, _FEWEST_POINTS, _KEPT_SHARE, _MOST_ITERATIONS = 20_000, 10, 0.8, 60
-_NEIGHBOURS = 10
 # Neighbours that swap places never let the last thousandths of a mm come to rest.
 _STILL_MM = 5e-3
 # Directions in which the surface slides along itself (a plane has three) are not moved in.

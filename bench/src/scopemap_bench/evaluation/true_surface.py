@@ -160,11 +160,7 @@ class TrueSurface:
         return trimesh.Trimesh(self._mesh.vertices, self._mesh.faces[self.seen], process=False)
 
     def seen_by(self, camera: CameraModel, views: Mapping[int, TrueView]) -> TrueSurface:
-        """Return the mesh with a new `seen`: the faces whose centre some view, by its frame's number, sees.
-
-        Where the tissue moves, each view is compared with its own mesh. `InputError` where no face is seen or no mesh
-        fits.
-        """
+        """Return the mesh with the faces that some view, by its frame's number, sees; `InputError` where no mesh fits."""
         seen = np.zeros(len(self._mesh.faces), dtype=bool)
         for index, view in views.items():
             mesh = self._mesh_of_frame(index) if self.frames else self._mesh

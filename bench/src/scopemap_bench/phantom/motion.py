@@ -1,8 +1,7 @@
 """How the camera and the tissue move.
 
-Generated camera paths move like a hand; poses are camera to world, mm, OpenCV axes. Tissue breathes or is pushed by a
-smooth displacement with bounded gradient: at the point p of space is that of the rest point p - u(p), with u a sum of
-plane waves and of bumps.
+Generated paths are hand-like; poses are camera to world, mm, OpenCV axes. Tissue moves by a smooth displacement: at the
+point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps.
 """
 
 from __future__ import annotations

@@ -48,9 +48,7 @@ _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
 @dataclass(frozen=True)
 class Phantom:
-    """A scene with the path through it, ready to be rendered frame by frame.
-
-    poses : (N, 4, 4) float64, camera to world, mm. exposure : gain of every frame, or of each (N,); None: each has its
+    """A scene and the path (N, 4, 4) through it, camera to world, mm; `exposure`: of all frames, of each (N,), or None:
     own.
     """
 

@@ -37,10 +37,9 @@ MAX_SAMPLES = 8
 """Of light within one exposure."""
 
 _SHIFT_PERCENTILE, _PX_PER_SAMPLE = 95, 2.0
-_ENCODER = "libx264"
+_ENCODER, _FULL_EVERY = "libx264", 60
 # Endoscopy towers record live: no frames from the future, a full frame every two seconds.
 _OPTIONS = {"preset": "fast", "tune": "zerolatency"}
-_FULL_EVERY = 60
 
 
 @dataclass(frozen=True)

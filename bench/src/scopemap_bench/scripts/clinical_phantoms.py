@@ -2,9 +2,8 @@
 
     python -m scopemap_bench.scripts.clinical_phantoms [--only NAME ...] [--seeds N] [--preset NAME] [--out FOLDER]
 
-First table: each phantom (120 frames of 320x256 px) has one difficulty, one run of the command line with scopenet. ATE
-is that of the largest submap after a Sim(3) alignment. Second table: phantoms through lenses of known kind and field of
-view, given as plain pictures: every fourth of 120 frames, as the estimate uses them.
+First table: phantoms of 120 frames with one difficulty each; ATE is that of the largest submap after a Sim(3)
+alignment. Second table: lenses of known kind and field of view, given as plain pictures, every fourth of 120 frames.
 """
 
 from __future__ import annotations

@@ -2,11 +2,10 @@
 
     python -m scopemap_bench.scripts.depth_without_download --data FOLDER [--model FILE ...] [--size WxH ...]
 
-Four scenes with true depth are seen by rectified pinholes of any size; "wide" is trans_t1_a at 0.6 times the focal
-length, where depth and distance along the ray differ most. Dark surround, depth clipped by the data set and instruments
-do not count. Of several --model (weights of the network) each has a row. The few constants of shading were chosen on
-these very frames; the network never saw them. Sigma is judged after median scaling, by errors that are Laplace
-distributed in log depth: 0.76 and 0.94 of the pixels are within 1 and 2 sigma where it is right. Last table: pixels
+Four scenes with true depth are seen by rectified pinholes; "wide" is trans_t1_a at 0.6 times the focal length. Dark
+surround, clipped depth and instruments do not count. Each --model (weights of the network) has a row. The few constants
+of shading were chosen on these very frames; the network never saw them. Sigma is judged after median scaling, by
+Laplace errors of log depth: 0.76 and 0.94 of the pixels are within 1 and 2 sigma where it is right. Last table: pixels
 masked as instruments, and IoU with `gt_masks`.
 """
 

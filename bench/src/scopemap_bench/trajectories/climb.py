@@ -1,9 +1,9 @@
 """Poses in CLiMB's layouts: the submaps of a submission's run, and a sequence's reference by COLMAP.
 
-A run holds `camera_trajectory/cam_traj_map_000.txt`, one file per submap, with rows `timestamp, name_image, tx, ty, tz,
-qw, qx, qy, qz`, camera-to-world. A reference is `SEQUENCE/results_txt/images.txt`; `scales.csv` beside SEQUENCE has its
-mm per unit. Both count frames from 1; frames are numbered from 0 here. Source: EndoCartoScope/climb-challenge,
-README.md and submission_instructions/README.md.
+A run holds `camera_trajectory/cam_traj_map_000.txt`, a file per submap, of `timestamp, name_image, tx, ty, tz, qw, qx,
+qy, qz`, camera-to-world. A reference is `SEQUENCE/results_txt/images.txt`; `scales.csv` beside SEQUENCE has its mm per
+unit. Both count frames from 1, we from 0. Source: EndoCartoScope/climb-challenge, README.md,
+submission_instructions/README.md.
 """
 
 from __future__ import annotations
