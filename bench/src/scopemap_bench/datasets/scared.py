@@ -193,7 +193,7 @@ class ScaredCKeyframe(ScaredKeyframe):
 
 
 class _ArchivedImages(ImageFolder):
-    """Images in an archive, `frame<number>.png`; one that is missing or damaged is left out with a warning."""
+    """Images in an archive, `frame<number>.png`; one that is missing or damaged is left out."""
 
     def __init__(self, archive: NumberedFiles, numbers: list[int]) -> None:
         self._archive = archive

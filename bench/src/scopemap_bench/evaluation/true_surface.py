@@ -160,7 +160,7 @@ class TrueSurface:
         return trimesh.Trimesh(self._mesh.vertices, self._mesh.faces[self.seen], process=False)
 
     def seen_by(self, camera: CameraModel, views: Mapping[int, TrueView]) -> TrueSurface:
-        """Return the mesh with the faces that some view, by its frame's number, sees; `InputError` where no mesh fits."""
+        """Return the mesh with the faces that some view, by its frame's number, sees; `InputError` where none fits."""
         seen = np.zeros(len(self._mesh.faces), dtype=bool)
         for index, view in views.items():
             mesh = self._mesh_of_frame(index) if self.frames else self._mesh

@@ -61,10 +61,7 @@ class Phantom:
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
-    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame.
-
-    Raises `InputError` where the path file cannot be used or holds fewer poses than the frames wanted.
-    """
+    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame."""
     poses = camera_path(spec)
     volume, appearance = build_scene(spec, poses)
     for event in _events(spec, "contact"):
