@@ -3,8 +3,7 @@
 Here is what needs the whole way, or no reader of its own. Elsewhere: files cut off, empty, of text, of another size,
 numbers missing, twice or out of order, poses of NaN and left-handed, depth of 8 bit, in every data set's layout
 (test_planted_faults); what means harm (test_hostile_input); names without numbers (test_datasets); options (test_cli);
-an earlier run, and what else lies in an output folder (test_reconstruction, test_refusals); any damage at random
-(scopemap_bench/scripts/fuzz.py).
+an earlier run, and what else lies in an output folder (test_reconstruction, test_refusals).
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from scopemap.frame import Frame
 from scopemap.io.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.track import FrameTracker, Track
-from scopemap_bench.methods import open3d_odometry
-from scopemap_bench.methods.open3d_odometry import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
+from scopemap_bench.methods import baselines
+from scopemap_bench.methods.baselines import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
 
 COLOUR, CLOUDS = list(RGBD_METHODS), list(ICP_METHODS)
 PLAIN = {
@@ -147,6 +147,6 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch: pytest.Monke
     def missing(name: str) -> ModuleType:
         raise OSError(f"libusb-1.0.so.0: cannot open shared object file ({name})")
 
-    monkeypatch.setattr(open3d_odometry.importlib, "import_module", missing)
+    monkeypatch.setattr(baselines.importlib, "import_module", missing)
     with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -e '\./bench\[baselines\]'.*libgl1"):
         Open3dTracker("park")

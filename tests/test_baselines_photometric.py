@@ -20,8 +20,7 @@ from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.pyramid import build_pyramid
 from scopemap.tracking.track import FrameTracker
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.methods.endo_depth_and_motion import SETTINGS, create_endo_depth_and_motion
-from scopemap_bench.methods.standing_still import StandingStill
+from scopemap_bench.methods.baselines import SETTINGS, StandingStill, create_endo_depth_and_motion
 
 PLAIN = {
     **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},

@@ -13,8 +13,8 @@ from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
 from scopemap_bench import runner
+from scopemap_bench.comparison import FinishedRun, write_results
 from scopemap_bench.entry import Entry
-from scopemap_bench.figures import FinishedRun, write_results
 from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
 from scopemap_bench.runner import run_entry, run_plan

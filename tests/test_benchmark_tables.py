@@ -23,8 +23,7 @@ from scopemap_bench.evaluation.depth import mean_depth_report, scale_jitter
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.surface import compare_surfaces, distance_figures
 from scopemap_bench.result import RunResult
-from scopemap_bench.summary import summarise
-from scopemap_bench.table import Table
+from scopemap_bench.table import Table, summarise
 from scopemap_bench.tables import PublishedTable, benchmark_tables, read_table, write_tables
 
 NAN = float("nan")

@@ -21,8 +21,7 @@ from tiny_phantom import write_tiny
 
 from scopemap.errors import InputError
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.climb.check import submission_problems
-from scopemap_bench.climb.submission import write_submission
+from scopemap_bench.climb.submission import submission_problems, write_submission
 
 ROOT = Path(__file__).resolve().parents[1]
 Edit = Callable[[Path], object]

@@ -16,12 +16,13 @@ from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
 from scopemap_bench.evaluation.consistency import (
     ConsistencyMeter,
+    FrameCorrespondences,
+    FrameMatcher,
     alignment_errors,
     depth_change,
     mean_change,
     projected_depth,
 )
-from scopemap_bench.evaluation.correspondences import FrameCorrespondences, FrameMatcher
 
 STILL = [pose()] * 4
 ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]

@@ -21,8 +21,7 @@ from scopemap.io.sequence import Sequence
 from scopemap.io.source import SourceFrame, SourceTruth
 from scopemap.trajectory.formats.text import read_poses
 from scopemap_bench.datasets.checking import Finding, check, check_path, refusal
-from scopemap_bench.datasets.pose_depth import PoseDepthTest
-from scopemap_bench.datasets.survey import FrameFigures, Survey, survey
+from scopemap_bench.datasets.survey import FrameFigures, PoseDepthTest, Survey, survey
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 
@@ -261,7 +260,7 @@ def test_few_frames_are_held_and_compared_over_three_lags() -> None:
 
 def test_the_documents_name_every_code() -> None:
     room = ROOT / "bench" / "src" / "scopemap_bench" / "datasets"
-    text = "".join((room / name).read_text() for name in ("checking.py", "pose_depth.py"))
+    text = "".join((room / name).read_text() for name in ("checking.py", "survey.py"))
     heads = "camera|depth|frame|number|pose|poses|reading|time|truth"
     codes = set(re.findall(rf'"((?:{heads})-[a-z-]+)"', text)) | {"refused", "source", "assumed"}
     codes |= {"pose-missing", "depth-missing"}

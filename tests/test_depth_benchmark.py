@@ -10,7 +10,7 @@ import pytest
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.frame import Frame
 from scopemap_bench.scripts import depth_without_download as bench
-from scopemap_bench.scripts.depth_scenes import drawn
+from scopemap_bench.scripts.depth_without_download import drawn
 
 CAMERA = PinholeCamera(50.0, 50.0, 31.5, 23.5, 64, 48)
 SHAPE = (300, 400)

@@ -11,12 +11,13 @@ import numpy as np
 import plane_scene
 import pytest
 import trimesh
+from chosen_settings import configured
 from front_door import said, warned
 from result_files import frame_rows
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.config import Config, MappingSettings
+from scopemap.config import MappingSettings
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -29,8 +30,7 @@ from scopemap.mapping.submaps import corrected_frame
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap_bench.climb.check import submission_problems
-from scopemap_bench.climb.submission import write_submission
+from scopemap_bench.climb.submission import submission_problems, write_submission
 from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
@@ -251,8 +251,10 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     monkeypatch.setattr(TsdfVolume, "integrate", integrate)
     # Features would find the camera at once: no map would begin.
     monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: None)
-    settings = {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
-    result = reconstruct(open_sequence(cut), Config.load(settings=settings), out=tmp_path / "out")
+    config = configured(
+        {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
+    )
+    result = reconstruct(open_sequence(cut), config, out=tmp_path / "out")
     status = result.frames["status"].tolist()
     assert status == ["initial"] + ["ok"] * 53
     assert result.frames["reason"][10 : 11 + LOST_BEFORE_NEW].tolist() == [

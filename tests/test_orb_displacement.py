@@ -8,7 +8,7 @@ import plane_scene as scene
 import pytest
 from plane_scene import CAMERA, SIX_PIXELS_MM, View, pose, see, true_flow
 
-from scopemap_bench.evaluation.correspondences import (
+from scopemap_bench.evaluation.consistency import (
     Matches,
     displacement_figures,
     lifted_matches,

@@ -17,15 +17,12 @@ from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp
 from scopemap.io.opening import open_sequence
 from scopemap.trajectory.formats.text import read_poses
-from scopemap_bench.phantom.camera_path import lumen_path, sweep_path, turned
-from scopemap_bench.phantom.deformation import REST
-from scopemap_bench.phantom.exposing import VideoCoding, lagging_gains
 from scopemap_bench.phantom.instrument import Capsules, insert
-from scopemap_bench.phantom.march import march, rays_of
+from scopemap_bench.phantom.march import Volume, march, rays_of
+from scopemap_bench.phantom.motion import REST, lumen_path, sweep_path, turned
 from scopemap_bench.phantom.render import Phantom, light, prepare, render_frame
-from scopemap_bench.phantom.shading import develop, shade
+from scopemap_bench.phantom.shading import VideoCoding, develop, lagging_gains, shade
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
-from scopemap_bench.phantom.volume import Volume
 from scopemap_bench.phantom.writer import write_phantom
 
 # ---- the camera: motion blur, exposure, coding, lens

@@ -8,11 +8,10 @@ import trimesh
 from scipy import ndimage
 
 from scopemap.geometry.se3 import inverse, transform
-from scopemap_bench.phantom.deformation import REST, breathing
-from scopemap_bench.phantom.march import march
+from scopemap_bench.phantom.march import Volume, march
+from scopemap_bench.phantom.motion import REST, breathing
 from scopemap_bench.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.volume import Volume
 from scopemap_bench.phantom.writer import seen_surface
 
 SMALL = {"width": 96, "height": 80, "frames": 12}

@@ -213,7 +213,7 @@ def test_overlapping_stages_change_no_bit(folder: Path, monkeypatch: pytest.Monk
     spies = spied(monkeypatch)
     threaded = reconstruct(open_sequence(folder), Config.load())
     assert threading.main_thread().name not in spies[0].threads
-    monkeypatch.setattr("scopemap.runner.run._ahead", lambda items, thread, count=2: (item for item in items))
+    monkeypatch.setattr("scopemap.runner.run.in_thread", lambda items, thread, count=2: (item for item in items))
     serial = reconstruct(open_sequence(folder), Config.load())
     assert threaded.trajectory.T_world_camera.tobytes() == serial.trajectory.T_world_camera.tobytes()
     assert len(serial.mesh.faces) > 100

@@ -17,8 +17,13 @@ from scopemap.errors import InputError
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.opening import open_sequence
 from scopemap_bench.evaluation.surface import compare_surfaces
-from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
-from scopemap_bench.evaluation.visibility import TrueView, seen_points
+from scopemap_bench.evaluation.true_surface import (
+    TrueSurface,
+    TrueView,
+    measure_surface,
+    read_true_surface,
+    seen_points,
+)
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 

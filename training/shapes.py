@@ -57,7 +57,7 @@ def _ease(a):
 def bump(x, y, z, seed):
     """Return smooth noise of period 1: standard deviation 0.27, hardly ever beyond -1..1.
 
-    As `scopemap_bench.phantom.volume` (Perlin 2002), with gradients straight from the bits of the hash: a quarter of
+    As `scopemap_bench.phantom.march` (Perlin 2002), with gradients straight from the bits of the hash: a quarter of
     the time.
     """
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)

@@ -78,8 +78,9 @@ if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.depth.custom import OwnDepth
     from scopemap.errors import ScopemapError
-    from scopemap.frame import Frame, Truth
+    from scopemap.frame import Frame
     from scopemap.io.opening import open_sequence
+    from scopemap.io.run_folder import RunFolder
     from scopemap.reconstruction import Reconstruction
     from scopemap.runner.reconstruct import reconstruct
     from scopemap.runner.reconstructor import Reconstructor
@@ -92,9 +93,9 @@ __all__ = [
     "OwnDepth",
     "Reconstruction",
     "Reconstructor",
+    "RunFolder",
     "ScopemapError",
     "Trajectory",
-    "Truth",
     "__version__",
     "open_sequence",
     "read_trajectory",
@@ -107,9 +108,9 @@ _HOMES = {
     "OwnDepth": "depth.custom",
     "Reconstruction": "reconstruction",
     "Reconstructor": "runner.reconstructor",
+    "RunFolder": "io.run_folder",
     "ScopemapError": "errors",
     "Trajectory": "trajectory.trajectory",
-    "Truth": "frame",
     "open_sequence": "io.opening",
     "read_trajectory": "trajectory.formats.opening",
     "reconstruct": "runner.reconstruct",

@@ -1,25 +1,229 @@
-"""Scores finished runs and trajectories of other systems side by side, without a plan, for `scopemap compare`."""
+"""Runs side by side: scored without a plan for `compare`, and their tables and figures, also for `bench`.
+
+OUT/results.md, OUT/tables/NAME.{md,csv,tex}, OUT/figures/: ate.png, frames_until_loss.png, orb_bars.png; per sequence
+orb_pairs, orb_points, depth_change, clouds; per run its mesh with the camera paths. Without true poses, points and
+meshes are drawn by the estimated ones, and the figures state so.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import trimesh
+
 from scopemap.actions.inputs import open_truth
-from scopemap.errors import InputError
-from scopemap.io.reference import read_reference
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import MaskSettings
+from scopemap.errors import AlignmentError, InputError
+from scopemap.evaluation.poses import match
+from scopemap.frame import Frame, Truth
+from scopemap.geometry.se3 import inverse, se3, transform
+from scopemap.io.depth_maps import DepthReader
+from scopemap.io.reference import read_reference, reference_trajectory
 from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence as Frames
+from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Unit
+from scopemap_bench import pictures
 from scopemap_bench.entry import FILE_NAME as ENTRY
 from scopemap_bench.entry import Entry
-from scopemap_bench.figures import FinishedRun
-from scopemap_bench.plan import ProtocolPlan
+from scopemap_bench.evaluation.consistency import FrameMatcher, lifted_matches
+from scopemap_bench.plan import ProtocolPlan, folder_name
 from scopemap_bench.result import FILE_NAME, RunResult
+from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction, draw_registered_clouds
 from scopemap_bench.scoring import default_protocol, pose_groups, score
+from scopemap_bench.table import joined, pd, summarise
+from scopemap_bench.tables import write_tables
+
+_MAX_DEPTHS = 6
+_WORLD = {"reference": "world, true poses", "estimated": "world, own poses"}
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run whose figures are drawn; `open` opens its frames and their truth, None where only poses are known."""
+
+    result: RunResult
+    folder: Path
+    open: Callable[[], Frames] | None = None
+
+
+def write_results(
+    runs: Sequence[FinishedRun], out: Path, *, title: str, notes: Sequence[str] = (), paper_units: bool = False
+) -> list[Path]:
+    """Write all tables, and every figure that the runs have values for, below `out`; return the files."""
+    results = [run.result for run in runs]
+    files = list(write_tables(results, out, paper_units=paper_units, title=title, notes=notes))
+    folder = out / "figures"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write figures to {folder}: {error.strerror or error}") from None
+    files += _bars(results, folder)
+    for sequence in dict.fromkeys(result.sequence for result in results):
+        done = [run for run in runs if run.result.sequence == sequence and run.result.status == "done"]
+        files += _figures_of_sequence(sequence, done, folder)
+    return files
+
+
+def _bars(results: Sequence[RunResult], folder: Path) -> Iterator[Path]:
+    rows = summarise(results)
+
+    def of_all(key: str) -> pd.DataFrame:
+        """Return a figure by sequence and method, both in the order of the results."""
+        table = rows.reindex(columns=[key, "sequence", "method"]).pivot(index="sequence", columns="method", values=key)
+        return table.reindex(index=rows["sequence"].unique(), columns=rows["method"].unique()).astype(float)
+
+    if (ate_mm := of_all("poses.ate_rmse_mm")).notna().any(axis=None):
+        pictures.draw_ate(ate_mm, folder / "ate.png", alignment=joined(sorted(rows["alignment"])).replace("/", ", "))
+        yield folder / "ate.png"
+    if (lengths := of_all("poses.frames")).notna().any(axis=None):
+        longest = lengths.max(axis=1).fillna(0).astype(int).tolist()
+        pictures.draw_frames_until_loss(of_all("poses.frames_until_loss"), longest, folder / "frames_until_loss.png")
+        yield folder / "frames_until_loss.png"
+    orb = f"consistency.orb_{_world_poses(results)}"
+    if (medians_mm := of_all(f"{orb}.median_mm")).notna().any(axis=None):
+        means_mm, stds_mm = of_all(f"{orb}.mean_mm"), of_all(f"{orb}.std_mm")
+        file = folder / "orb_bars.png"
+        pictures.draw_displacement_bars(means_mm, stds_mm, medians_mm, file, where=_WORLD[_world_poses(results)])
+        yield file
+
+
+def _world_poses(results: Sequence[RunResult]) -> str:
+    """Return whose poses take matched points into the world: the true ones for all runs where any run has them."""
+    known = any(np.isfinite(result.figure("consistency", "orb_reference.median_mm")) for result in results)
+    return "reference" if known else "estimated"
+
+
+def _figures_of_sequence(sequence: str, runs: Sequence[FinishedRun], folder: Path) -> Iterator[Path]:
+    """Draw the figures of one sequence; those that need its frames only where these are still there."""
+    name = folder_name(sequence)
+    poses = _world_poses([run.result for run in runs])
+    pairs = {run.result.method: _pair_medians(run.result, poses) for run in runs}
+    measured = {method: medians for method, medians in pairs.items() if np.isfinite(medians).any()}
+    if measured:
+        pictures.draw_displacement_scatter(measured, folder / f"orb_pairs_{name}.png", where=_WORLD[poses])
+        yield folder / f"orb_pairs_{name}.png"
+    open_frames = next((run.open for run in runs if run.open is not None), None)
+    try:
+        frames = None if open_frames is None else open_frames()
+    except InputError:
+        frames = None
+    if frames is None:
+        return
+    if measured:
+        yield from _two_frames(sequence, [run for run in runs if run.result.method in measured], frames, folder)
+    for run in runs:
+        file = folder / f"mesh_{name}_{folder_name(run.result.method)}.png"
+        if _draw_mesh(run, frames, file):
+            yield file
+
+
+def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
+    medians = result.figures.get("consistency", {}).get(f"orb_{poses}", {}).get("pair_median_mm", [])
+    return np.array([np.nan if value is None else value for value in medians], dtype=np.float64)
+
+
+def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
+    """Draw two frames in the middle: their depth, their clouds by each method's poses, ORB's matches in space."""
+    (previous, true_previous), (current, true_current) = _middle(frames)
+    depths, own_poses = {}, {}
+    for run in runs[:_MAX_DEPTHS]:
+        reader, scale = DepthReader(run.folder), run.result.figure("consistency", "scale")
+        before, now = reader.read(previous.index), reader.read(current.index)
+        if before is not None and now is not None and before.shape == now.shape == previous.valid.shape:
+            depths[run.result.method] = (scale * before, scale * now)
+            own_poses[run.result.method] = _poses_of(run, (previous.index, current.index), scale)
+    if not depths:
+        return
+    name = folder_name(sequence)
+    images = (previous.rgb, current.rgb)
+    frames_shown = {f"frame {frame.index}": frame.rgb for frame in (previous, current)}
+    draw_depth_change(frames_shown, depths, folder / f"depth_change_{name}.png")
+    yield folder / f"depth_change_{name}.png"
+    posed = {method: poses for method, poses in own_poses.items() if poses is not None}
+    if posed:
+        clouds = {method: _clouds(images, depths[method], poses, frames.camera) for method, poses in posed.items()}
+        draw_registered_clouds(clouds, folder / f"clouds_{name}.png", where=_WORLD["estimated"])
+        yield folder / f"clouds_{name}.png"
+    matcher = FrameMatcher(frames.camera)
+    matcher.match(previous.rgb, previous.valid)
+    correspondence = matcher.match(current.rgb, current.valid)
+    if correspondence is None:
+        return
+    T_previous, T_current = (None if truth is None else truth.T_world_camera for truth in (true_previous, true_current))
+    where = "estimated" if T_previous is None or T_current is None else "reference"
+    if T_previous is not None and T_current is not None:
+        posed = dict.fromkeys(depths, (T_previous, T_current))
+    if posed:
+        points = {
+            method: lifted_matches(correspondence.matches, *depths[method], frames.camera, poses)[:2]
+            for method, poses in posed.items()
+        }
+        pictures.draw_matched_points(points, folder / f"orb_points_{name}.png", where=_WORLD[where])
+        yield folder / f"orb_points_{name}.png"
+
+
+def _poses_of(run: FinishedRun, indices: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return a run's poses (4, 4) of two frames, their translations scaled as its depth; None where one is lost."""
+    trajectory = read_trajectory(run.folder)
+    poses = [trajectory.T_world_camera[(trajectory.indices == index) & trajectory.tracked] for index in indices]
+    if not all(len(found) for found in poses):
+        return None
+    first, second = (se3(found[0, :3, :3], scale * found[0, :3, 3]) for found in poses)
+    return first, second
+
+
+def _clouds(
+    images: tuple[np.ndarray, np.ndarray],
+    depths_mm: tuple[np.ndarray, np.ndarray],
+    poses: tuple[np.ndarray, np.ndarray],
+    camera: PinholeCamera,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (N, 3) of both frames, mm, in the camera of the first, and their colours (N, 3) uint8."""
+    known = [np.isfinite(depth) for depth in depths_mm]
+    local = [(camera.rays * depth[..., None])[k] for depth, k in zip(depths_mm, known, strict=True)]
+    points = np.concatenate([local[0], transform(inverse(poses[0]) @ poses[1], local[1])])
+    return points, np.concatenate([image[k] for image, k in zip(images, known, strict=True)])
+
+
+def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
+    """Return the two frames in the middle, masked as for the measures, with their truth."""
+    stamps = frames.source.stamps(frames.selection) or []
+    masker = Masker(MaskSettings())
+    last: list[tuple[Frame, Truth | None]] = []
+    for number, (frame, truth) in enumerate(frames):
+        last = [*last[-1:], (masker(frame), truth)]
+        if number > len(stamps) // 2 and len(last) == 2:
+            break
+    return last
+
+
+def _draw_mesh(run: FinishedRun, frames: Frames, file: Path) -> bool:
+    """Draw a run's mesh with its camera path, and the true one where it is known; False where there is no mesh."""
+    mesh_file, reference = run.folder / "mesh.ply", reference_trajectory(frames)
+    mesh = trimesh.load_mesh(mesh_file, process=False) if mesh_file.is_file() else trimesh.Trimesh()
+    if not len(mesh.faces):
+        return False
+    estimate = read_trajectory(run.folder)
+    if reference is None:
+        tracked, poses = estimate.tracked, estimate.T_world_camera
+        true_mm, T_view = None, poses[np.argmax(tracked)]
+    else:
+        try:
+            matched = match(estimate, reference, run.result.figures["poses"].get("align", "sim3"))
+        except AlignmentError:
+            return False
+        mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
+        tracked, poses = matched.tracked, matched.aligned
+        true_mm, T_view = matched.reference[:, :3, 3], matched.reference[0]
+    draw_reconstruction(mesh, np.where(tracked[:, None], poses[:, :3, 3], np.nan), true_mm, file, T_view)
+    return True
 
 
 def compare(
@@ -27,10 +231,9 @@ def compare(
 ) -> list[FinishedRun]:
     """Return the figures of each run's folder, benchmark's run or trajectory file against `truth`.
 
-    A benchmark's run (a folder with result.json) brings its figures, measured by its own plan. The others are measured
-    here: against a data set's folder with their mesh and depth, against a trajectory file by their poses. `names` are
-    for the table, by default those of the folders. `unit` is that of files that state none. Raises `InputError`, also
-    where `truth` is needed.
+    A benchmark's run (a folder with result.json) brings its figures. The others are measured: against a data set's
+    folder with their mesh and depth, against a trajectory file by their poses. `names` are by default those of the
+    folders, `unit` is that of files that state none. Raises `InputError`, also where `truth` is needed.
     """
     if names and len(names) != len(paths):
         raise InputError(f"comparing {len(paths)} runs: {len(names)} names were given")

@@ -24,13 +24,7 @@ FILE_NAME = "entry.json"
 
 
 class Entry(BaseModel):
-    """One row of a benchmark before it is run.
-
-    Attributes
-    ----------
-    sequence, method, protocol, settings, seed : of the plan. data : the folder of --data.
-    out : the benchmark's folder.
-    """
+    """One row of a benchmark before it is run: parts of its plan, the folder of --data, and the benchmark's folder."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -71,10 +65,7 @@ class Entry(BaseModel):
 
     @property
     def key(self) -> str:
-        """Fingerprint of everything that decides the figures but the code: the plan, and the files that it names.
-
-        A file or folder is represented by its size and time; the folder of --data itself does not count.
-        """
+        """Fingerprint of all that decides the figures but the code: the plan, and size and time of the files in it."""
         described = self.model_dump(mode="json", exclude={"out", "data"})
         named = [self.method.files.format(sequence=self.sequence.name, seed=self.seed), self.sequence.camera or ""]
         named += [self.sequence.depth.partition("files:")[2], (self.sequence.phantom or {}).get("path_file", "")]
@@ -138,15 +129,8 @@ def entries_of(plan: Plan, sequences: list[SequencePlan], data: Path | None, out
         for seed in plan.seeds:
             for method in plan.method:
                 if seed == plan.seeds[0] or sequence.phantom is not None or "{seed}" in method.files:
-                    yield Entry(
-                        sequence=sequence,
-                        method=method,
-                        protocol=plan.protocol,
-                        settings=plan.settings,
-                        seed=seed,
-                        data=data,
-                        out=out,
-                    )
+                    of_plan = {"protocol": plan.protocol, "settings": plan.settings, "data": data, "out": out}
+                    yield Entry(sequence=sequence, method=method, seed=seed, **of_plan)
 
 
 def render_once(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> bool:

@@ -24,13 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.container import BarContainer
     from mpl_toolkits.mplot3d import Axes3D
 
-BAR_COLOUR = "#4575b4"
-_NOTE_COLOUR = "#666666"
-_MEAN_COLOUR = "#d95f02"
-_PANELS_ACROSS = 4
-_LONGEST_NAME = 34
-_SHOWN_MATCHES = 400
 _LETTERS_PER_INCH = 12
+BAR_COLOUR, _NOTE_COLOUR, _MEAN_COLOUR = "#4575b4", "#666666", "#d95f02"
+_PANELS_ACROSS, _LONGEST_NAME, _SHOWN_MATCHES = 4, 34, 400
 
 
 def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:
@@ -44,10 +40,7 @@ def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:
 
 
 def draw_frames_until_loss(frames: pd.DataFrame, lengths: Sequence[int], file: Path) -> None:
-    """Draw the frames until tracking is lost first; `lengths` are the frames of each sequence, a dashed line.
-
-    Bars of methods that are never lost are green. Raises `ValueError` unless there is one length per sequence.
-    """
+    """Draw the frames until tracking is lost first, green if never; `lengths` of the sequences are dashed lines."""
     check_shape("lengths", np.asarray(lengths), (len(frames),))
     figure, panels = _bar_panels(frames)
     for axes, values, length in zip(panels, frames.to_numpy(), lengths, strict=True):
@@ -62,10 +55,7 @@ def draw_frames_until_loss(frames: pd.DataFrame, lengths: Sequence[int], file: P
 def draw_displacement_bars(
     mean_mm: pd.DataFrame, std_mm: pd.DataFrame, median_mm: pd.DataFrame, file: Path, *, where: str
 ) -> None:
-    """Draw the mean ORB displacement, mm, its standard deviation as a whisker and its median as a diamond.
-
-    `where` names the frame in which the points were compared ("world, true poses").
-    """
+    """Draw the mean ORB displacement, mm, `where` it was compared; whiskers: standard deviation, diamonds: median."""
     figure, panels = _bar_panels(mean_mm)
     figures = (mean_mm.to_numpy(), std_mm.to_numpy(), median_mm.to_numpy())
     for axes, means, stds, medians in zip(panels, *figures, strict=True):
@@ -79,10 +69,7 @@ def draw_displacement_bars(
 
 
 def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Path, *, where: str) -> None:
-    """Draw the median ORB displacement of each pair of consecutive frames, mm, one panel per method, one scale for all.
-
-    `pair_median_mm` gives each method's (P,) values in order, NaN where nothing was matched.
-    """
+    """Draw the median ORB displacement of each pair of consecutive frames (P,), mm, NaN = unmatched."""
     across, down = _grid_size(len(pair_median_mm))
     figure = _new_figure(3.4 * across + 0.6, 2.7 * down + 0.7)
     grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
@@ -105,10 +92,9 @@ def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Pa
 
 
 def draw_matched_points(points_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:
-    """Draw matched points of two consecutive frames in space, mm, one panel per method: the closer, the better.
+    """Draw matched points of two consecutive frames in one world, `where`, mm, one panel per method, 400 at most.
 
-    Each method gives the ends in the previous and in the current frame, (N, 3) each, in one world, which `where` names;
-    of more than 400 matches every k-th is drawn.
+    Each method gives the ends in the previous and in the current frame, (N, 3) each.
     """
     across, down = _grid_size(len(points_mm))
     figure = _new_figure(4.2 * across, 4.2 * down)

@@ -38,8 +38,6 @@ class _Part(BaseModel):
 class ProtocolPlan(_Part):
     """How runs are scored.
 
-    Attributes
-    ----------
     align : alignment of the trajectory, also applied to mesh and depth in mm.
     protocols : protocols of other papers, measured as well (`evaluation.protocols.PROTOCOLS`).
     surface, depth, consistency : whether these are measured, where there is a truth for them.
@@ -73,18 +71,15 @@ class ProtocolPlan(_Part):
 class SequencePlan(_Part):
     """One sequence, or all that a pattern finds.
 
-    Attributes
-    ----------
     name : for tables; before the path of each sequence that a pattern finds.
     path : below the data folder. A pattern finds folders and videos, with `dataset` only those of its reader, in any
-        spelling of SCARED's folders and within folders of the same name.
+    spelling of SCARED's folders and within folders of the same name.
     phantom : settings of a `PhantomSpec` instead of a path; its `path_file` is below the data folder, its `seed` is
-        added to the benchmark's.
+    added.
     dataset, camera, size, frames : as `open_sequence` takes them; frames as [first, end] or [first, end, step].
-    depth : "": from the settings; "true": the depth files of a C3VD, 7-Scenes or phantom folder; "files:FOLDER" below
-        the data folder; else a name of `depth.backend`.
-    near_far_mm : metric anchor of the first frame. align : replaces the protocol's.
-    settings : dotted names to values, for this sequence.
+    depth : "": from the settings; "true": the data set's files; "files:FOLDER" below the data folder; or a
+    `depth.backend`.
+    near_far_mm : metric anchor of the first frame. align : replaces the protocol's. settings : dotted names to values.
     """
 
     name: str = ""
@@ -115,8 +110,6 @@ class SequencePlan(_Part):
 class MethodPlan(_Part):
     """One method.
 
-    Attributes
-    ----------
     name : for tables and folders. use : "scopemap", "import", or a baseline (`benchmark.methods.method.BASELINES`).
     preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
     files : of `use = "import"`: trajectory below the data folder; may hold {sequence} and {seed}.
@@ -182,10 +175,7 @@ def shipped_plans() -> list[str]:
 
 
 def found_sequences(plan: Plan, data: Path | None) -> tuple[list[SequencePlan], list[str]]:
-    """Return the plan's sequences with patterns replaced by what they find, and a note for each that is missing.
-
-    Raises `InputError` where all are missing.
-    """
+    """Return the plan's sequences, patterns replaced, and a note for each missing one; `InputError` without any."""
     found: list[SequencePlan] = []
     missing: list[str] = []
     for sequence in plan.sequence:
@@ -288,7 +278,5 @@ def _text_of(plan: Path | str) -> str:
     try:
         return shipped.read_text(encoding="utf-8") if shipped.is_file() else Path(plan).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        known = ", ".join(shipped_plans())
-        raise SettingsError(
-            f"cannot read the plan {plan}: {error}. Name a TOML file, or one of those that come with scopemap: {known}"
-        ) from None
+        known = f"Name a TOML file, or one of those that come with scopemap: {', '.join(shipped_plans())}"
+        raise SettingsError(f"cannot read the plan {plan}: {error}. {known}") from None

@@ -19,16 +19,12 @@ Figures = dict[str, dict[str, Any]]
 class RunResult:
     """One row of a benchmark.
 
-    Attributes
-    ----------
     sequence, method, seed : what was run; names as in the plan.
-    status : "failed" where the method died, "missing" where its weights or its trajectory are not on this machine;
-        `error` is the reason, in one line.
-    figures : groups of figures by name: "poses" (`pose_report`), "paper" (`paper_figures`), "depth",
-        "consistency", "surface", and one group per named protocol. A group that could not be measured is absent, a
-        figure that could not be measured is NaN (null in the file).
-    timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; two runs of the same plan may
-        differ here and nowhere else.
+    status : "failed" where the method died, "missing" without its weights or trajectory; `error` is the reason in a
+    line.
+    figures : by group: "poses" (`pose_report`), "paper" (`paper_figures`), "depth", "consistency", "surface", and named
+    protocols; what could not be measured is absent, or NaN (null in the file).
+    timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; not the same in two runs.
     facts : machine, commit, versions, settings, alignment, depth, quality of the truth.
     """
 

@@ -1,9 +1,10 @@
-"""Runs a plan: each entry in a process of its own, with a time limit. A second call continues an interrupted one.
+"""Runs a plan, each entry in a process of its own, with a time limit; a second call continues an interrupted one.
 
 OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/
 
 A method may use all memory, crash in foreign code or call exit: its row says so and the benchmark continues. The
-process of an entry is `python -m scopemap_bench.runner ENTRY.json`, so peak memory is its own.
+process of an entry is `python -m scopemap_bench.runner ENTRY.json`, so peak memory is its own. `describe` tells what a
+plan would run, without running it.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -30,11 +32,85 @@ from scopemap.estimators import missing_weights
 from scopemap.io.sequence import Sequence
 from scopemap_bench.entry import Entry, entries_of
 from scopemap_bench.methods.method import Method, PipelineMethod, create_method
-from scopemap_bench.plan import Plan, found_sequences
+from scopemap_bench.plan import Plan, found_sequences, spec_of
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scoring import score
 
+# Seconds per frame at 400x320 px on two CPU cores: half the CPU time of random networks of full size, flow both ways.
+_FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
+_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
+_PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
+_TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
+_START_S = 20.0  # of a run: imports and kernels
 Listener = Callable[[Entry, RunResult, bool], None]
+
+
+def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
+    """Yield the lines that `scopemap bench PLAN --dry-run` prints; raises as `run_plan`, but writes nothing."""
+    entries, notes = planned(plan, out, data)
+    lengths = {entry.label: _frames(entry) for entry in entries}
+    rows: defaultdict[str, list[str]] = defaultdict(list)
+    hours: defaultdict[str, float] = defaultdict(float)
+    lacking: set[str] = set()
+    done = 0
+    for entry in entries:
+        if kept_result(entry) is not None:
+            done += 1
+        elif reason := what_is_missing(entry):
+            rows[entry.method.name].append(reason)
+            lacking |= set(missing_weights(config)) if (config := _config(entry)) else set()
+        else:
+            hours[entry.method.name] += _seconds(entry, lengths[entry.label]) / 3600
+    yield f"{plan.title}: {len(lengths)} sequences, {sum(lengths.values())} frames, {len(plan.method)} methods"
+    yield from (f"  {label}: {count} frames" for label, count in lengths.items())
+    yield from (f"note: {note}" for note in notes)
+    yield "rows:"
+    for method in dict.fromkeys(entry.method.name for entry in entries):
+        reasons = dict.fromkeys(rows[method])
+        expected = [_duration(hours[method])] if method in hours else []
+        yield f"  {method}: {'; '.join([*expected, *reasons]) or 'done'}"
+    yield f"weights that are missing: {', '.join(sorted(lacking)) or 'none'}"
+    waiting = sum(map(len, rows.values()))
+    yield (
+        f"{len(entries)} runs: {done} done, {waiting} missing, {len(entries) - done - waiting} to run in about "
+        f"{_duration(sum(hours.values()))} on two CPU cores; networks take less on a GPU"
+    )
+
+
+def _duration(hours: float) -> str:
+    return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
+
+
+def _frames(entry: Entry) -> int:
+    """Return the number of frames of an entry's sequence; 0 where its file does not state it."""
+    if entry.sequence.phantom is not None:
+        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0
+    try:
+        return entry.open().count or 0
+    except ScopemapError:  # the run reports it
+        return 0
+
+
+def _config(entry: Entry) -> Config | None:
+    """Return the settings of an entry's run; None for an imported trajectory, and for a run that will fail."""
+    method = method_of(entry)
+    with suppress(ScopemapError):
+        return method.config(entry.shared_settings()) if isinstance(method, PipelineMethod) else None
+    return None
+
+
+def _seconds(entry: Entry, frames: int) -> float:
+    """Return the time that an entry takes, from its networks."""
+    config = _config(entry)
+    if config is None:
+        return 0.0
+    flow, networks, mapis = config.networks.flow, config.networks, config.mapis
+    per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
+    per_frame += _FLOW_S.get(networks.keyframe_flow, 0.0)
+    if (mapis.constants.blend, mapis.constants.frame_scale) != ("none", "none"):
+        per_frame += _FLOW_S.get(flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
+    once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
+    return once + frames * per_frame
 
 
 @dataclass(frozen=True)
@@ -58,13 +134,9 @@ def run_plan(
 ) -> Benchmark:
     """Run the entries that are not done yet and return all rows.
 
-    An entry is done when its `result.json` has its fingerprint: settings, sequence, method, protocol, seed. Failed rows
-    are kept, too, unless `retry`. `listener` is called with each row, and whether it was kept. A method that takes
-    longer than `timeout_s` is ended and fails.
-
-    What a method needs and this machine does not have is a row of status "missing", looked for again by each call.
-
-    Raises `InputError` where no sequence is found or `out` cannot be written.
+    An entry is done when its `result.json` has its fingerprint; failed rows are run again with `retry`, those of status
+    "missing" always. `listener` is called with each row, and whether it was kept. A method that takes longer than
+    `timeout_s` is ended and fails. Raises `InputError` where no sequence is found or `out` cannot be written.
     """
     out = Path(out).resolve()
     entries, notes = planned(plan, out, data)
@@ -87,23 +159,17 @@ def run_plan(
 
 
 def planned(plan: Plan, out: Path, data: Path | None = None) -> tuple[list[Entry], list[str]]:
-    """Return the entries of a plan, and a note for each sequence that is missing.
-
-    Raises `InputError` where no sequence is found, `SettingsError` for unknown methods and for two entries with one
-    folder.
-    """
+    """Return the entries of a plan, and a note for each missing sequence; `SettingsError` for two of one folder."""
     data = None if data is None else Path(data).resolve()
     sequences, notes = found_sequences(plan, data)
     for method in plan.method:
         create_method(method, data)
     entries = list(entries_of(plan, sequences, data, out))
     folders = Counter(entry.folder for entry in entries)
-    for entry in entries:
-        if folders[entry.folder] > 1:
-            raise SettingsError(
-                f"the plan '{plan.title}' has two sequences that are called '{entry.label}' (letters and digits "
-                "count): give them names"
-            )
+    twice = next((entry.label for entry in entries if folders[entry.folder] > 1), None)
+    if twice is not None:
+        called = f"two sequences that are called '{twice}' (letters and digits count): give them names"
+        raise SettingsError(f"the plan '{plan.title}' has {called}")
     return entries, notes
 
 

@@ -23,37 +23,22 @@ from scopemap.io.sequence import Sequence
 from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
-from scopemap_bench.evaluation.consistency import ConsistencyMeter
-from scopemap_bench.evaluation.correspondences import FrameMatcher
-from scopemap_bench.evaluation.depth import (
-    DEPTH_RANGES_MM,
-    DepthPairs,
-    DepthScaling,
-    evaluate_depth_sequence,
-    fit_sequence,
-)
+from scopemap_bench.evaluation import depth as depth_errors
+from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher
+from scopemap_bench.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
 from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.result import Figures
 
-_CONSISTENCY_PX = 1.0
-_MAX_VIEWS = 40
+_CONSISTENCY_PX, _MAX_VIEWS = 1.0, 40
 
 
 def score(
-    folder: Path,
-    sequence: Sequence,
-    protocol: ProtocolPlan,
-    align: AlignMode | None = None,
-    flows: Path | None = None,
+    folder: Path, sequence: Sequence, protocol: ProtocolPlan, align: AlignMode | None = None, flows: Path | None = None
 ) -> Figures:
-    """Return all figures of a run's folder that the truth of its sequence allows, by group.
-
-    `align` replaces the protocol's; `flows` is a folder that keeps the flow for the next method. A group without a
-    truth is left out. A trajectory that cannot be aligned (too few frames tracked) has "poses" without errors.
-    """
+    """Return all figures of a run's folder that its sequence's truth allows, by group; `flows` keeps flow."""
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
     if matched is not None and protocol.surface:
@@ -70,10 +55,7 @@ def score(
 def pose_groups(
     estimate: Trajectory, reference: Trajectory | None, protocol: ProtocolPlan, align: AlignMode
 ) -> tuple[Figures, MatchedTrajectories | None]:
-    """Return "poses", "paper" and the named protocols' groups, and the alignment.
-
-    Without an alignment, "poses" holds the figures that need no truth, by the names of `pose_report`.
-    """
+    """Return "poses", "paper" and the protocols' groups, and the alignment; without one, "poses" that need no truth."""
     matched: MatchedTrajectories | None = None
     # A path that cannot be aligned (one place, one line) still has rotation, TLR and an error from the start.
     modes: tuple[AlignMode, ...] = (align, "origin")
@@ -99,8 +81,8 @@ def surface_figures_of(
 ) -> dict[str, float]:
     """Return the figures of a run's mesh.ply against the true surface of a data set; {} where there is none.
 
-    With a sequence, the part of the true surface that its views show is found, where the data set does not state it.
-    `similarity` takes the run's world to the true one. Raises `InputError` for a mesh that cannot be read.
+    `similarity` takes the run's world to the true one. A sequence tells what of the true surface its views show, where
+    the data set does not. Raises `InputError` for a mesh that cannot be read.
     """
     file = run / "mesh.ply"
     if not file.is_file():
@@ -128,13 +110,11 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
     chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]}
+    truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
     views = {
         truth.index: (truth.T_world_camera, truth.depth_mm)
-        for frame, truth in sequence
-        if frame.index in chosen
-        and truth is not None
-        and truth.T_world_camera is not None
-        and truth.depth_mm is not None
+        for truth in truths
+        if truth.T_world_camera is not None and truth.depth_mm is not None
     }
     return surface.seen_by(sequence.camera, views) if views else surface
 
@@ -142,8 +122,8 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
 def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:
     """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
 
-    True depth counts within the range that is usual for the data set (`DEPTH_RANGES_MM`). Raises `InputError` where the
-    run kept no depth, or its camera is not that of the data set, or the data set has no true depth.
+    Raises `InputError` where the run kept no depth, or has another camera than the data set, which must have true
+    depth.
     """
     depth = DepthReader(run)
     if not depth.present:
@@ -181,7 +161,7 @@ def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
 
 
 def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
-    report = evaluate_depth_sequence(
+    report = depth_errors.evaluate_depth_sequence(
         _true_pairs(depth, sequence),
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
@@ -193,14 +173,10 @@ def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Fi
 
 
 def _consistency(
-    depth: DepthReader,
-    sequence: Sequence,
-    estimate: Trajectory,
-    protocol: ProtocolPlan,
-    flows: Path | None = None,
+    depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan, flows: Path | None = None
 ) -> Figures:
     """Measure depth over time, after one scale factor for all frames where true depth is known."""
-    scale = fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    scale = depth_errors.fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
@@ -234,8 +210,7 @@ def flow_to_previous(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px from frame `index` to the one before, and its consistent pixels (H, W) bool.
 
-    `folder` keeps the flow of one sequence and one estimator, so that all methods are measured with the same one. Half
-    precision (0.03 px at most for flows below 64 px), with and without a folder.
+    `folder` keeps the flow, so that all methods are measured with the same one. Half precision, with and without it.
     """
     file = None if folder is None else folder / f"{index:06d}.npz"
     if file is not None and file.is_file():

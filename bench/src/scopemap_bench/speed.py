@@ -1,8 +1,7 @@
 """Processor time of each stage of a run on this machine, and its comparison with an earlier measurement.
 
-Processor time, not time that passes: what else runs on the machine disturbs it less. A stage counts without the stages
-that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's DIS flow of a fixed pair of
-images: not this package's code, and like most of its work.
+A stage counts without the stages that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's
+DIS flow of a fixed pair of images: not this package's code, and like most of its work.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "store": ("fusion.frame_store:FrameStore.put", "fusion.frame_store:FrameStore._read"),
     "feature tracks": ("mapping.feature_tracks:FeatureTracks.add",),
     "depth triangulation": ("mapping.multiview_depth:triangulate_depth", "mapping.multiview_depth:propagate_depth"),
-    "fusion": ("fusion.volume:TsdfVolume.integrate",),
+    "fusion": ("fusion.surface_fusion:TsdfVolume.integrate",),
     "writing": ("io.depth_maps:DepthWriter.__call__", "reconstruction:Reconstruction.save"),
 }
 """Functions, "module:name" in the package, whose processor time is a stage's; the rest is that of the run's parts."""
@@ -74,13 +73,7 @@ _CALIBRATION_RUNS = 15
 
 @dataclass(frozen=True)
 class StageTime:
-    """Processor time of a stage.
-
-    Attributes
-    ----------
-    ms : per frame of the clip: median of a call times calls per frame, summed over the stage's functions.
-    ratio : the same over the calibration. share : of all stages. thread : the thread that most of it ran in.
-    """
+    """Processor time of a stage: ms per frame, ratio to the calibration, share of all stages, main thread."""
 
     ms: float
     ratio: float
@@ -92,11 +85,9 @@ class StageTime:
 class Speed:
     """Processor time per frame of a run's stages on one machine.
 
-    Attributes
-    ----------
-    clip : name of the input. frames : how many. preset : of the run. size : (width, height) of the working images, px.
-    calibration_ms : processor time of the calibration. cpu_ms : of the whole process, per frame.
-    passed_ms : time that passed, per frame. stages : by name.
+    calibration_ms, cpu_ms : of the calibration, and of the whole process per frame. passed_ms : time that passed, per
+    frame.
+    size : (width, height) of the working images, px. stages : by name.
     """
 
     clip: str
@@ -118,10 +109,8 @@ class Speed:
         return rounded
 
     def slower_than(self, before: Speed, tolerance: float) -> list[str]:
-        """Return a line for each stage whose ratio to the calibration has grown by more than the share `tolerance`.
-
-        Stages below a twentieth of the calibration are within the noise. Raises `InputError` for another clip,
-        number of frames or preset.
+        """Return a line for each stage slower by more than the share `tolerance`; `InputError` for other clips or
+        presets.
         """
         if before._measured != self._measured:
             raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
@@ -146,8 +135,7 @@ def read_speed(file: Path) -> Speed:
 def measure_speed(video: Path | None, config: Config, frames: int | None = None) -> Speed:
     """Run a video, or by default a phantom, and return the processor time of its stages.
 
-    frames : how many of the video, None: all. OpenCV has one thread meanwhile, so that its work is counted where it is
-    called. Not for use beside other runs in the process.
+    `frames`: None: all. OpenCV has one thread meanwhile, so that its work is counted where it is called.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -172,16 +160,8 @@ def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Spee
     cpu_ms = 1e3 * (time.process_time() - cpu_started) / count
     passed_ms = 1e3 * (time.perf_counter() - started) / count
     calibration_ms = float(np.median(calibrations + _calibrations_ms()))
-    return Speed(
-        sequence.name,
-        count,
-        config.preset,
-        (sequence.camera.width, sequence.camera.height),
-        calibration_ms,
-        cpu_ms,
-        passed_ms,
-        clock.stages(count, calibration_ms),
-    )
+    size, stages = (sequence.camera.width, sequence.camera.height), clock.stages(count, calibration_ms)
+    return Speed(sequence.name, count, config.preset, size, calibration_ms, cpu_ms, passed_ms, stages)
 
 
 class _Stopwatch:
@@ -216,7 +196,9 @@ class _Stopwatch:
         """Note the processor time of what is within as that of a function of a stage; usable as a decorator."""
         # Open calls of this thread: stage, seconds of the stages within.
         calls: list[tuple[str, list[float]]] = self._local.__dict__.setdefault("calls", [])
-        name, within = _named(stage, [call for call, _ in calls]), [0.0]
+        name, within = stage, [0.0]
+        if stage == "flow":  # named by what it is computed for
+            name = next((_CALLER[caller] for caller, _ in calls if caller in _CALLER), _OTHER_FLOW)
         calls.append((stage, within))
         started = time.thread_time()
         try:
@@ -226,7 +208,9 @@ class _Stopwatch:
             calls.pop()
             if calls:
                 calls[-1][1][0] += seconds
-            self._seconds[name, _thread_name(), function].append(seconds - within[0])
+            thread = threading.current_thread().name
+            thread = "main" if thread == "MainThread" else thread.rpartition("_")[0] or thread
+            self._seconds[name, thread, function].append(seconds - within[0])
 
     def stages(self, frames: int, calibration_ms: float) -> dict[str, StageTime]:
         """Return the stages that ran, the slowest first."""
@@ -240,18 +224,6 @@ class _Stopwatch:
             own = sum(threads.values())
             found[stage] = StageTime(own, own / calibration_ms, own / total, max(threads, key=threads.__getitem__))
         return found
-
-
-def _named(stage: str, callers: list[str]) -> str:
-    """Return the name of a stage; flow is named by what it is computed for."""
-    if stage != "flow":
-        return stage
-    return next((_CALLER[caller] for caller in callers if caller in _CALLER), _OTHER_FLOW)
-
-
-def _thread_name() -> str:
-    name = threading.current_thread().name
-    return "main" if name == "MainThread" else name.rpartition("_")[0] or name
 
 
 def resolved(place: str) -> tuple[Any, str]:

@@ -1,10 +1,8 @@
 """All tables of a benchmark, and their files. `tables.toml` lists the columns.
 
-A group of figures that no run has is no table. The figures of a named protocol stand in a table of its name only.
-
-Tables 1 to 3 have the form of arXiv 2508.11282: our figures as measured, the paper's rows as printed. The paper's rows
-come from other data, after an alignment and with an RPE over an interval that it does not state: they are marked as
-published and never compete, and their RPE has a column of its own.
+A group of figures that no run has is no table. A named protocol has a table of its name. Tables 1 to 3 have the form of
+arXiv 2508.11282, with the paper's rows as printed: they are marked as published and never compete, and their RPE, over
+an interval that is not stated, has a column of its own.
 """
 
 from __future__ import annotations
@@ -19,8 +17,7 @@ from typing import Any, Literal
 
 from scopemap.errors import InputError
 from scopemap_bench.result import RunResult
-from scopemap_bench.summary import joined, of_frames, summarise
-from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, pd
+from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, joined, of_frames, pd, summarise
 
 PublishedTable = Literal["table1_pose_scared", "table2_methods_scared", "table3_ablation_scared"]
 
@@ -52,9 +49,8 @@ _PUBLISHED_COLUMNS = {
 def benchmark_tables(results: Iterable[RunResult], *, paper_units: bool = False) -> tuple[Table, ...]:
     """Return all tables that the results have figures for, the overview first and the times last.
 
-    Rows stand in the order in which sequences and methods first appear. A method without figures is a row with
-    "failed", "needs weights" or "not supplied", in the overview with the reason. `paper_units`: angles of tables 1 to 3
-    in radians instead of degrees.
+    Rows stand in the order in which sequences and methods first appear; without figures they hold the failure.
+    `paper_units`: angles of tables 1 to 3 in radians instead of degrees.
     """
     results = tuple(results)
     rows = summarise(results)
@@ -77,11 +73,7 @@ def write_tables(
     title: str = "Results",
     notes: Sequence[str] = (),
 ) -> tuple[Path, ...]:
-    """Write FOLDER/results.md, which holds all tables, and FOLDER/tables/NAME.md, .csv, .tex; return the files.
-
-    `title` and `notes` stand at the head of results.md, with machine, commit and versions. The same results give the
-    same bytes. Raises `InputError` where the folder cannot be written.
-    """
+    """Write FOLDER/results.md with all tables, and tables/NAME.md, .csv, .tex, and return the files."""
     results = tuple(results)
     tables = benchmark_tables(results, paper_units=paper_units)
     texts = {"results.md": _document(results, tables, title, notes)}
@@ -117,9 +109,6 @@ def _figure(column: dict[str, Any], paper_units: bool) -> Figure:
     return Figure(**column | {"unit": unit, "factor": factor})
 
 
-# ---- tables 1 to 3
-
-
 def _paper_tables(rows: pd.DataFrame, paper_units: bool) -> Iterator[Table]:
     if not rows.reindex(columns=["paper.t_avg_mm"]).notna().any(axis=None):
         return
@@ -135,15 +124,8 @@ def published_rows(table: PublishedTable) -> pd.DataFrame:
     """Return the rows of one of the paper's tables, in its order, with the columns of `summarise`: mm and rad."""
     with (resources.files("scopemap_bench") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
         rows = pd.read_csv(file).rename(columns=_PUBLISHED_COLUMNS)
-    texts = {
-        "depth": "",
-        "frames tracked": "",
-        "sequences": "",
-        "alignment": "not stated",
-        "failure": "",
-        "source": "published",
-    }
-    return rows.assign(competes=False, **texts)
+    empty = dict.fromkeys(("depth", "frames tracked", "sequences", "failure"), "")
+    return rows.assign(competes=False, alignment="not stated", source="published", **empty)
 
 
 def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
@@ -165,9 +147,6 @@ def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
         )
         .reset_index()
     )
-
-
-# ---- other tables
 
 
 def _protocol_table(group: str, rows: pd.DataFrame, results: Sequence[RunResult]) -> Table:
@@ -201,9 +180,6 @@ def _times(rows: pd.DataFrame) -> Table:
     keys = sorted(key for key in rows if key.startswith("timing.ms_of_") and not key.endswith(SPREAD))
     stages = [Figure(key, key.removeprefix("timing.ms_of_").replace("_", " "), "ms", 1, "") for key in keys]
     return replace(table, figures=(*table.figures[:-1], *stages, table.figures[-1]))
-
-
-# ---- files
 
 
 def _document(results: Sequence[RunResult], tables: Sequence[Table], title: str, notes: Sequence[str]) -> str:

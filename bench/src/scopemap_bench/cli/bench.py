@@ -70,14 +70,14 @@ def bench(
         _list_plans()
         return
     if dry_run:
-        from scopemap_bench.preview import describe
+        from scopemap_bench.runner import describe
 
         for line in describe(read_plan(plan), out or Path("."), data):
             typer.echo(line)
         return
     if out is None:
         raise typer.BadParameter("needed with a plan: the folder for runs, tables and figures", param_hint="--out")
-    from scopemap_bench.figures import FinishedRun, write_results
+    from scopemap_bench.comparison import FinishedRun, write_results
     from scopemap_bench.runner import run_plan
 
     def tell(entry: Entry, result: RunResult, known: bool) -> None:
@@ -85,10 +85,8 @@ def bench(
             typer.echo(_line(result, known))
 
     benchmark = run_plan(read_plan(plan), out, data=data, retry=retry, timeout_s=timeout_s, listener=tell)
-    runs = [
-        FinishedRun(result, entry.run_folder, entry.open)
-        for entry, result in zip(benchmark.entries, benchmark.results, strict=True)
-    ]
+    pairs = zip(benchmark.entries, benchmark.results, strict=True)
+    runs = [FinishedRun(result, entry.run_folder, entry.open) for entry, result in pairs]
     title = benchmark.plan.title
     files = write_results(runs, out, title=title, notes=benchmark.notes, paper_units=paper_units)
     for note in [] if quiet else benchmark.notes:

@@ -25,8 +25,7 @@ def climb(
     quiet: Quiet = False,
 ) -> None:
     """Write each run as the five runs of a clip, and check the submission by the challenge's rules (exit code 1)."""
-    from scopemap_bench.climb.check import submission_problems
-    from scopemap_bench.climb.submission import write_submission
+    from scopemap_bench.climb.submission import submission_problems, write_submission
 
     written = [write_submission(run, out, clip) for run in runs or []]
     problems = submission_problems(out, videos)

@@ -38,7 +38,7 @@ def compare(
     from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import PAGE, write_comparison
     from scopemap_bench.comparison import compare as compare_runs
-    from scopemap_bench.figures import write_results
+    from scopemap_bench.comparison import write_results
     from scopemap_bench.plan import ProtocolPlan
     from scopemap_bench.tables import benchmark_tables
 

@@ -28,14 +28,10 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     from scopemap.io.opening import readers
 
     # A reader's docstrings and its layout's table are the only description of a data set.
-    rows = [
-        {
-            "name": name,
-            "what": _first_line(sys.modules[kind.__module__]),
-            "recognised": _first_line(getattr(kind, "recognised", kind.recognises)).removeprefix("Whether "),
-        }
-        for name, kind in readers().items()
-    ]
+    rows = []
+    for name, kind in readers().items():
+        recognised = _first_line(getattr(kind, "recognised", kind.recognises)).removeprefix("Whether ")
+        rows.append({"name": name, "what": _first_line(sys.modules[kind.__module__]), "recognised": recognised})
     if as_json:
         print_json(rows)
     elif not quiet:

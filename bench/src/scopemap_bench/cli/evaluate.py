@@ -62,8 +62,7 @@ def evaluate(
     ] = None,
     icp: Annotated[bool, typer.Option("--icp", help="Also the mesh after a refinement by ICP.")] = False,
     depth: Annotated[
-        DepthScaling | None,
-        typer.Option(help="Also a run's depth maps against true depth, scaled so."),
+        DepthScaling | None, typer.Option(help="Also a run's depth maps against true depth, scaled so.")
     ] = None,
     consistency: Annotated[
         bool, typer.Option("--consistency", help="Also the consistency of a run's depth over time.")

@@ -24,8 +24,8 @@ def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, floa
     """Return ATE, RPE, TFR and counts of the estimate and its other submaps; errors are NaN where no submap counts.
 
     A submap takes the reference frames that no earlier one has, and counts with at least `LEAST_FRAMES` of them. Errors
-    are means over the submaps, weighted by these frames (`matched_poses`). `tfr_percent` is the share of the
-    reference's poses that are matched. Raises `AlignmentError` for a submap that stands still or moves on a line.
+    are means over the submaps, weighted by these frames. Raises `AlignmentError` for a submap that stands still or on a
+    line.
     """
     known = free = reference.rows(reference.tracked)
     errors: list[list[float]] = []

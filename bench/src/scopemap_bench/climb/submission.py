@@ -1,12 +1,16 @@
-"""Writes runs of ours as a submission to the CLiMB challenge.
+"""Writes runs of ours as a submission to the CLiMB challenge, and checks one by its rules.
 
 SUBMISSION/CLIP/RUN/{runtime.txt, camera_trajectory/cam_traj_map_000.txt, 3D_maps/0/points3D.txt}; a file or folder per
-submap; RUN is 1 to 5. Source: EndoCartoScope/climb-challenge, submission_instructions/README.md.
+submap; RUN is 1 to 5. The check holds all that the evaluation relies on. Source: EndoCartoScope/climb-challenge at
+79d7435, submission_instructions/README.md, evaluation/validate_submission.py and slam_utils.py.
 """
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +19,9 @@ import trimesh
 from scopemap.errors import InputError
 from scopemap.io.run_folder import RunFolder
 from scopemap.trajectory.formats.folders import read_run, submap_folders
+from scopemap.trajectory.formats.text import text_lines
 from scopemap.trajectory.trajectory import Trajectory
-from scopemap_bench.trajectories.climb import write_submap
+from scopemap_bench.trajectories.climb import read_submap, write_submap
 
 RUNS = ("1", "2", "3", "4", "5")
 RUNTIME_KEYS = ("init_seconds", "processing_seconds")
@@ -26,10 +31,10 @@ _MOST_POINTS = 20_000
 
 
 def write_submission(run: Path, out: Path, clip: str = "") -> str:
-    """Write the run in folder `run` as five equal runs of a clip below `out`, and return the clip's name.
+    """Write the run in folder `run` as five equal runs of a clip (default: its input's name) below `out`; return its
+    name.
 
-    clip : by default the name of the run's input. Raises `InputError` where `run` is no run's folder, and where one of
-    the clip's runs is there already.
+    Raises `InputError` where `run` is no run's folder, and where one of the clip's runs is there already.
     """
     try:
         facts = RunFolder(run).provenance
@@ -63,10 +68,7 @@ def _write_maps(run: Path, folder: Path) -> None:
 
 
 def _points(mesh_file: Path, submap: Trajectory) -> np.ndarray:
-    """Return rows number x y z r g b error of the mesh's vertices; without a mesh of the camera centres.
-
-    The challenge's evaluation breaks off at a map without points.
-    """
+    """Return rows number x y z r g b error of the mesh's vertices; without a mesh of the camera centres."""
     points = submap.positions_mm[submap.tracked]
     colours = np.zeros(points.shape)
     mesh = trimesh.load_mesh(mesh_file, process=False) if mesh_file.is_file() else None
@@ -74,3 +76,73 @@ def _points(mesh_file: Path, submap: Trajectory) -> np.ndarray:
         points, colours = mesh.vertices, mesh.visual.vertex_colors[:, :3]
     rows = np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).astype(np.int64)
     return np.column_stack([np.arange(1, len(rows) + 1), points[rows], colours[rows], np.zeros(len(rows))])
+
+
+def submission_problems(submission: Path, videos: Path | None = None) -> list[str]:
+    """Return what breaks the rules, a sentence each; `videos` holds the clips (*.mp4) that must be there, None: any."""
+    clips = _folders(submission) if videos is None else sorted(file.stem for file in videos.glob("*.mp4"))
+    if not clips:
+        return [f"{videos or submission}: no clip"]
+    return [problem for clip in clips for problem in _clip_problems(submission / clip)]
+
+
+def _clip_problems(clip: Path) -> Iterator[str]:
+    runs = _folders(clip)
+    # The evaluation takes every folder for a run; a clip with one that it cannot read does not enter the mean.
+    yield from (f"{clip / name}: not a run, which are 1 to {len(RUNS)}" for name in runs if name not in RUNS)
+    for name in RUNS:
+        yield from _run_problems(clip / name) if name in runs else [f"{clip / name}: missing"]
+
+
+def _run_problems(run: Path) -> Iterator[str]:
+    maps, trajectories = run / "3D_maps", run / "camera_trajectory"
+    checks: list[tuple[Callable[[Path], object], Path]] = [(_check_runtime, run / "runtime.txt")]
+    names, expected = _folders(maps), set[Path]()
+    if not names:
+        yield f"{maps}: no map"
+    for name in names:
+        if not (name.isascii() and name.isdecimal()):
+            yield f"{maps / name}: the name of a map must be an integer"
+            continue
+        file = trajectories / f"cam_traj_map_{int(name):03d}.txt"
+        if file in expected:
+            yield f"{maps / name}: another map has this number"
+        expected.add(file)
+        checks += [(_check_points, maps / name / "points3D.txt"), (read_submap, file)]
+    unpaired = sorted({*trajectories.glob("cam_traj_map_*")} - expected)
+    yield from (f"{file}: no map in 3D_maps has this number of three digits" for file in unpaired)
+    for check, file in checks:
+        try:
+            check(file)
+        except InputError as error:
+            yield str(error)
+
+
+def _check_runtime(file: Path) -> None:
+    lines = [line.replace(" ", "") for line in text_lines(file)]
+    for key in RUNTIME_KEYS:
+        if not any(re.fullmatch(rf"{key}=\d+(\.\d+)?(e[-+]?\d+)?", line) for line in lines):
+            raise InputError(f"{file}: expected a line {key}=<seconds>")
+
+
+def _check_points(file: Path) -> None:
+    """Raise `InputError` unless the file holds points, `POINT3D_ID X Y Z R G B ERROR`, with different numbers."""
+    numbers = set()
+    for line_number, line in enumerate(text_lines(file), start=1):
+        if line.startswith("#"):
+            continue
+        fields = line.split()
+        try:
+            number, colour = int(fields[0]), [int(field) for field in fields[4:7]]
+            finite = all(math.isfinite(float(field)) for field in (*fields[1:4], fields[7]))
+        except (IndexError, ValueError):
+            finite = False
+        if not finite or not all(0 <= value <= 255 for value in colour) or number in numbers:
+            raise InputError(f"{file}, line {line_number}: expected POINT3D_ID X Y Z R G B ERROR, each number once")
+        numbers.add(number)
+    if not numbers:
+        raise InputError(f"{file}: no point; the evaluation breaks off at a map without any")
+
+
+def _folders(path: Path) -> list[str]:
+    return sorted(folder.name for folder in path.iterdir() if folder.is_dir()) if path.is_dir() else []

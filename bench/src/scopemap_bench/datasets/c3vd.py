@@ -1,9 +1,8 @@
 """C3VD: phantom colonoscopy with registered truth, and what is written in its layout (github.com/DurrLab/C3VD).
 
-One folder per video: `NNNN_color.png`, `NNNN_depth.tiff`, `pose.txt`; image number = line of `pose.txt`, from 0. Also
-C3VDv2's `rgb/NNNN.png`, `depth/NNNN_depth.tiff`, and EndoGSLAM's copy of C3VD, `color/`, `depth/`: undistorted, half
-the size, depth of 8 bit. Bobrow et al., "Colonoscopy 3D video dataset with paired depth from 2D-3D registration",
-arXiv 2206.08903; Golhar et al., arXiv 2506.24074 (v2); Wang et al., arXiv 2403.15124 (EndoGSLAM).
+`NNNN_color.png`, `NNNN_depth.tiff`, `pose.txt`; image number = line of `pose.txt`, from 0. Also C3VDv2's `rgb/`,
+`depth/`, and EndoGSLAM's undistorted copy of half the size, `color/`, `depth/` of 8 bit. Bobrow et al., arXiv
+2206.08903; Golhar et al., arXiv 2506.24074 (v2); Wang et al., arXiv 2403.15124 (EndoGSLAM).
 """
 
 from __future__ import annotations

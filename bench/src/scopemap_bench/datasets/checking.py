@@ -17,16 +17,21 @@ from scopemap.errors import CalibrationError, ScopemapError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.inspection.clip import Finding, Severity
 from scopemap.io.images import frame_number
-from scopemap_bench.datasets.pose_depth import OTHERS, Agreement
-from scopemap_bench.datasets.survey import RIGID_TOLERANCE, Survey, deviation, extent_mm, positions_of
+from scopemap_bench.datasets.survey import (
+    OTHERS,
+    RIGID_TOLERANCE,
+    Agreement,
+    Survey,
+    deviation,
+    extent_mm,
+    positions_of,
+)
 
 _NAMED = 3
 _TIME_STAMP = re.compile(r"\d\.\d")
 _BLACK_LEVEL, _LEAST_SPREAD = 16.0, 1.0
-_UNEVEN = 0.5
-_FOCAL_WIDTHS = (0.2, 5.0)
-_MIDDLE = (0.25, 0.75)
-_ASPECT_TOLERANCE = 0.1
+_UNEVEN, _ASPECT_TOLERANCE = 0.5, 0.1
+_FOCAL_WIDTHS, _MIDDLE = (0.2, 5.0), (0.25, 0.75)
 _JUMP, _JUMP_DEG = 10.0, 30.0
 _SMALLEST_JUMP_MM, _AROUND = 0.5, 5
 _LARGEST_STEP_MM, _LARGEST_EXTENT_MM = 50.0, 10_000.0
@@ -255,10 +260,7 @@ def _better(agreement: Agreement) -> list[Finding]:
 
 
 def _jumps(steps_mm: np.ndarray, usual_mm: float) -> np.ndarray:
-    """Return where a step (n,) is far longer than is usual, and than those around it.
-
-    A camera at rest trembles by micrometres: when it moves off, all its steps are far longer than is usual.
-    """
+    """Return where a step (n,) is far longer than is usual, and than those around it: a camera at rest trembles."""
     far = steps_mm > max(_JUMP * usual_mm, _SMALLEST_JUMP_MM)
     for at in np.flatnonzero(far):
         around_mm = steps_mm[max(at - _AROUND, 0) : at + _AROUND + 1]

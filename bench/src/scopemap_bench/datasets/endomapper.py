@@ -1,9 +1,8 @@
 """EndoMapper: whole colonoscopies and gastroscopies, some with poses by structure from motion.
 
-`Sequences/Seq_NNN/{Seq_NNN.mov, Seq_NNN_info.json, meta-data/colmap/Seq_NNN.zip}`; the calibration is in a tree of
-its own, `Calibrations/Endoscope_NN/Endoscope_NN_geometrical.xml`, and the info file names the endoscope. COLMAP's poses
-fall into sub-models that share neither frame nor scale: the largest one is used. Azagra et al., "EndoMapper dataset of
-complete calibrated endoscopy procedures", Scientific Data 10, 671 (2023), doi 10.1038/s41597-023-02564-7.
+`Sequences/Seq_NNN/{Seq_NNN.mov, Seq_NNN_info.json, meta-data/colmap/Seq_NNN.zip}`; the info file names the endoscope,
+whose calibration is `Calibrations/Endoscope_NN/Endoscope_NN_geometrical.xml`. COLMAP's sub-models share neither frame
+nor scale: the largest one is used. Azagra et al., Scientific Data 10, 671 (2023), doi 10.1038/s41597-023-02564-7.
 """
 
 from __future__ import annotations
@@ -91,10 +90,7 @@ class EndoMapperSequence(PosedVideo):
 
 
 def read_endoscope(info: Path) -> int | None:
-    """Return the endoscope's number in an info file, which writes it as 1, "1", "Endoscope_01" or "N/A" (None).
-
-    Raises `InputError` for anything else.
-    """
+    """Return the endoscope's number, written 1, "1", "Endoscope_01" or "N/A" (None); `InputError` for anything else."""
     with reporting(f"reading {info}: it is no JSON object"):
         stated = json.loads(info.read_text(encoding="utf-8-sig")).get("endoscope_number")
     text = "" if stated is None else str(stated).strip()

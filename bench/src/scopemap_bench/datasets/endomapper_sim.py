@@ -16,8 +16,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError, reporting
 from scopemap.io.decoding import check_pixels
-from scopemap_bench.datasets.layouts import Place
-from scopemap_bench.datasets.unity import UnityFolder
+from scopemap_bench.datasets.layouts import Place, UnityFolder
 
 CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)
 """As published with the simulated sequences."""
@@ -60,9 +59,8 @@ class EndoMapperSimFolder(UnityFolder):
         v = read_exr_red(file)
         rows, columns = v.shape
         if abs(columns * self.height / (rows * self.width) - 1) > _ASPECT_TOLERANCE:
-            raise InputError(
-                f"reading {file}: depth of {columns}x{rows} px for images of {self.width}x{self.height} px"
-            )
+            size = f"{self.width}x{self.height} px"
+            raise InputError(f"reading {file}: depth of {columns}x{rows} px for images of {size}")
         # A depth buffer holds 0 to 1; NaN compares false.
         v = np.where((v >= 0) & (v <= 1), v, np.float32(np.nan))
         depth_dm = 1 / (1 / _FAR_DM + (1 / _NEAR_DM - 1 / _FAR_DM) * v)
@@ -70,10 +68,7 @@ class EndoMapperSimFolder(UnityFolder):
 
 
 def read_exr_red(file: Path) -> np.ndarray:
-    """Return the channel R, or Y of a file without R, as (h, w) float32.
-
-    Raises `InputError` for a file that is damaged, has neither channel, or claims more pixels than `decoding` allows.
-    """
+    """Return the channel R, or Y, as (h, w) float32; `InputError` for a damaged file, or one of too many pixels."""
     import OpenEXR
 
     with reporting(f"reading {file}: no OpenEXR image with a channel R or Y, or damaged"):

@@ -1,9 +1,8 @@
 """EndoNeRF: short clips of robotic surgery with the camera at rest, tissue that is pulled or cut, and stereo depth.
 
-`images/frame-000000.color.png`, `depth/frame-000000.depth.png` (8 or 16 bit, mm, 0 = none), `gt_masks` (instruments)
-and `masks` (instruments, and holes of the depth), `poses_bounds.npy` (LLFF; `pose_bounds.npy` in the README). Depth is
-by stereo matching, instruments were left out of it. Wang et al., "Neural Rendering for Stereo 3D Reconstruction of
-Deformable Tissues in Robotic Surgery", arXiv 2206.15255.
+`images/frame-000000.color.png`, `depth/frame-000000.depth.png` (8 or 16 bit, mm, 0 = none), `gt_masks` (instruments),
+`masks` (instruments, and holes of the depth), `poses_bounds.npy` (LLFF; `pose_bounds.npy` in the README). Depth is by
+stereo matching without instruments. Wang et al., arXiv 2206.15255.
 """
 
 from __future__ import annotations
@@ -22,16 +21,11 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
 _MASKS, _MASKS_WITH_HOLES = "gt_masks", "masks"
 _COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
-_IDENTITY_TOLERANCE = 1e-2
-_REST_TOLERANCE = 1e-6
+_IDENTITY_TOLERANCE, _REST_TOLERANCE = 1e-2, 1e-6
 
 
 class EndoNerfFolder(LayoutFolder):
-    """One EndoNeRF scene, or a folder in its layout.
-
-    Rows of `poses_bounds.npy` belong to the images in their order. Raises `InputError` for one that cannot be used; a
-    camera in it that cannot be is its `camera_fault`.
-    """
+    """One EndoNeRF scene; rows of `poses_bounds.npy` belong to the images in their order."""
 
     name = "endonerf"
     places = (Place("images", depths=("depth/",)),)

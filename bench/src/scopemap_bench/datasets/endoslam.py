@@ -1,13 +1,10 @@
 """EndoSLAM: endoscopes and capsules in ex-vivo organs, held by a robot, and the same rendered in Unity.
 
-Real: `Cameras/HighCam/Colon-I/TumorfreeTrajectory_1/{Frames/frame_000060.jpg, Poses/*.xlsx}`. Rendered:
-`UnityCam/Colon/{Frames/image_0000.png, Pixelwise Depths/aov_image_0000.png, Poses/colon_position_rotation.csv}`; copies
-repeat folders (`Frames/Frames`, `Depths/Pixelwise Depths`). `Calibration/cam.txt` (3x3) is beside a camera's organs.
-
-The csv is a table of Unity, row = image number. The xlsx of the robot has the columns `ImageFrame` (the number in the
-image's name), `trans_x,y,z` (metres) and the quaternion `quot_x,y,z,w`. Not documented: the unit of Unity and of
-rendered depth, the frame and axes of the robot. Ozyoruk et al., "EndoSLAM dataset and an unsupervised monocular visual
-odometry and depth estimation approach for endoscopic videos", arXiv 2006.16670.
+Real: `Cameras/HighCam/Colon-I/TumorfreeTrajectory_1/{Frames/frame_000060.jpg, Poses/*.xlsx}`, columns `ImageFrame` (the
+number in the image's name), `trans_x,y,z` (metres), `quot_x,y,z,w`. Rendered: `UnityCam/Colon/{Frames/image_0000.png,
+Pixelwise Depths/aov_image_0000.png, Poses/colon_position_rotation.csv}`, row = image number. Copies repeat folders.
+`Calibration/cam.txt` (3x3) is beside a camera's organs. Not documented: the unit of Unity and of rendered depth, frame
+and axes of the robot. Ozyoruk et al., arXiv 2006.16670.
 """
 
 from __future__ import annotations
@@ -23,8 +20,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import InputError, check_bytes, reporting
 from scopemap.io.decoding import read_decoded
 from scopemap.trajectory.formats.poses import poses_by_row
-from scopemap_bench.datasets.layouts import Place
-from scopemap_bench.datasets.unity import UnityFolder
+from scopemap_bench.datasets.layouts import Place, UnityFolder
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
 """UnityCam's `cam.txt` as others quote it, for copies without it."""
@@ -39,8 +35,7 @@ _DEPTHS = ("Pixelwise Depths/", "Depths/Pixelwise Depths/", "Pixelwise Depths/Pi
 _POSES, _POSE_FILES = ("Poses", "Poses/Poses"), ("*position_rotation.csv", "*.xlsx")
 _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
 _COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
-_MM_PER_METRE = 1000.0
-_SAME = 1e-6
+_MM_PER_METRE, _SAME = 1000.0, 1e-6
 # Some hundred thousand cells; in memory they take many times as much.
 _MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
 
@@ -118,9 +113,8 @@ class EndoSlamFolder(UnityFolder):
                 f"{self.numbers[-1]}); do they belong together?"
             )
         if without or count != len(self.numbers):
-            self.warnings.append(
-                f"{file.name} holds {count} rows for {len(self.numbers)} images; {without} images have no pose"
-            )
+            found = f"{count} rows for {len(self.numbers)} images; {without} images have no pose"
+            self.warnings.append(f"{file.name} holds {found}")
 
     def _depth_levels(self, file: Path) -> np.ndarray | None:
         levels = read_decoded(file)
@@ -148,7 +142,7 @@ def _sheet_rows(file: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def read_sheet(file: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows of the first sheet that hold anything: row number from 1, and the text of each cell, "" if empty.
+    """Return number, from 1, and cells ("" if empty) of the first sheet's rows that hold anything.
 
     Raises `InputError` for any other file, for one that unpacks to more than 32 MB, and without `openpyxl`.
     """

@@ -1,4 +1,7 @@
-"""Layouts of folders of pictures, as a table: where pictures, depth and intrinsics are, and how depth is coded."""
+"""Layouts of folders of pictures, as a table: where pictures, depth and intrinsics are, and how depth is coded.
+
+Poses as Unity writes them are left-handed with y up; a table of them has the columns `tX,tY,tZ,rX,rY,rZ,rW,time(s)`.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from scopemap.cameras.formats.reading import stated_calibration
+from scopemap.errors import InputError
+from scopemap.frame import TruthQuality
 from scopemap.io.images import ImageFolder, by_number, image_files, numbered_images
+from scopemap.trajectory.formats.poses import poses_by_row
+from scopemap.trajectory.formats.text import fields_of, text_lines
+
+_HEADER = ["tx", "ty", "tz", "rx", "ry", "rz", "rw", "time(s)"]
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -16,8 +28,8 @@ class Place:
     """Where a layout has its pictures, and the depth of each.
 
     images : folder of the pictures. names : of the pictures without ending; what the `*` stands for is a picture's key.
-    depths : files with the depth of a picture, `{}` its key, of which the first that exists is used; one that ends in
-    "/" is a folder whose images belong to the pictures with the same number. needs : folder beside it, or "".
+    depths : files with the depth of a picture, `{}` its key, the first that exists; one that ends in "/" is a folder
+    whose images belong to the pictures with the same number. needs : folder beside it, or "".
     """
 
     images: str = ""
@@ -94,3 +106,54 @@ def _found(places: tuple[Place, ...], path: Path) -> tuple[Place, dict[Path, str
         if pictures:
             break
     return place, pictures
+
+
+def mirrored(T: np.ndarray) -> np.ndarray:
+    """Return poses (..., 4, 4) of the left-handed world with y up in OpenCV's axes, both camera and world: M T M."""
+    return _MIRROR @ T @ _MIRROR
+
+
+class UnityFolder(LayoutFolder):
+    """A folder of images rendered with Unity, numbered as the rows of a table of poses."""
+
+    numbered = True
+    quality: TruthQuality = "exact"
+
+    def _read_table(self, file: Path, mm_per_unit: float) -> int:
+        """Read the poses and time stamps of a table; return its rows' number.
+
+        Its header may be missing. A last row that is cut off, as in published files, and times that do not increase are
+        left out with a warning. Raises `InputError`, with the line, for anything else that is no such table.
+        """
+        lines = "\n".join(text_lines(file)).rstrip().splitlines()
+        has_header = bool(lines) and any(name in lines[0].lower() for name in _HEADER)
+        if has_header and fields_of(lines[0].lower()) != _HEADER:
+            raise InputError(f"{file}, line 1: expected the columns {','.join(_HEADER)}, found {lines[0][:80]!r}")
+        where = [f"{file}, line {number}" for number in range(1, len(lines) + 1)]
+        rows: list[list[float]] = []
+        for place, line in list(zip(where, lines, strict=True))[has_header:]:
+            try:
+                rows.append([float(field) for field in fields_of(line)])
+                if len(rows[-1]) != len(_HEADER):
+                    raise ValueError(f"found {len(rows.pop())} columns where {len(_HEADER)} numbers were expected")
+            except ValueError as error:
+                # Only at the end: a row left out in between would shift the poses of all images after it.
+                if place != where[-1] or not rows:
+                    raise InputError(f"{place}: {error}") from None
+                self._warn(f"{place}: {error}: the last row is cut off and was left out")
+        if not rows:
+            raise InputError(f"reading {file}: it holds no pose")
+        values = np.array(rows)
+        by_row = poses_by_row(values[:, :7], mm_per_unit, where[has_header:])
+        self.poses = {row: mirrored(T) for row, T in by_row.items()}
+        known = np.flatnonzero(np.isfinite(values[:, 7]))
+        times_s = np.interp(np.arange(len(rows)), known, values[known, 7]) if known.size else np.zeros(2)
+        self.stamped = bool((np.diff(times_s) > 0).all())
+        if self.stamped:
+            # Images beyond the last row follow it at the assumed rate.
+            last = len(rows) - 1
+            self.times_s = {n: float(times_s[min(n, last)]) + max(n - last, 0) / self.rate_hz for n in self.numbers}
+            self.notes[0] = f"time stamps: those of {file.name}"
+        else:
+            self._warn(f"{file}: the times do not increase and were left out")
+        return len(rows)

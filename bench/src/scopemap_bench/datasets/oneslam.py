@@ -28,16 +28,11 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped
 
 _CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
-_DEPTHS_PER_UNIT = 1000.0
-_TISSUE = 255
+_DEPTHS_PER_UNIT, _TISSUE = 1000.0, 255
 
 
 class OneSlamFolder(LayoutFolder):
-    """A folder in OneSLAM's layout.
-
-    Raises `InputError` for images without a number of their own and for poses, mask and frame rate that cannot be read;
-    a calibration that cannot be or does not fit is its `camera_fault`.
-    """
+    """A folder in OneSLAM's layout; `InputError` for poses, mask and frame rate that cannot be read."""
 
     name = "oneslam"
     places = (Place("images"),)

@@ -21,12 +21,10 @@ _SMALLEST_FRAME_BYTES = 16
 class PosedVideo(Source):
     """One view of a folder's video, with `poses` by frame number, which a reader fills in; no depth.
 
-    path : the folder. videos : its one video file. aspect : width over height of one view, of which the video may hold
-    two, above or beside each other, the left one first; None: the whole image. A time stamp is the frame's number over
-    the video's rate, known before anything is decoded. `camera.yaml` in the folder is its calibration. Where the header
-    claims more frames than the file has room for, `count` is None.
-
-    Raises `InputError` for a video that cannot be read, `CalibrationError` for a calibration that does not fit.
+    videos : its one file. aspect : width over height of one view, of which the video may hold two, the left one above
+    or first; None: the whole image. A time stamp is the frame's number over the video's rate. Where the header claims
+    more frames than the file has room for, `count` is None. `InputError` for a video that cannot be read,
+    `CalibrationError` for a `camera.yaml` that does not fit.
     """
 
     quality: TruthQuality = "kinematic"

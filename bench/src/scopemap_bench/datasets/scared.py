@@ -1,15 +1,11 @@
 """SCARED and SCARED-C: da Vinci stereo video of porcine abdomens, surface from structured light.
 
-SCARED, a keyframe's folder as it is downloaded: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the
-right), `data/frame_data.tar.gz` (poses from robot kinematics), `data/scene_points.tar.gz`, or these archives unpacked.
-Frame number = order in the video, from 0 = number of the JSON and of the scene points. A scene point file holds X, Y, Z
-per pixel in the camera's frame, mm, the left view above the right one. Copies hold the left views as images, in
-`image_02/data` (AF-SfMLearner), `left` or `left_finalpass`. Allan et al., "Stereo correspondence and reconstruction of
-endoscopic data challenge", arXiv 2101.01133.
-
-SCARED-C: SCARED's left images with poses by structure from motion (github.com/juseonghan/SCARED-C): also
-`intrinsics_colmap.yaml`, `frame_log.json` and `data/rgb_frames.tar.gz`. Frames count from 1 and have gaps, where COLMAP
-registered none.
+A keyframe's folder: `endoscope_calibration.yaml`, `data/rgb.mp4` (left view above the right), `data/frame_data.tar.gz`
+(poses from robot kinematics), `data/scene_points.tar.gz` (X, Y, Z per pixel in the camera's frame, mm, left above
+right), or these archives unpacked. Frame number = order in the video, from 0. Copies hold the left views as images.
+Allan et al., arXiv 2101.01133. SCARED-C: the left images with poses by structure from motion
+(github.com/juseonghan/SCARED-C), with `intrinsics_colmap.yaml`, `frame_log.json`, `data/rgb_frames.tar.gz`. Frames
+count from 1 and have gaps.
 """
 
 from __future__ import annotations
@@ -38,17 +34,13 @@ _VIDEOS = ("data/rgb.mp4", "rgb.mp4")
 _IMAGES = ("image_02/data", "left", "data/left", "left_finalpass")
 _SCENE_POINTS = ("data/scene_points", "scene_points", "image_02/data/groundtruth")
 _INTRINSICS, _LOG = "intrinsics_colmap.yaml", "frame_log.json"
-_BADLY_CALIBRATED = (4, 5)
-_STACKED_ASPECT = 1.4
+_BADLY_CALIBRATED, _STACKED_ASPECT = (4, 5), 1.4
 # COLMAP puts the centre of the top-left pixel at (0.5, 0.5).
 _COLMAP_CENTRE_PX = 0.5
 
 
 class ScaredKeyframe(Source):
-    """The left view of one keyframe's video, with its true poses and depth where they are beside it.
-
-    Raises `InputError` for a keyframe without a video, and `CalibrationError` for a calibration that does not fit.
-    """
+    """The left view of one keyframe's video, with its true poses and depth; `InputError` without a video."""
 
     name = "scared"
     quality: TruthQuality = "kinematic"
@@ -108,10 +100,8 @@ class ScaredKeyframe(Source):
         self.stamped = bool(self.times_s)
         faults = [frame.fault for frame in frames if frame.fault]
         if faults:
-            self._warn(
-                f"{len(faults)} of {len(frames)} files cannot be used, so their frames have no true pose (first: "
-                f"{faults[0]})"
-            )
+            without = f"files cannot be used, so their frames have no true pose (first: {faults[0]})"
+            self._warn(f"{len(faults)} of {len(frames)} {without}")
         if not self.stamped and len({str(frame.stamp) for frame in frames}) > 1:
             self._warn(f"{self.path}: stamps in frame_data do not increase or only count frames; none is used")
         return [frame.index for frame in frames]
@@ -129,10 +119,8 @@ class ScaredKeyframe(Source):
         if not common:
             raise InputError(f"reading {self.path}: no picture has the number of a frame_data file")
         if len(common) < max(len(available), len(posed)):
-            self._warn(
-                f"{self.path}: {len(available)} pictures, but {len(posed)} frame_data files; the {len(common)} "
-                "frames that have both are used"
-            )
+            used = f"the {len(common)} frames that have both are used"
+            self._warn(f"{self.path}: {len(available)} pictures, but {len(posed)} frame_data files; {used}")
         if isinstance(pictures, ImageFolder):
             pictures.files, pictures.numbers = [pictures.file_of[number] for number in common], common
         return common
@@ -143,9 +131,8 @@ class ScaredKeyframe(Source):
     def _assumptions(self, stacked: bool) -> list[str]:
         numbers = [int(n) for part in self.path.absolute().parts[-3:] for n in re.findall(r"dataset_?(\d+)", part)]
         if numbers and numbers[-1] in _BADLY_CALIBRATED:
-            self._warn(
-                f"SCARED dataset {numbers[-1]}: its calibration is known to be inaccurate, and so is what is measured"
-            )
+            known = "its calibration is known to be inaccurate, and so is what is measured"
+            self._warn(f"SCARED dataset {numbers[-1]}: {known}")
         notes = ["the view used: " + ("left, the upper half" if stacked else "the whole image")]
         if not self.poses:
             return [*notes, "no pose is known: frame_data is not there"]
@@ -167,10 +154,7 @@ class ScaredKeyframe(Source):
 
 
 class ScaredCKeyframe(ScaredKeyframe):
-    """The frames of one keyframe that COLMAP registered, read out of their archive one at a time.
-
-    Raises `InputError` where there are no frames, and `CalibrationError` for intrinsics that do not fit.
-    """
+    """The frames of one keyframe that COLMAP registered, read from their archive one at a time."""
 
     name = "scared-c"
     quality = "sfm"
@@ -209,7 +193,7 @@ class ScaredCKeyframe(ScaredKeyframe):
 
 
 class _ArchivedImages(ImageFolder):
-    """Images in an archive, `frame<number>.png`; one that is missing or damaged is left out with a warning."""
+    """Images in an archive, `frame<number>.png`; one that is missing or damaged is left out."""
 
     def __init__(self, archive: NumberedFiles, numbers: list[int]) -> None:
         self._archive = archive

@@ -1,9 +1,8 @@
 """SERV-CT: sixteen rectified stereo pictures of porcine organs with depth from a CT scan; no video, no camera poses.
 
-`Experiment_1` (001 to 008) and `Experiment_2` (009 to 016) each hold `Left_rectified/NNN.png`, `Right_rectified`,
-`Rectified_calibration/NNN.json` (P1, P2, Q) and `Ground_truth_CT/{DepthL,OcclusionL,...}/NNN.png`, in copies also
-`Reference_CT`; depth is uint16, 256 = 1 mm, 0 = none. Edwards et al., "SERV-CT: A disparity dataset from CT for
-validation of endoscopic 3D reconstruction", arXiv 2012.11779.
+`Experiment_1` (001 to 008) and `Experiment_2` each hold `Left_rectified/NNN.png`, `Rectified_calibration/NNN.json` (P1,
+P2, Q) and `Ground_truth_CT/{DepthL,OcclusionL,...}/NNN.png`, in copies also `Reference_CT`; depth is uint16, 256 = 1
+mm, 0 = none. Edwards et al., arXiv 2012.11779.
 """
 
 from __future__ import annotations
@@ -25,16 +24,11 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _CALIBRATION = "Rectified_calibration"
 _TRUTHS = ("Ground_truth_CT", "Reference_CT", "Ground_truth_RGB", "Reference_RGB")
-_SAME_CAMERA_PX = 0.01
-_BLUE = (0, 0, 255)
+_SAME_CAMERA_PX, _BLUE = 0.01, (0, 0, 255)
 
 
 class ServCtFolder(LayoutFolder):
-    """The left pictures of one experiment.
-
-    Each picture has a calibration of its own. Where these differ, pictures and depth are brought to the camera of the
-    first. Raises `InputError` for pictures that cannot be used; a calibration that cannot is its `camera_fault`.
-    """
+    """The left pictures of one experiment, with their depth brought to the camera of the first where theirs differ."""
 
     name = "serv-ct"
     places = (Place("Left_rectified", depths=tuple(f"{truth}/DepthL/{{}}.png" for truth in _TRUTHS)),)

@@ -1,10 +1,9 @@
 """7-Scenes: RGB-D sequences of rooms (Shotton et al., CVPR 2013), for odometry and fusion with measured depth.
 
 `frame-NNNNNN.color.png`, `.depth.png` (uint16 mm, 65535 = unknown), `.pose.txt` (4x4 camera-to-world, metres), optional
-`camera-intrinsics.txt` (3x3). Colour and depth come from two cameras of a Kinect, and are not registered in the files;
-poses and the published intrinsics are the depth camera's. Here the camera is that of the colour images, with the
-Kinect's nominal focal length and distance from the depth camera, and depth and poses are brought to it. (Where depth
-jumps in "redkitchen", the gradient of colour is then 2.3 times its mean; in the files as they are, 0.8 times.)
+`camera-intrinsics.txt` (3x3). Colour and depth come from two cameras of a Kinect, not registered in the files; poses
+and published intrinsics are the depth camera's. Here the camera is that of the colour images, by a Kinect's nominal
+focal length and distance from the depth camera, and depth and poses are brought to it.
 """
 
 from __future__ import annotations
@@ -54,10 +53,8 @@ class SevenScenesFolder(LayoutFolder):
             self.notes.append("camera-intrinsics.txt is not a Kinect's: depth is taken as registered to colour")
             return
         if self.width * COLOUR_CAMERA.height != self.height * COLOUR_CAMERA.width:
-            raise CalibrationError(
-                f"the 7-Scenes intrinsics are for 640x480 px, but the images are {self.width}x{self.height} px: "
-                "give a calibration (--camera)"
-            )
+            size = f"the images are {self.width}x{self.height} px: give a calibration (--camera)"
+            raise CalibrationError(f"the 7-Scenes intrinsics are for 640x480 px, but {size}")
         self._set_camera(COLOUR_CAMERA, "a Kinect's nominal colour camera", "of a Kinect")
         self.depth_sensor = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
         self.notes.append("depth and poses are the depth camera's: brought to the colour camera beside it")

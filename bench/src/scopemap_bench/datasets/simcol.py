@@ -14,8 +14,7 @@ import numpy as np
 from scopemap.errors import InputError
 from scopemap.trajectory.formats.poses import poses_by_row
 from scopemap.trajectory.formats.text import read_numbers
-from scopemap_bench.datasets.layouts import LayoutFolder, Place
-from scopemap_bench.datasets.unity import mirrored
+from scopemap_bench.datasets.layouts import LayoutFolder, Place, mirrored
 
 DEPTH_RANGE_MM = 200.0
 _MM_PER_CM = 10.0
@@ -23,10 +22,7 @@ _POSITION, _ROTATION = "SavedPosition", "SavedRotationQuaternion"
 
 
 class SimColFolder(LayoutFolder):
-    """The frames of one trajectory. Depth of 8 bit, 255 = 20 cm, as in the older SimColonDepth, is read, too.
-
-    Raises `InputError` where images and poses do not fit together.
-    """
+    """The frames of one trajectory; depth of 8 bit, 255 = 20 cm, as in the older SimColonDepth, is read, too."""
 
     name = "simcol3d"
     places = (Place("", "FrameBuffer_*", ("Depth_{}.png",)),)
@@ -55,7 +51,7 @@ class SimColFolder(LayoutFolder):
 
 
 def _pose_files(path: Path) -> tuple[Path, Path] | None:
-    """Return the two files of the folder's trajectory, of which one may be missing; None where both are.
+    """Return the files of the folder's trajectory, of which one may be missing; None where both are.
 
     They are named as `Frames_NAME`, or are the only ones in the folder; beside them, or up to two folders above.
     """

@@ -1,9 +1,8 @@
 """TUM RGB-D: rooms seen by a Kinect, with poses by motion capture, and whatever else is written in its layout.
 
-`rgb.txt` and `depth.txt` list `timestamp filename`, `groundtruth.txt` lists `timestamp tx ty tz qx qy qz qw`, the pose
-of the colour camera in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. Optional
-`associations.txt`: `t_rgb rgb_file t_depth depth_file`, or depth first. Frame number = position in rgb.txt, from 0.
-Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+`rgb.txt` and `depth.txt` list `timestamp filename`, `groundtruth.txt` `timestamp tx ty tz qx qy qz qw`, colour camera
+in the world, metres. Depth is registered to colour: uint16, 5000 = 1 m, 0 = unknown. `associations.txt`: `t_rgb
+rgb_file t_depth depth_file`, or depth first. Frame number = position in rgb.txt, from 0. Sturm et al., IROS 2012.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ CAMERAS: dict[str, CameraModel] = {
 }
 """Of the colour images of freiburg1, 2 and 3 as published; those of freiburg3 were undistorted."""
 
-DEPTH_UNIT_MM = 0.2
-ASSOCIATED_WITHIN_S = 0.02
+DEPTH_UNIT_MM, ASSOCIATED_WITHIN_S = 0.2, 0.02
 _IMAGES, _DEPTHS, _POSES, _PAIRS = "rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt"
 _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IGNORECASE)
 
@@ -38,9 +36,8 @@ _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IG
 class TumRgbdFolder(ImageFolder):
     """One TUM RGB-D sequence, or a folder in its layout; `camera.yaml` beside rgb.txt replaces published constants.
 
-    Images that a list names but that are not there are left out with a warning; the others keep their numbers. Names
-    that lead out of the folder count as not there. Raises `InputError` for lists and poses that cannot be read; images
-    that no published camera fits are its `camera_fault`.
+    Images that a list names but that are not there, or lead out of the folder, are left out with a warning; the others
+    keep their numbers. `InputError` for lists and poses that cannot be read.
     """
 
     name = "tum"
@@ -121,10 +118,9 @@ class TumRgbdFolder(ImageFolder):
 
 
 def read_stamped(file: Path) -> NumberTable:
-    """Return the rows `stamp tx ty tz qx qy qz qw` of a file, by ascending stamp.
+    """Return the rows `stamp tx ty tz qx qy qz qw` of a file, by ascending stamp; NaN or a quaternion of 0 is no pose.
 
-    A row with NaN or with the quaternion 0 0 0 0 states that there is no pose, and is left out. Raises `InputError`,
-    with the line, for any other row that is none, for a stamp that comes again, and where no pose is left.
+    Raises `InputError`, with the line, for any other row, for a stamp that comes again, and where no pose is left.
     """
     table = read_numbers(file, missing=True).with_columns(8, "stamp tx ty tz qx qy qz qw")
     known = np.isfinite(table.values).all(axis=1) & table.values[:, 4:].any(axis=1)
@@ -134,10 +130,7 @@ def read_stamped(file: Path) -> NumberTable:
 
 
 def associated(stamps_s: list[float], others_s: list[float]) -> dict[int, int]:
-    """Return pairs of rows of two ascending lists of time stamps: the nearest first, each row in one pair at most.
-
-    As the data set's own tool does it: pairs are less than 0.02 s apart.
-    """
+    """Return pairs of rows of two ascending lists of time stamps, the nearest first, less than 0.02 s apart."""
     windows = np.searchsorted(others_s, np.add.outer(stamps_s, [-ASSOCIATED_WITHIN_S, ASSOCIATED_WITHIN_S]))
     gaps = sorted(
         (abs(stamp - others_s[k]), i, k)

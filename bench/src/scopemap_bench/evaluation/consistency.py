@@ -1,5 +1,7 @@
-"""Temporal consistency of depth, frame by frame: a `ConsistencyMeter` per method, one `FrameMatcher` for all.
+"""Consistency of depth over time: a `ConsistencyMeter` per method, one `FrameMatcher` (ORB matches, flow) for all.
 
+- ORB displacement, the depth-consistency experiment of arXiv 2508.11282: e = ||P_t X_t - P_{t+1} X_{t+1}|| over inlier
+    matches of consecutive frames, lifted with depth. The form is ours.
 - OPW and rTC: Khan et al., "Temporally consistent online depth estimation in dynamic scenes", WACV 2023, in the form of
     facebookresearch/TemporallyConsistentDepth, `eval/metrics.py`.
 - TAE: Chen et al., "Video Depth Anything", arXiv 2501.12375, in the form of its `benchmark/eval/eval_tae.py`.
@@ -11,21 +13,188 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import SettingsError, check_shape
-from scopemap.geometry.se3 import inverse, se3
+from scopemap.evaluation.poses import ErrorSummary
+from scopemap.geometry.se3 import inverse, se3, transform
 from scopemap.geometry.warp import moved_depth, pull
-from scopemap_bench.evaluation.correspondences import FrameCorrespondences, displacement_figures, lifted_matches
 from scopemap_bench.evaluation.depth import depth_scale, scale_jitter
 
+FEATURES, RATIO = 1000, 0.8
+# OpenCV's default of 20 finds 7 corners in a smooth colon; 7 is ORB-SLAM's lower threshold, and the best 1000 stay.
+_FAST_THRESHOLD = 7
+# The five-point solver needs 5; with fewer than 8 no match is left to confirm a model.
+_FEWEST_MATCHES = 8
+_EPIPOLAR_PX, _RANSAC_CONFIDENCE, _RNG_SEED = 1.0, 0.999, 0
+# exp(-50 |difference|) > 1e-2, with colours in 0..1.
+_COLOUR_DISTANCE = 255 * np.log(1e2) / 50
+_FLOW_LIMIT_PX = 250.0
+
+OrbFeatures = tuple[np.ndarray, np.ndarray]
+"""ORB features of one image: pixels (N, 2) float64, px, and descriptors (N, 32) uint8."""
 _POSES = ("reference", "estimated")
 _CHANGES = ("same_pixel", "along_flow", "opw", "opw_reference", "opw_estimated")
-_CHANGE = ("mean_mm", "relative", "rtc")
-_RTC_RATIO = 1.01
+_CHANGE, _RTC_RATIO = ("mean_mm", "relative", "rtc"), 1.01
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The same M points in two frames: `previous_px` and `current_px`, (M, 2) float64, px."""
+
+    previous_px: np.ndarray
+    current_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class FrameCorrespondences:
+    """Correspondences of a frame and the one before it; the same for every method.
+
+    to_previous : (H, W, 2) px, pixel p of this frame is seen at p + to_previous(p) in the previous one; None: no flow.
+    consistent, same_colour : (H, W) bool, where that flow is trusted, and where moreover both images have the same
+    colour.
+    """
+
+    matches: Matches
+    to_previous: np.ndarray | None = None
+    consistent: np.ndarray | None = None
+    same_colour: np.ndarray | None = None
+
+
+class FrameMatcher:
+    """Matches each image with the one before it; keeps only that one."""
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        self._camera = camera
+        self._previous: tuple[np.ndarray, OrbFeatures] | None = None
+
+    def match(
+        self,
+        rgb: np.ndarray,
+        valid: np.ndarray,
+        to_previous: np.ndarray | None = None,
+        consistent: np.ndarray | None = None,
+    ) -> FrameCorrespondences | None:
+        """Return the correspondences with the image (H, W, 3) uint8 of the call before, None at the first."""
+        size = (self._camera.height, self._camera.width)
+        check_shape("rgb", rgb, (*size, 3))
+        check_shape("valid", valid, size)
+        previous, self._previous = self._previous, (rgb, orb_features(rgb, valid))
+        if previous is None:
+            return None
+        matches = match_features(previous[1], self._previous[1], self._camera)
+        if to_previous is None:
+            return FrameCorrespondences(matches)
+        trusted = np.ones(size, dtype=bool) if consistent is None else consistent
+        same_colour = trusted & have_same_colour(previous[0], rgb, to_previous)
+        return FrameCorrespondences(matches, to_previous, trusted, same_colour)
+
+
+def orb_features(rgb: np.ndarray, valid: np.ndarray | None = None) -> OrbFeatures:
+    """Return the 1000 strongest ORB features of an image (H, W, 3) uint8 on the `valid` pixels (H, W), None: on all."""
+    mask = None if valid is None else valid.astype(np.uint8)
+    detector = cv2.ORB.create(nfeatures=FEATURES, fastThreshold=_FAST_THRESHOLD)
+    keypoints, descriptors = detector.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), mask)
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
+    return np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64), descriptors
+
+
+def match_features(previous: OrbFeatures, current: OrbFeatures, camera: PinholeCamera) -> Matches:
+    """Return the matches between two frames that agree with one rigid motion; none from fewer than 8 features.
+
+    Mutual nearest neighbours by Lowe's ratio test of 0.8 both ways, inliers (1 px) of the essential matrix by a fixed
+    seed.
+    """
+    if min(len(previous[0]), len(current[0])) < _FEWEST_MATCHES:
+        return Matches(np.empty((0, 2)), np.empty((0, 2)))
+    to_current, distinct = _nearest(previous[1], current[1])
+    to_previous, distinct_back = _nearest(current[1], previous[1])
+    rows = np.arange(len(to_current))
+    mutual = np.flatnonzero(distinct & distinct_back[to_current] & (to_previous[to_current] == rows))
+    previous_px, current_px = previous[0][mutual], current[0][to_current[mutual]]
+    inliers = None
+    if len(mutual) >= _FEWEST_MATCHES:
+        cv2.setRNGSeed(_RNG_SEED)
+        _, inliers = cv2.findEssentialMat(
+            previous_px, current_px, camera.matrix, cv2.RANSAC, _RANSAC_CONFIDENCE, _EPIPOLAR_PX
+        )
+    kept = np.zeros(len(mutual), dtype=bool) if inliers is None else inliers.ravel() > 0
+    return Matches(previous_px[kept], current_px[kept])
+
+
+def _nearest(descriptors: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest of `among` for each descriptor (N,), and whether it passes the ratio test (N,)."""
+    distances, rows = cv2.batchDistance(descriptors, among, dtype=cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
+    return rows[:, 0], distances[:, 0] < RATIO * distances[:, 1]
+
+
+def have_same_colour(rgb_previous: np.ndarray, rgb_current: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
+    """Return where OPW counts a pixel, (H, W) bool: exp(-50 |I - I_warped|) > 0.01, and flow (H, W, 2) < 250 px.
+
+    Khan et al., WACV 2023; their code limits the flow only where it is positive.
+    """
+    difference = rgb_current.astype(np.float32) - pull(rgb_previous, to_previous)
+    same_colour = np.einsum("hwc,hwc->hw", difference, difference) < _COLOUR_DISTANCE**2
+    return same_colour & (np.abs(to_previous) < _FLOW_LIMIT_PX).all(axis=-1)
+
+
+def lifted_matches(
+    matches: Matches,
+    depth_previous_mm: np.ndarray,
+    depth_current_mm: np.ndarray,
+    camera: PinholeCamera,
+    poses: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return both ends of the matches in space, (M, 3) float64 mm each, and the mean depth (M,) of the two ends, mm.
+
+    M counts the matches with depth (H, W), NaN = unknown, at the nearest pixel of both ends. `poses` are T_world_camera
+    (4, 4) of the previous and of the current frame; without them points stay in their cameras.
+    """
+    z_previous = _nearest_depth(depth_previous_mm, matches.previous_px)
+    z_current = _nearest_depth(depth_current_mm, matches.current_px)
+    previous = z_previous[:, None] * camera.unproject(matches.previous_px)
+    current = z_current[:, None] * camera.unproject(matches.current_px)
+    if poses is not None:
+        previous, current = transform(poses[0], previous), transform(poses[1], current)
+    known = np.isfinite(previous).all(axis=1) & np.isfinite(current).all(axis=1)
+    return previous[known], current[known], ((z_previous + z_current) / 2)[known]
+
+
+def _nearest_depth(depth_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return depth (M,) float64 of the pixels nearest to positions (M, 2), NaN outside the image."""
+    height, width = depth_mm.shape
+    u, v = np.rint(pixels).astype(int).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return np.where(inside, depth_mm[v.clip(0, height - 1), u.clip(0, width - 1)], np.nan).astype(np.float64)
+
+
+def displacement_figures(pairs: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Return the figures of a sequence's displacements in mm and over depth, (2, M) per pair, M = 0 where unmatched.
+
+    pairs, matches : pairs of frames with a lifted match, and their matches.
+    mean_mm, median_mm, std_mm, relative_mean, relative_median : over all matches; NaN where there are none.
+    pair_mean_mm, pair_median_mm, pair_matches : of every pair in order.
+    """
+    mm, relative = (ErrorSummary.of(row) for row in np.concatenate([*pairs, np.empty((2, 0))], axis=1).astype(float))
+    each_mm = [ErrorSummary.of(pair[0]) for pair in pairs]
+    return {
+        "pairs": sum(pair.shape[1] > 0 for pair in pairs),
+        "matches": sum(pair.shape[1] for pair in pairs),
+        "mean_mm": mm.mean,
+        "median_mm": mm.median,
+        "std_mm": mm.std,
+        "relative_mean": relative.mean,
+        "relative_median": relative.median,
+        "pair_mean_mm": tuple(one.mean for one in each_mm),
+        "pair_median_mm": tuple(one.median for one in each_mm),
+        "pair_matches": tuple(pair.shape[1] for pair in pairs),
+    }
 
 
 def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarray | None = None) -> dict[str, float]:
@@ -56,7 +225,7 @@ def mean_change(changes: Sequence[dict[str, float]]) -> dict[str, float]:
 def projected_depth(depth_mm: np.ndarray, camera: PinholeCamera, T_other_camera: np.ndarray) -> np.ndarray:
     """Return the depth map (H, W) float32, mm, that the other camera sees of this one's points; NaN where none falls.
 
-    As in TAE's code: the last point written to a pixel stays, and a pixel that a point behind the camera took is empty.
+    As in TAE's code the last point written to a pixel stays, also one behind the camera, which leaves it empty.
     """
     # Rows of (3, H W): contiguous coordinates are several times faster than points side by side.
     rays = np.ascontiguousarray(camera.rays.reshape(-1, 3).T)
@@ -76,8 +245,7 @@ def alignment_errors(
 ) -> tuple[float, float]:
     """Return TAE's two errors of a pair, forth and back: mean |projected - d| / d, d of the frame projected into.
 
-    NaN where no pixel can be compared (the public code counts 0 there). TAE is 100 times the mean over both directions
-    and all pairs. The public protocol first fits scale and shift to the truth.
+    NaN where no pixel can be compared (the public code counts 0). TAE is 100 times the mean over directions and pairs.
     """
     forth = depth_change(projected_depth(depth_previous_mm, camera, T_current_previous), depth_current_mm)
     back = depth_change(projected_depth(depth_current_mm, camera, inverse(T_current_previous)), depth_previous_mm)
@@ -85,11 +253,7 @@ def alignment_errors(
 
 
 class ConsistencyMeter:
-    """Measures one method's depth frame by frame; keeps the previous frame and a few numbers per match.
-
-    `scale` is a factor on depth and on the translation of estimated poses, so that figures in mm of methods with
-    different units compare. Raises `SettingsError` unless it is positive.
-    """
+    """Measures a method's depth frame by frame; `scale` > 0 is a factor on depth and translations, to mm."""
 
     def __init__(self, camera: PinholeCamera, scale: float = 1.0) -> None:
         if not (np.isfinite(scale) and scale > 0):
@@ -113,9 +277,9 @@ class ConsistencyMeter:
     ) -> None:
         """Measure the next frame against the one before; without `found`, no measure along flow or on matches.
 
-        depth_mm : (H, W) float, mm or the method's own unit, NaN = unknown. valid : (H, W) bool, where it counts.
-        T_world_camera : (4, 4) the method's own pose, in the unit of its depth.
-        T_reference_camera : (4, 4) the reference's, mm. true_depth_mm : (H, W), NaN = unknown; for scale jitter only.
+        depth_mm : (H, W) float, the method's own unit, NaN = unknown. valid : (H, W) bool, where it counts.
+        T_world_camera : the method's own pose (4, 4), in the unit of its depth. T_reference_camera : the reference's,
+        mm. true_depth_mm : (H, W), for scale jitter only.
         """
         camera = self._camera
         check_shape("depth_mm", depth_mm, (camera.height, camera.width))
@@ -154,12 +318,12 @@ class ConsistencyMeter:
     def report(self) -> dict[str, Any]:
         """Return the figures of all frames so far, by measure; NaN where nothing could be measured. Lower is better.
 
-        frames, pairs : frames added, and pairs of consecutive ones; scale, jitter : factor to mm, and its variation.
-        same_pixel, along_flow : |D_t - D_{t-1}| at the same pixel, and along the flow.
-        opw : along the flow where the images have the same colour; its `rtc` is rTC.
-        opw_reference, opw_estimated : the same after moving the current depth into the previous camera by these poses.
-        tae_reference, tae_estimated : TAE by these poses, percent of depth. The public protocol is `reference`.
-        orb_camera, orb_reference, orb_estimated : displacement of points in their own cameras, and in the world.
+        scale, jitter : factor to mm, and its variation. same_pixel, along_flow : |D_t - D_{t-1}| at the same pixel,
+        along the flow.
+        opw : along the flow where the images have the same colour; its `rtc` is rTC. opw_reference, opw_estimated : the
+        same after moving the current depth into the previous camera by these poses. tae_reference, tae_estimated : TAE,
+        percent of depth; the public protocol is `reference`. orb_camera, orb_reference, orb_estimated : displacement of
+        points in their own cameras, and in the world.
         """
         figures: dict[str, Any] = {"frames": len(self._scales), "pairs": max(len(self._scales) - 1, 0)}
         figures |= {"scale": self._scale, "jitter": scale_jitter(np.array(self._scales))}

@@ -1,8 +1,8 @@
 """Depth maps against true depth: the field's standard errors, per image and per sequence, and the jitter of the scale.
 
-Definitions: Eigen, Puhrsch and Fergus, "Depth map prediction from a single image", NeurIPS 2014, section 4.2; average
-over images, not over pixels, as AF-SfMLearner and EndoDAC report it. A median scale per image hides flicker, so a
-sequence may have one factor, or one scale and shift in disparity (Video-Depth-Anything, arXiv 2501.12375).
+Eigen, Puhrsch and Fergus, "Depth map prediction from a single image", NeurIPS 2014, section 4.2; mean over images, not
+pixels, as AF-SfMLearner and EndoDAC report it. A scale per image hides flicker, so a sequence may have one factor, or
+one scale and shift in disparity (Video-Depth-Anything, arXiv 2501.12375).
 """
 
 from __future__ import annotations
@@ -47,9 +47,8 @@ _LOG_LOW, _LOG_HIGH, _LOG_STEP = float(np.log(1e-4)), float(np.log(1e6)), 2e-5
 class DepthFit:
     """Scale and shift of a prediction d (mm): 1 / d' = 1 / (scale d) + shift. The default changes nothing.
 
-    scaling : how it was found.
-    scale : factor on the depth; infinite where least squares found no correlation with the truth.
-    shift_per_mm : added to the disparity, 1/mm; not 0 under scale-and-shift only.
+    scale : factor on the depth; infinite where least squares found no correlation with the truth. shift_per_mm : added
+    to the disparity, 1/mm; not 0 under scale-and-shift only.
     """
 
     scaling: DepthScaling = "none"
@@ -75,17 +74,15 @@ def evaluate_depth(
 ) -> dict[str, Any]:
     """Return the errors of a predicted depth map (H, W) against the true one (H, W), both mm, NaN = unknown.
 
-    pixels, coverage : compared pixels, and their share of the pixels with true depth, 0..1. The others are NaN without.
-    scaling, scale, shift_per_mm : what was applied to the prediction, as in `DepthFit`.
-    abs_rel, sq_rel_mm : mean of |d - g| / g and of (d - g)^2 / g; mae_mm : mean |d - g|.
-    rmse_mm, rmse_log : root mean square of d - g and of ln d - ln g.
-    delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2, 1.25^3.
+    pixels, coverage : compared pixels, and their share of those with true depth, 0..1. The others are NaN without.
+    scaling, scale, shift_per_mm : what was applied to the prediction (`DepthFit`).
+    abs_rel, sq_rel_mm : mean of |d - g| / g and (d - g)^2 / g; mae_mm : mean |d - g|; rmse_mm, rmse_log : root mean
+    square of d - g and ln d - ln g; delta_1, delta_2, delta_3 : share with max(d/g, g/d) strictly below 1.25, 1.25^2,
+    1.25^3.
 
-    scaling : `median`: by the ratio of the medians of the compared pixels; `scale-and-shift`: least squares in
-        disparity; or a fit found elsewhere. Raises `SettingsError` for another name.
-    truth_range_mm : true depth counts strictly inside; see `DEPTH_RANGES_MM`.
-    clip_prediction : whether the scaled prediction is then clipped to this range, as AF-SfMLearner and
-        Video-Depth-Anything do. Without it the far pixels of a shifted prediction dominate the mean.
+    `scaling`: "median", the ratio of the medians of the compared pixels; "scale-and-shift", least squares in disparity;
+    or a fit found elsewhere; `SettingsError` for another name. True depth counts strictly inside `truth_range_mm`, to
+    which `clip_prediction` clips the scaled prediction, as AF-SfMLearner and Video-Depth-Anything do.
     """
     d, g, known = compared_depths(predicted_mm, truth_mm, truth_range_mm)
     fit = scaling if isinstance(scaling, DepthFit) else _fit(d, g, scaling)
@@ -149,10 +146,7 @@ def disparity_fit(sums: np.ndarray, scaling: DepthScaling) -> DepthFit:
 
 
 def mean_depth_report(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the mean of `evaluate_depth` over images; those without a comparable pixel have `pixels` and `coverage`.
-
-    Raises `SettingsError` where the images were scaled in different ways.
-    """
+    """Return the mean of `evaluate_depth` over comparable images; `SettingsError` where their scaling differs."""
     if not reports:
         return _report("none", [0, *[float("nan")] * 11])
     scalings = sorted({report["scaling"] for report in reports})
@@ -211,10 +205,8 @@ def depth_scale(
 def scale_jitter(scales: np.ndarray) -> dict[str, float]:
     """Return the variation of one factor s_t per frame (N,), in order, NaN where a frame has none.
 
-    A global scale cancels.
-
-    frames : frames with a factor. log_std : standard deviation (by N) of ln s_t; NaN below two frames.
-    log_step : mean |ln s_{t+1} - ln s_t| over consecutive frames that both have one; NaN where there are none.
+    frames : with a factor. log_std : standard deviation (by N) of ln s_t; NaN below two frames. log_step : mean |ln
+    s_{t+1} - ln s_t| over consecutive frames that both have one; NaN where there are none.
     """
     logs = np.log(np.asarray(scales, dtype=np.float64))
     known, steps = logs[np.isfinite(logs)], np.abs(np.diff(logs))
@@ -225,10 +217,7 @@ def scale_jitter(scales: np.ndarray) -> dict[str, float]:
 
 
 def fit_sequence(pairs: DepthPairs, scaling: DepthScaling, truth_range_mm: tuple[float, float]) -> DepthFit:
-    """Return the one fit of `sequence-median` or `sequence-scale-and-shift` in one pass over the frames.
-
-    Every compared pixel of every frame has the same weight. The identity where no pixel can be compared.
-    """
+    """Return the one fit of a sequence mode over all compared pixels, in one pass; the identity without one."""
     sums, counts = np.zeros(5), np.zeros((2, int((_LOG_HIGH - _LOG_LOW) / _LOG_STEP) + 1), dtype=np.int64)
     for predicted_mm, truth_mm in pairs():
         d, g, _ = compared_depths(predicted_mm, truth_mm, truth_range_mm)

@@ -32,13 +32,13 @@ def paper_figures(matched: MatchedTrajectories) -> dict[str, Any]:
 
     `t_` is translation, `r_` rotation; `avg`, `std`, `rmse`, `fin`, `max` are mean, standard deviation (by N), root
     mean square, the last tracked frame's, and the largest error; `below_avg_percent` the share strictly below the mean.
-
     rpe_1_frame_, rpe_10_mm_path_ with mm, std_mm, rad, std_rad, deg, std_deg : relative error, mean and deviation.
     tlr : estimated over reference path length before the alignment; lost_percent : share of matched frames lost.
-    t_fin_origin_mm, r_fin_origin_rad, r_fin_origin_deg : the last error after aligning the first tracked poses, no
-        scale; t_fin_origin_scaled_mm : with the scale of the alignment.
-    t_axes_mm : statistics along x, y, z of the reference's first camera; r_axes_rad, r_axes_deg : about the axes of
-        each reference camera, `R = R_z R_y R_x`.
+    t_fin_origin_mm, r_fin_origin_rad, r_fin_origin_deg : the last error after aligning the first tracked poses, without
+    scale;
+    t_fin_origin_scaled_mm : with that of the alignment.
+    t_axes_mm : along x, y, z of the reference's first camera; r_axes_rad, r_axes_deg : about the axes of each reference
+    camera, `R = R_z R_y R_x`.
     """
     ok = matched.tracked
     aligned, reference = matched.aligned[ok], matched.reference[ok]

@@ -1,8 +1,4 @@
-"""Published pose protocols by name, each as its authors compute it.
-
-Published figures compare only under the protocol that they were made with: one trajectory may have 0.05 under AF and 3
-mm under evo. So every figure carries its protocol's name.
-"""
+"""Published pose protocols by name, each as its authors compute it; published figures compare only under their own."""
 
 from __future__ import annotations
 
@@ -28,18 +24,15 @@ from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
 
 _EVO_MODES: tuple[AlignMode, ...] = ("none", "se3", "sim3")
 _EVO_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
-_ONESLAM_PATH_MM = 1.0
-_AF_MOTIONS = 4
-_SURGCUT3R_FRAMES = 16
+_ONESLAM_PATH_MM, _AF_MOTIONS, _SURGCUT3R_FRAMES = 1.0, 4, 16
 
 
 @dataclass(frozen=True)
 class Protocol:
     """A published protocol: call it with estimate and reference.
 
-    name : as in `PROTOCOLS`.
-    description : one sentence: alignment, pairs, unit, deviations from evo.
-    source : the repository and file that define it.
+    description : one sentence: alignment, pairs, unit, deviations from evo. source : the repository and file that
+    define it.
     measure : from estimate and reference to figures without the name's prefix.
     """
 
@@ -49,10 +42,9 @@ class Protocol:
     measure: Callable[[Trajectory, Trajectory], dict[str, float]]
 
     def __call__(self, estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
-        """Return the figures over the tracked frames; each name begins with the protocol's and ends with its unit.
+        """Return the figures over the tracked frames, named PROTOCOL_NAME_UNIT; NaN where too few frames give one.
 
-        NaN where too few frames give a figure. Raises `AlignmentError` where fewer than 3 tracked frames match or a fit
-        is degenerate.
+        Raises `AlignmentError` where fewer than 3 tracked frames match or a fit is degenerate.
         """
         prefix = self.name.replace("-", "_")
         return {f"{prefix}_{name}": float(value) for name, value in self.measure(estimate, reference).items()}
@@ -124,10 +116,10 @@ def _af(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 def af_figures(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Return the AF figures of relative poses, both (K, 4, 4), target frame <- source frame, mm.
 
-    K poses make K - 1 windows of up to 4. The chain `c <- c T` from the identity gives positions and rotations that are
-    no camera path, as T is not inverted; the published figures are made so. With positions p, q of a window of n:
-    `ATE = sqrt(sum (s p - q)^2) / n`, `s = sum(p q) / sum(p p)`; `RE = mean angle(R_q R_p^-1)`, rad. `ci95` bounds the
-    mean ATE by Student's t as EndoDAC does.
+    K poses make K - 1 windows of up to 4. The chain `c <- c T` from the identity is no camera path, as T is not
+    inverted; the published figures are made so. With positions p, q of a window of n: `ATE = sqrt(sum (s p - q)^2) /
+    n`, `s = sum(p q) / sum(p p)`; `RE = mean angle(R_q R_p^-1)`, rad. `ci95` bounds the mean ATE by Student's t as
+    EndoDAC does.
     """
     windows = [slice(start, start + _AF_MOTIONS) for start in range(len(estimated) - 1)]
     errors = [_snippet_errors(_chain(estimated[window]), _chain(reference[window])) for window in windows]

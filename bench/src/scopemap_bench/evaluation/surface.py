@@ -1,9 +1,8 @@
 """Surfaces against the true surface: accuracy, completeness, Chamfer distance, precision, recall, F-score, and ICP.
 
-Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017, section 4.2. The thresholds of 1, 2 and 5 mm are our choice.
-ICP is point to plane (Chen and Medioni, Image and Vision Computing 10(3), 1992) by small rotations (Low, UNC TR04-004,
-2004) on the closest share of the points (Chetverikov et al., "The trimmed iterative closest point algorithm", ICPR
-2002). `trimesh.registration.icp` allows reflections and keeps every outlier.
+Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017, section 4.2; the thresholds are ours. ICP is point to plane
+(Chen and Medioni, Image and Vision Computing 10(3), 1992) by small rotations (Low, UNC TR04-004, 2004) on the closest
+share of the points (Chetverikov et al., ICPR 2002). `trimesh.registration.icp` allows reflections and keeps outliers.
 """
 
 from __future__ import annotations
@@ -24,16 +23,10 @@ THRESHOLDS_MM = (1.0, 2.0, 5.0)
 
 _SAMPLES_PER_MM2 = 4.0
 _SAMPLES = (1_000, 200_000)
-_COVERED_MM = 2.0
-_LARGEST_EDGE_MM = 2.0
-_MOST_TRIANGLES = 1_000_000
-_CANDIDATES = (8, 32, 128)
-_CHUNK = 5_000
-_MOVED_POINTS = 20_000
-_FEWEST_POINTS = 10
-_NEIGHBOURS = 10
-_KEPT_SHARE = 0.8
-_MOST_ITERATIONS = 60
+_COVERED_MM, _NEIGHBOURS = 2.0, 10
+_LARGEST_EDGE_MM, _MOST_TRIANGLES = 2.0, 1_000_000
+_CANDIDATES, _CHUNK = (8, 32, 128), 5_000
+_MOVED_POINTS, _FEWEST_POINTS, _KEPT_SHARE, _MOST_ITERATIONS = 20_000, 10, 0.8, 60
 # Neighbours that swap places never let the last thousandths of a mm come to rest.
 _STILL_MM = 5e-3
 # Directions in which the surface slides along itself (a plane has three) are not moved in.
@@ -43,9 +36,9 @@ _FREE_RATIO = 1e-2
 def distance_to_mesh(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
     """Return the distance (N,) float64, mm, of points (N, 3), mm, to the nearest triangle of a mesh.
 
-    Triangles with an edge over 2 mm are subdivided, so that each is within r <= 1.4 mm of its centroid. Those of the 8
-    nearest centroids are measured; where another could be nearer, 32 and at last 128. Points far from a bent surface
-    may get up to r too much, never too little.
+    Triangles with an edge over 2 mm are subdivided: each is within r <= 1.4 mm of its centroid. Those of the 8 nearest
+    centroids are measured; where another could be nearer, 32 and 128. Far points may get up to r too much, never too
+    little.
     """
     triangles = small_triangles(mesh)
     centroids = triangles.mean(axis=1)
@@ -67,10 +60,7 @@ def distance_to_mesh(points: np.ndarray, mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def _nearest_mm(points: np.ndarray, triangles: np.ndarray, nearest: np.ndarray, at_least_mm: np.ndarray) -> np.ndarray:
-    """Return the smallest distance of each point to its candidate triangles `nearest` (N, K).
-
-    A candidate whose lower bound `at_least_mm` (N, K) exceeds the first one's distance is not measured.
-    """
+    """Return the distance of each point to the nearest of its candidate triangles (N, K), bounded by `at_least_mm`."""
     first = np.linalg.norm(trimesh.triangles.closest_point(triangles[nearest[:, 0]], points) - points, axis=1)
     rows, columns = np.nonzero(at_least_mm[:, 1:] < first[:, None])
     chosen = triangles[nearest[rows, columns + 1]]
@@ -103,12 +93,12 @@ def compare_surfaces(predicted: Surface, truth: Surface, *, observed: Surface | 
 
     accuracy_mean_mm, _median_mm, _rms_mm, _p90_mm : distance of the predicted surface to the whole truth.
     completeness_... : of the truth to the predicted surface, over the part `observed` by the camera where it is known.
-    chamfer_mm : mean of mean accuracy and mean completeness (Chamfer-L1).
-    precision_1mm, recall_1mm, f_1mm, ... : shares nearer than each threshold, 0..1, and their harmonic mean.
-    coverage_2mm : share of the observed truth nearer than 2 mm; observed_share : of the true area; NaN: not known.
+    chamfer_mm : mean of mean accuracy and mean completeness (Chamfer-L1). precision_1mm, recall_1mm, f_1mm, ... :
+    shares nearer than each threshold, 0..1, and their harmonic mean.
+    coverage_2mm, observed_share : share of the observed truth nearer than 2 mm, and of the true area observed; NaN:
+    unknown.
 
-    Meshes are sampled evenly, 4 points per mm^2 but at most 200 000, by a fixed seed. Of an empty prediction recall and
-    coverage are 0 and distances and precision NaN. Raises `ValueError` for an empty truth.
+    Of an empty prediction recall and coverage are 0 and distances and precision NaN. `ValueError` for an empty truth.
     """
     empty = is_empty(predicted)
     from_predicted = from_truth = np.empty(0)
@@ -131,10 +121,7 @@ def compare_surfaces(predicted: Surface, truth: Surface, *, observed: Surface | 
 
 
 def normal_consistency(predicted: Surface, truth: Surface) -> float:
-    """Return the mean |cosine| between normals of nearest samples of two meshes, both ways; NaN unless both are meshes.
-
-    Mescheder et al., "Occupancy networks", CVPR 2019, section 4 (metrics).
-    """
+    """Return the mean |cosine| of normals of nearest samples of two meshes (Mescheder et al., CVPR 2019); else NaN."""
     if not (isinstance(predicted, trimesh.Trimesh) and isinstance(truth, trimesh.Trimesh)) or is_empty(predicted):
         return float("nan")
     samples = [oriented_samples(predicted), oriented_samples(truth)]
@@ -161,10 +148,9 @@ def surface_points(surface: Surface) -> np.ndarray:
 
 
 def oriented_samples(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (N, 3) float64, mm, of a surface and unit normals (N, 3).
+    """Return points (N, 3) float64, mm, spread evenly over a surface by a fixed seed, and unit normals (N, 3).
 
-    A mesh gives points spread evenly, by a fixed seed, with the normals of their triangles; bare points get theirs from
-    their 10 nearest neighbours. Raises `ValueError` for a mesh without area, and for no points.
+    Bare points get normals from their 10 nearest neighbours. `ValueError` for a mesh without area, and for no points.
     """
     if not isinstance(surface, trimesh.Trimesh):
         points = surface_points(surface)
@@ -192,10 +178,9 @@ def _extent(surface: Surface) -> float:
 def refine(predicted: Surface, truth: Surface) -> tuple[Similarity, float, float]:
     """Return the rigid motion that fits the predicted surface to the true one, each a mesh or points (N, 3), mm.
 
-    Beside it the root mean square distance of the closest 80 % of 20 000 samples before and after, mm. These count in
-    each of at most 60 iterations. Directions that the surface leaves free, as along a plane, are not moved in; without
-    a gain it is the identity. Raises `AlignmentError` for fewer than 10 points on a side, `ValueError` for an empty
-    surface.
+    Beside it the root mean square distance, mm, of the closest 80 % of 20 000 samples before and after. Directions that
+    the surface leaves free, as along a plane, are not moved in; without a gain it is the identity. Raises
+    `AlignmentError` for fewer than 10 points on a side, `ValueError` for an empty surface.
     """
     points = surface_points(predicted)
     points = points[np.random.default_rng(0).permutation(len(points))[:_MOVED_POINTS]]
@@ -221,10 +206,7 @@ def refine(predicted: Surface, truth: Surface) -> tuple[Similarity, float, float
 
 
 def _step(points: np.ndarray, onto: np.ndarray, normals: np.ndarray) -> Similarity:
-    """Return the small rigid motion that minimises the distances along the normals, all (N, 3).
-
-    The rotation is about the centroid and in mm at the points' mean radius, so that all unknowns are mm.
-    """
+    """Return the small rigid motion that minimises the distances along the normals, all (N, 3), mm."""
     centre = points.mean(axis=0)
     arms = points - centre
     radius = max(float(np.sqrt(np.mean(np.sum(arms**2, axis=1)))), 1e-12)

@@ -1,4 +1,4 @@
-"""The true surface of a data set, its observed part, and all figures of a predicted surface against it.
+"""The true surface of a data set, its part that a camera sees, and all figures of a predicted surface against it.
 
 | data | the true surface | observed part |
 |---|---|---|
@@ -15,11 +15,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
 
 from scopemap.cameras.camera import CameraModel
 from scopemap.errors import InputError, reporting
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.decoding import read_decoded
 from scopemap_bench.evaluation.surface import (
     Surface,
@@ -29,22 +31,114 @@ from scopemap_bench.evaluation.surface import (
     is_empty,
     normal_consistency,
     refine,
+    small_triangles,
     surface_points,
 )
-from scopemap_bench.evaluation.visibility import TrueView, pixels_near, seen_points, visible_from
 
+TrueView = tuple[np.ndarray, np.ndarray]
+"""One frame's pose (4, 4), camera to world, mm, and its true depth (H, W), mm, NaN = unknown."""
+
+_TOLERANCE, _NEARER = 0.02, 0.01
+_SUBPIXEL_BITS, _PAINTED_PX = 4, 1280
 _OBSERVED, _MISSED = 1, 2
+
+
+def seen_points(points_mm: np.ndarray, camera: CameraModel, view: TrueView) -> np.ndarray:
+    """Return which points (N, 3), world mm, one view sees, (N,) bool: its true depth is within 2 % of the point's."""
+    T_world_camera, depth_mm = view
+    seen = np.zeros(len(points_mm), dtype=bool)
+    rows, columns, z_mm, inside = _pixels(points_mm, camera, T_world_camera)
+    true_mm = depth_mm[rows, columns]
+    # Unknown depth is NaN and matches nothing.
+    seen[inside] = np.abs(z_mm - true_mm) <= _TOLERANCE * true_mm
+    return seen
+
+
+def visible_from(
+    surface: Surface, camera: CameraModel, T_world_camera: np.ndarray, valid: np.ndarray | None = None
+) -> Surface:
+    """Return the part of a surface, world mm, that one view sees on its `valid` pixels (H, W), None: on all.
+
+    Triangles of 2 mm are painted from far to near on a grid at least 1280 wide; one is kept unless the ray to its
+    centre meets the triangle painted there more than 1 % nearer. Points hide nothing.
+    """
+    usable = np.ones((camera.height, camera.width), dtype=bool) if valid is None else valid
+    if not isinstance(surface, trimesh.Trimesh):
+        rows, columns, _, inside = _pixels(surface, camera, T_world_camera)
+        return surface[inside[usable[rows, columns]]]
+    if is_empty(surface):
+        return surface
+    triangles = small_triangles(surface)
+    local = transform(inverse(T_world_camera), triangles.reshape(-1, 3)).reshape(triangles.shape)
+    rows, columns, _, inside = _pixels(local.mean(axis=1), camera, np.eye(4))
+    in_view = inside[usable[rows, columns]]
+    kept = in_view[~_hidden(local, in_view, camera)]
+    corners = np.arange(3 * len(kept)).reshape(-1, 3)
+    return trimesh.Trimesh(triangles[kept].reshape(-1, 3), corners, process=False)
+
+
+def pixels_near(
+    points_mm: np.ndarray, camera: CameraModel, T_world_camera: np.ndarray, *, radius_px: float
+) -> np.ndarray:
+    """Return the pixels (H, W) bool within `radius_px` of the projection of any point (N, 3), world mm."""
+    hit = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    rows, columns, _, _ = _pixels(points_mm, camera, T_world_camera)
+    hit[rows, columns] = 1
+    away_px = cv2.distanceTransform(1 - hit, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (away_px <= radius_px) & hit.any()
+
+
+def _pixels(
+    points_mm: np.ndarray, camera: CameraModel, T_world_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, columns and z (M,) of the points inside the image, and their numbers (M,)."""
+    local = transform(inverse(T_world_camera), points_mm)
+    pixels = camera.project(local)
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero(((pixels >= -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(axis=1))
+    columns, rows = np.rint(pixels[inside]).astype(np.intp).T
+    return rows, columns, local[inside, 2], inside
+
+
+def _hidden(triangles: np.ndarray, chosen: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Return which of the `chosen` (M,) triangles (F, 3, 3), in the camera, are behind the painted ones' planes."""
+    finer = -(-_PAINTED_PX // camera.width)
+    grid = camera.resized(finer * camera.width, finer * camera.height)
+    nearest = _nearest_triangle(triangles, grid)
+    centres = triangles[chosen].mean(axis=1)
+    rows, columns, _, inside = _pixels(centres, grid, np.eye(4))
+    front = np.full(len(chosen), -1)
+    front[inside] = nearest[rows, columns]
+    a, b, c = triangles[front].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        met = np.sum(normals * a, axis=1) / np.sum(normals * centres, axis=1)
+    return (front >= 0) & (met < 1 - _NEARER)
+
+
+def _nearest_triangle(triangles: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Return the number (H, W) int32 of the nearest triangle (F, 3, 3), in the camera, on each pixel, -1 = none."""
+    painted = np.full((camera.height, camera.width), -1, dtype=np.int32)
+    pixels = camera.project(triangles)
+    with np.errstate(invalid="ignore"):
+        touching = (pixels.max(axis=1) > -1).all(axis=1)
+        touching &= (pixels.min(axis=1) < [camera.width, camera.height]).all(axis=1)
+    drawn = np.flatnonzero(touching)
+    drawn = drawn[np.argsort(-triangles[drawn, :, 2].mean(axis=1), kind="stable")]
+    outlines = np.round(pixels[drawn] * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+    for outline, number in zip(outlines, drawn.tolist(), strict=True):
+        cv2.fillConvexPoly(painted, outline, number, cv2.LINE_8, _SUBPIXEL_BITS)
+    return painted
 
 
 @dataclass(frozen=True)
 class TrueSurface:
-    """A true surface in the true world, mm.
+    """A true surface in the true world, mm: a mesh, or points (N, 3).
 
-    surface : a mesh, or points (N, 3).
     seen : (F,) bool, the faces of the mesh that the camera saw; None: not known.
     frames : where the tissue moves, the mesh file of every frame, with the faces of `surface`; empty: it is at rest.
     T_view : (4, 4), world from camera, mm, of the one view that the truth was taken from; None: the whole scene.
-    reach_px : a pixel of that view has a truth if a true point falls within this distance; larger for sparse points.
+    reach_px : a pixel of that view has a truth if a true point falls within this distance.
     """
 
     surface: Surface
@@ -66,11 +160,7 @@ class TrueSurface:
         return trimesh.Trimesh(self._mesh.vertices, self._mesh.faces[self.seen], process=False)
 
     def seen_by(self, camera: CameraModel, views: Mapping[int, TrueView]) -> TrueSurface:
-        """Return the mesh with a new `seen`: the faces whose centre some view, by its frame's number, sees.
-
-        Where the tissue moves, each view is compared with the mesh of its own frame. Raises `InputError` where no face
-        is seen, and where a frame's mesh is missing or has other faces.
-        """
+        """Return the mesh with the faces that some view, by its frame's number, sees; `InputError` where none fits."""
         seen = np.zeros(len(self._mesh.faces), dtype=bool)
         for index, view in views.items():
             mesh = self._mesh_of_frame(index) if self.frames else self._mesh
@@ -92,10 +182,7 @@ class TrueSurface:
 
 
 def read_true_surface(folder: Path) -> TrueSurface | None:
-    """Return the true surface in the folder of a phantom, a C3VD video or a SCARED keyframe; None where there is none.
-
-    SCARED's points are in the left camera at the keyframe, the world of its poses. `InputError` for an unreadable file.
-    """
+    """Return the true surface of a phantom, a C3VD video or a SCARED keyframe in the world of its poses, or None."""
     for name, read in _READERS.items():
         file = Path(folder) / name
         if file.is_file():
@@ -109,9 +196,9 @@ def measure_surface(
 ) -> dict[str, float]:
     """Return every figure of a predicted surface, which the alignment of the trajectories has moved to the true world.
 
-    The names of `compare_surfaces`, and `normal_consistency`; with `icp` also accuracy_icp_*, icp_rms_before_mm and
-    icp_rms_after_mm. Against a truth of one view, only the part of the prediction is measured that the view, whose
-    `camera` is then needed, sees on pixels with a truth.
+    Those of `compare_surfaces`, normal_consistency; with `icp` accuracy_icp_*, icp_rms_before_mm, icp_rms_after_mm.
+    Against a truth of one view, only what the view, whose `camera` is then needed, sees on pixels with a truth is
+    measured.
     """
     if truth.T_view is not None:
         if camera is None:

@@ -19,10 +19,7 @@ from scopemap_bench.plan import MethodPlan
 
 
 class ImportedTrajectory:
-    """Reads the file of a sequence and seed, as `plan.files` names it; frames without a pose in it are lost.
-
-    Raises `InputError` where the file is missing or none of its poses matches a frame.
-    """
+    """Reads the file of a sequence and seed, as `plan.files` names it; frames without a pose in it are lost."""
 
     def __init__(self, plan: MethodPlan, data: Path | None, name: str, seed: int) -> None:
         self._plan, self._name = plan, plan.files.format(sequence=name, seed=seed)
@@ -59,10 +56,7 @@ class ImportedTrajectory:
 
 
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:
-    """Return the trajectory at the frames (N,), matched by number where it has numbers, else by time.
-
-    Frames without a pose are lost.
-    """
+    """Return the trajectory at the frames (N,), matched by number, else by time; frames without a pose are lost."""
     frames = Trajectory(indices, times_s, np.full((len(indices), 4, 4), np.nan), np.full(len(indices), "lost"))
     known = trajectory.rows(trajectory.tracked)
     rows_known, rows = associate(known, frames)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from scopemap.config import Config
 from scopemap.errors import SettingsError
@@ -16,10 +16,8 @@ from scopemap.io.sequence import Sequence
 from scopemap.odometry import Step
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.track import FrameTracker
-from scopemap_bench.methods.endo_depth_and_motion import create_endo_depth_and_motion
+from scopemap_bench.methods.baselines import Open3dTracker, StandingStill, create_endo_depth_and_motion
 from scopemap_bench.methods.imported import ImportedTrajectory
-from scopemap_bench.methods.open3d_odometry import Open3dTracker
-from scopemap_bench.methods.standing_still import StandingStill
 from scopemap_bench.plan import MethodPlan
 
 # Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
@@ -35,22 +33,6 @@ BASELINES: dict[str, Callable[[], FrameTracker]] = {
     "standing-still": StandingStill,
 }
 """Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
-
-
-class Method(Protocol):
-    """Turns a sequence into a run's folder, which the same code then scores for all methods."""
-
-    def missing(self, settings: Mapping[str, Any]) -> str:
-        """Return what the method needs and this machine does not have, in one line; "" where it can run."""
-
-    def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
-        """Write at least trajectory.tum, frames.csv and provenance.json to `out` and return the times.
-
-        All methods get the same `sequence` of frames, whose truth they must not read, and the same `settings` (dotted
-        names): depth and its anchor, masks, fusion. Times are "ms_per_frame", from the first finished frame to the last
-        without start-up, "track_ms_per_frame" and "seconds_STAGE"; none where they are unknown. Raises any error of the
-        method.
-        """
 
 
 @dataclass(frozen=True)
@@ -73,9 +55,10 @@ class PipelineMethod:
         return f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
-        """Reconstruct into `out`; raises what the pipeline raises.
+        """Reconstruct into `out` and return the times of the run's own clock; raises what the pipeline raises.
 
-        Times are those of the run's own clock: "tracking" is tracking, depth refinement and the choice of keyframes.
+        "ms_per_frame" is from the first finished frame to the last, without start-up; "track_ms_per_frame" is tracking,
+        depth refinement and the choice of keyframes.
         """
         tracker = None if self.plan.use == "scopemap" else BASELINES[self.plan.use]()
         finished: list[float] = []
@@ -95,11 +78,12 @@ class PipelineMethod:
         }
 
 
-def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed: int = 0) -> Method:
-    """Return the method of a plan; raises `SettingsError` for an unknown one.
+Method = PipelineMethod | ImportedTrajectory
+"""Turns frames, whose truth it must not read, and the settings of all methods into a run's folder."""
 
-    data : folder of imported trajectories. sequence, seed : which of them, by the name of the sequence.
-    """
+
+def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed: int = 0) -> Method:
+    """Return the method of a plan, for imports that of a sequence and seed; `SettingsError` for an unknown one."""
     if plan.use == "import":
         return ImportedTrajectory(plan, data, sequence, seed)
     if plan.use != "scopemap" and plan.use not in BASELINES:

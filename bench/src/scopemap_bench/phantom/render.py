@@ -8,17 +8,34 @@ import numpy as np
 
 from scopemap.errors import InputError
 from scopemap.trajectory.formats.text import read_poses
-from scopemap_bench.phantom.camera_path import lumen_path, sweep_path, touching, turned
-from scopemap_bench.phantom.cavity import Tint, laparoscopy_volume
-from scopemap_bench.phantom.deformation import REST, Breathing, Push, TissueMotion, breathing, poke, push
-from scopemap_bench.phantom.exposing import exposure_times, lagging_gains, pose_at
 from scopemap_bench.phantom.instrument import insert, instrument
-from scopemap_bench.phantom.lumen import colon_volume, tube_volume
-from scopemap_bench.phantom.march import SurfaceBuffers, march
-from scopemap_bench.phantom.shading import develop, disturb, exposure_for, shade, vignette
+from scopemap_bench.phantom.march import SurfaceBuffers, Volume, march
+from scopemap_bench.phantom.motion import (
+    REST,
+    Breathing,
+    Push,
+    TissueMotion,
+    breathing,
+    lumen_path,
+    poke,
+    push,
+    sweep_path,
+    touching,
+    turned,
+)
+from scopemap_bench.phantom.scenes import Tint, colon_volume, laparoscopy_volume, tube_volume
+from scopemap_bench.phantom.shading import (
+    Appearance,
+    develop,
+    disturb,
+    exposure_for,
+    exposure_times,
+    lagging_gains,
+    pose_at,
+    shade,
+    vignette,
+)
 from scopemap_bench.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
-from scopemap_bench.phantom.texture import Appearance
-from scopemap_bench.phantom.volume import Volume
 
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
@@ -31,11 +48,8 @@ _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
 @dataclass(frozen=True)
 class Phantom:
-    """A scene with the path through it, ready to be rendered frame by frame.
-
-    volume, appearance : shape and appearance of the tissue at rest. motion : how it moves.
-    poses : (N, 4, 4) float64, camera to world, mm.
-    exposure : gain of every frame, or of each (N,); None: each frame has its own.
+    """A scene and the path (N, 4, 4) through it, camera to world, mm; `exposure`: of all frames, of each (N,), or None:
+    own.
     """
 
     spec: PhantomSpec
@@ -47,10 +61,7 @@ class Phantom:
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
-    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame.
-
-    Raises `InputError` where the path file cannot be used or holds fewer poses than the frames wanted.
-    """
+    """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame."""
     poses = camera_path(spec)
     volume, appearance = build_scene(spec, poses)
     for event in _events(spec, "contact"):
@@ -76,10 +87,7 @@ def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotio
 
 
 def _poke(spec: PhantomSpec, event: Event, T_world_camera: np.ndarray, volume: Volume) -> Push:
-    """Return the push of what a camera sees on the right of its middle: half into the wall, half along it.
-
-    Raises `InputError` where nothing is seen there.
-    """
+    """Return the push of what a camera sees right of its middle, half into the wall, half along it."""
     surface = march(volume, spec.camera, T_world_camera, REST)
     row, column = (round(share * side) for share, side in zip(_POKED_AT, surface.depth_mm.shape, strict=True))
     if not np.isfinite(surface.depth_mm[row, column]):
@@ -112,9 +120,8 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
         return _with_turns(path[:: spec.speed], spec)
     poses = read_poses(spec.path_file)
     if spec.frames is not None and spec.frames > len(poses):
-        raise InputError(
-            f"{spec.path_file} holds {len(poses)} poses, {spec.frames} frames were asked for: ask for fewer"
-        )
+        wanted = f"{spec.frames} frames were asked for: ask for fewer"
+        raise InputError(f"{spec.path_file} holds {len(poses)} poses, {wanted}")
     return _with_turns(poses[: spec.frames], spec)
 
 
@@ -137,10 +144,7 @@ def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearanc
 
 
 def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return linear light (H, W, 3) float32 of a frame before exposure, and the surface at the frame's own pose.
-
-    Light is the mean over the time during which the shutter is open.
-    """
+    """Return linear light (H, W, 3) float32 of a frame, the mean over the open shutter, and the surface at its pose."""
     spec = phantom.spec
     radiance, surface = _light_at(phantom, float(index))
     if spec.shutter > 0:

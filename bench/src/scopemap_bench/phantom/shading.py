@@ -1,33 +1,103 @@
-"""Shading of a surface to linear light, and the camera's 8-bit image of it.
+"""From a surface to the picture of it: tissue's albedo and wet film, the lamp at the camera, exposure, video coding.
 
-The light is at the camera: irradiance falls as cosine over squared distance, and a wet spot that faces it reflects it.
+Irradiance falls as cosine over squared distance, and a wet spot that faces the lamp reflects it. Albedo, vessels and
+film are functions of the rest point, so that they move with the tissue; they fade where a pixel is too coarse for them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from fractions import Fraction
+
+import av
 import cv2
 import numpy as np
+from av.video.codeccontext import VideoCodecContext
 
 from scopemap.cameras.camera import CameraModel
-from scopemap_bench.phantom.march import SurfaceBuffers, rays_of
+from scopemap.errors import SettingsError
+from scopemap.geometry.se3 import inverse, mean_near, transform
+from scopemap_bench.phantom.march import SurfaceBuffers, noise_at, rays_of
+from scopemap_bench.phantom.scenes import Tint
 from scopemap_bench.phantom.spec import EventName
-from scopemap_bench.phantom.volume import noise_at
 
-_FILM_TILT = 0.3
-_HIGHLIGHT_SHARPNESS = 350.0
-_HIGHLIGHT_STRENGTH = 1.6
-_VIGNETTE = 0.35
-_KNEE = 0.6
-_OPTICS_SIGMA_PX = 0.55
-_EXPOSED_SHARE = 80.0
-_EXPOSED_LEVEL = 0.48
-_SHOT_NOISE = 2.5
+_MOTTLES = ((22.0, 0.22), (8.0, 0.16), (3.0, 0.14), (1.2, 0.14))
+_VESSEL_COLOUR = np.array([0.80, 0.42, 0.50], np.float32)
+# Lattice spacing mm, width mm, depth of colour.
+_VESSELS = ((17.0, 0.45, 0.75), (8.0, 0.22, 0.55))
+_RIPPLE_MM, _PUDDLE_MM, _FILM_TILT = 1.9, 14.0, 0.3
+_HIGHLIGHT_SHARPNESS, _HIGHLIGHT_STRENGTH = 350.0, 1.6
+_VIGNETTE, _KNEE, _OPTICS_SIGMA_PX, _SHOT_NOISE = 0.35, 0.6, 0.55, 2.5
+_EXPOSED_SHARE, _EXPOSED_LEVEL = 80.0, 0.48
 _BLUR_PX = 13
-_WATER_PX = 5.0
-_WATER_LENGTH_PX = 40.0
-_WATER_FRAMES = 7.0
+_WATER_PX, _WATER_LENGTH_PX, _WATER_FRAMES = 5.0, 40.0, 7.0
 _WATER_RGB = np.array([0.55, 0.45, 0.22], np.float32)
 _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
+MAX_SAMPLES = 8
+"""Of light within one exposure."""
+
+_SHIFT_PERCENTILE, _PX_PER_SAMPLE = 95, 2.0
+_ENCODER, _FULL_EVERY = "libx264", 60
+# Endoscopy towers record live: no frames from the future, a full frame every two seconds.
+_OPTIONS = {"preset": "fast", "tune": "zerolatency"}
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Appearance of tissue: `base`, its colour, linear RGB (3,), or the colours in space; `seed` of its pattern.
+
+    texture, gloss : strength of mottling and vessels, and of highlights; 0 = none.
+    """
+
+    base: np.ndarray | Tint
+    texture: float
+    gloss: float
+    seed: int
+
+    def albedo(self, rest_mm: np.ndarray, footprint_mm: np.ndarray) -> np.ndarray:
+        """Return linear RGB (H, W, 3) float32, 0..1, at rest points (H, W, 3) seen by pixels that wide (H, W)."""
+        footprint = np.nan_to_num(footprint_mm, nan=1.0)
+        colour = self.base.at(rest_mm) if isinstance(self.base, Tint) else self.base.astype(np.float32)
+        if self.texture > 0:
+            colour = colour * self._mottling(rest_mm, footprint) * self._vessels(rest_mm, footprint)
+        return np.minimum(np.broadcast_to(colour, rest_mm.shape), 1.0)
+
+    def ripple(self, rest_mm: np.ndarray, footprint_mm: np.ndarray) -> np.ndarray:
+        """Return the tilt (H, W, 3) float32, about -1..1, of the fluid film; zero without gloss."""
+        if self.gloss == 0:
+            return np.zeros(rest_mm.shape, np.float32)
+        axes = [noise_at(rest_mm, _RIPPLE_MM, self.seed + 41 + n) for n in range(3)]
+        return np.stack(axes, -1) * _visible(_RIPPLE_MM, np.nan_to_num(footprint_mm, nan=1.0))[..., None]
+
+    def film(self, rest_mm: np.ndarray) -> np.ndarray:
+        """Return the strength (H, W) float32, >= 0, of specular reflection: larger in wet places, never 0."""
+        wetness = 0.5 + 1.6 * noise_at(rest_mm, _PUDDLE_MM, self.seed + 45)
+        return (self.gloss * np.clip(wetness, 0.05, 1.0)).astype(np.float32)
+
+    def _mottling(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        brightness = sum(
+            strength * _visible(period, footprint) * noise_at(points, period, self.seed + 31 + n)
+            for n, (period, strength) in enumerate(_MOTTLES)
+        )
+        redness = noise_at(points, 12.0, self.seed + 36)
+        tone = np.array([0.02, -0.22, -0.18], np.float32)
+        return np.exp(self.texture * (brightness[..., None] + redness[..., None] * tone)).astype(np.float32)
+
+    def _vessels(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Vessels run along the zero crossings of smooth noise; a second noise selects where."""
+        stain = np.zeros(footprint.shape, np.float32)
+        for n, (period, width, depth) in enumerate(_VESSELS):
+            bent = points + 0.9 * noise_at(points, period / 3, self.seed + 51 + n)[..., None]
+            away_mm = np.abs(noise_at(bent, period, self.seed + 53 + n)) * period / 1.6
+            wide = np.hypot(width, 0.7 * footprint)
+            there = np.clip(2.2 * noise_at(points, 1.7 * period, self.seed + 55 + n) + 0.25, 0, 1)
+            stain += depth * there * (width / wide) * np.exp(-((away_mm / wide) ** 2))
+        return _VESSEL_COLOUR ** (self.texture * stain[..., None])
+
+
+def _visible(period_mm: float, footprint_mm: np.ndarray) -> np.ndarray:
+    """Share (0..1) of a pattern's contrast that pixels of this width resolve."""
+    return np.clip(period_mm / (2.0 * footprint_mm) - 0.5, 0.0, 1.0).astype(np.float32)
 
 
 def shade(
@@ -113,9 +183,8 @@ def _fluid(linear: np.ndarray, index: int) -> np.ndarray:
 
 def _smoke(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     height, width = linear.shape[:2]
-    clouds = cv2.resize(
-        rng.uniform(0.55, 0.9, (4, 5)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC
-    )
+    coarse = rng.uniform(0.55, 0.9, (4, 5)).astype(np.float32)
+    clouds = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     thickness = np.clip(clouds, 0, 1)[..., None]
     return linear * (1 - thickness) + _SMOKE_GREY * thickness
 
@@ -129,3 +198,73 @@ def _blur(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     for step in np.linspace(-length, length, 4 * length):
         kernel[round(length + step * np.sin(angle)), round(length + step * np.cos(angle))] = 1.0
     return cv2.GaussianBlur(cv2.filter2D(linear, -1, kernel / kernel.sum()), (0, 0), 3.0 * scale)
+
+
+def pose_at(poses: np.ndarray, time: float) -> np.ndarray:
+    """Return the pose (4, 4) at a time in frames, between the poses (N, 4, 4) before and after; held at the ends."""
+    first = int(np.clip(np.floor(time), 0, max(len(poses) - 2, 0)))
+    share = float(np.clip(time - first, 0, 1))
+    last = min(first + 1, len(poses) - 1)
+    return poses[first] if share == 0 else mean_near(poses[first], [poses[last]], [share])
+
+
+def exposure_times(
+    index: int, shutter: float, poses: np.ndarray, surface: SurfaceBuffers, camera: CameraModel
+) -> list[float]:
+    """Return the times, in frames, at which the light of frame `index` is sampled; `[index]` where nothing moves.
+
+    The shutter is open for a share `shutter` of the interval, centred at the frame's pose: a sample every 2 px, 8 at
+    most.
+    """
+    start, end = (pose_at(poses, index + half) for half in (-0.5 * shutter, 0.5 * shutter))
+    rows, columns = np.arange(0, camera.height, 4), np.arange(0, camera.width, 4)
+    seen = surface.depth_mm[np.ix_(rows, columns)].astype(np.float64)
+    points = transform(poses[index], (rays_of(camera)[np.ix_(rows, columns)] * seen[..., None])[np.isfinite(seen)])
+    first, last = (camera.project(transform(inverse(pose), points)) for pose in (start, end))
+    shift_px = np.linalg.norm(last - first, axis=1)
+    shift_px = shift_px[np.isfinite(shift_px)]
+    wanted = float(np.percentile(shift_px, _SHIFT_PERCENTILE)) if len(shift_px) else 0.0
+    samples = int(np.clip(np.ceil(wanted / _PX_PER_SAMPLE), 1, MAX_SAMPLES))
+    return [index + shutter * ((n + 0.5) / samples - 0.5) for n in range(samples)]
+
+
+def lagging_gains(wanted: np.ndarray, lag_frames: float) -> np.ndarray:
+    """Return gains (N,) whose logarithm follows that of the wanted (N,) with a time constant in frames."""
+    share = 1 - np.exp(-1 / lag_frames) if lag_frames > 0 else 1.0
+    log = np.log(np.asarray(wanted, np.float64))
+    for n in range(1, len(log)):
+        log[n] = log[n - 1] + share * (log[n] - log[n - 1])
+    return np.exp(log)
+
+
+class VideoCoding:
+    """Encodes and decodes frames in order; equal frames give equal results, since it uses one thread.
+
+    crf : rate factor of H.264, 0 to 51; 23 is usual, larger is coarser. `SettingsError` where PyAV has no H.264
+    encoder.
+    """
+
+    def __init__(self, crf: int, width: int, height: int) -> None:
+        if _ENCODER not in av.codecs_available:
+            raise SettingsError("the phantom's h264_crf needs PyAV with libx264: install the wheel from PyPI")
+        # 4:2:0 needs even sizes: a last row or column is repeated.
+        self._width, self._height = width + width % 2, height + height % 2
+        encoder, decoder = av.CodecContext.create(_ENCODER, "w"), av.CodecContext.create("h264", "r")
+        assert isinstance(encoder, VideoCodecContext)
+        encoder.width, encoder.height, encoder.pix_fmt = self._width, self._height, "yuv420p"
+        encoder.time_base, encoder.gop_size, encoder.thread_count = Fraction(1, 30), _FULL_EVERY, 1
+        encoder.options = _OPTIONS | {"crf": str(crf)}
+        decoder.thread_count = 1
+        decoder.flags |= av.codec.context.Flags.low_delay
+        self._encoder, self._decoder = encoder, decoder
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        """Return the next frame (H, W, 3) uint8 after coding."""
+        height, width = rgb.shape[:2]
+        padded = np.pad(rgb, ((0, self._height - height), (0, self._width - width), (0, 0)), mode="edge")
+        frame = av.VideoFrame.from_ndarray(padded, format="rgb24")
+        packets = self._encoder.encode(frame)
+        decoded = [picture for packet in packets for picture in self._decoder.decode(packet)]
+        if len(decoded) != 1:
+            raise RuntimeError("the H.264 decoder holds frames back")
+        return decoded[0].to_ndarray(format="rgb24")[:height, :width]

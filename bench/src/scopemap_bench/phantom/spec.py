@@ -27,9 +27,9 @@ class Event:
     """What happens from frame `first` to frame `last`, inclusive.
 
     black, blur, smoke, fluid : of the picture. instrument : one enters, works and leaves. turn : the camera turns by 30
-    degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera turns to the wall
-    and touches it, then goes back. push : the tissue is pushed two ways from `first` on, and stays so from `last` on.
-    poke : so is the part of it on the right of the view alone, by 8 mm, half into the wall and half along it.
+    degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera touches the wall
+    and goes back. push : the tissue is pushed two ways and stays so. poke : the part on the right of the view alone is,
+    by 8 mm, half into the wall and half along it.
     """
 
     kind: EventName
@@ -42,26 +42,19 @@ class PhantomSpec:
     """Parameters of a phantom.
 
     scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
-    frames : number of frames; None: every pose of `path_file`, or 200.
-    width, height : image size, px.
-    fov_deg : horizontal field of view of a pinhole camera, degrees; a `camera_file` has its own.
-    camera_file : calibration of the camera that sees the scene, scaled to the image size; None: a pinhole camera.
-    seed : of everything random.
-    path_file : camera path to follow (`read_poses`), None: a hand-like path is generated.
-    deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often.
-    loop : whether the generated path ends in exactly its first pose.
-    speed : how many times faster than usual the camera goes along a generated path.
-    events : what happens on the way, see `Event`.
+    frames : None: every pose of `path_file`, or 200. width, height : image size, px. seed : of everything random.
+    fov_deg : horizontal field of view of a pinhole, degrees; a `camera_file` has its own, scaled to the image size.
+    path_file : camera path to follow (`read_poses`), None: a hand-like path is generated, which is `speed` times faster
+    than usual, and with `loop` ends in exactly its first pose.
+    deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
-    texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo.
-    gloss : strength of the wet highlights, 1 = as in the clinic, 0 = none.
-    auto_exposure : whether every frame has its own exposure; False: all that of the first.
-    exposure_lag_frames : time constant with which automatic exposure follows the scene, 0: at once.
+    texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo. gloss : of wet highlights, 1 =
+    clinic.
+    auto_exposure : whether every frame has its own exposure, which follows with the time constant exposure_lag_frames.
     shutter : share of the time between two frames during which light is gathered, 0: no motion blur.
     indirect : light that the tissue scatters onto itself, share of the lamp's; it lights far walls too much.
-    h264_crf : rate factor of the video coding, 0 to 51, that frames go through (`exposing.VideoCoding`); None: none.
-    depth_scale_mm : mm per unit of the depth files; the default is C3VD's, 100 mm at most.
-    fps : frames per second as written to `camera.yaml`.
+    h264_crf : rate factor, 0 to 51, of the video coding (`shading.VideoCoding`); None: none.
+    depth_scale_mm : mm per unit of the depth files; C3VD's by default. fps : frames per second of `camera.yaml`.
     """
 
     scene: SceneName = "colon"
@@ -117,10 +110,7 @@ class PhantomSpec:
 
     @cached_property
     def camera(self) -> CameraModel:
-        """The camera of `camera_file`; else a pinhole with square pixels, its principal point at the image's centre.
-
-        Raises `CalibrationError` where the file holds no camera for an image of this aspect.
-        """
+        """The camera of `camera_file`; else a pinhole with square pixels, its principal point at the image's centre."""
         if self.camera_file is not None:
             calibration = read_calibration(self.camera_file, (self.width, self.height), "scale")
             return calibration.camera

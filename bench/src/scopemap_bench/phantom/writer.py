@@ -20,23 +20,21 @@ from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import marching_cubes
 from scopemap.io.decoding import write_encoded
-from scopemap_bench.phantom.exposing import VideoCoding
+from scopemap_bench.phantom.march import Volume
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
+from scopemap_bench.phantom.shading import VideoCoding
 from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.volume import Volume
 
 CLIPPED = 65535
 _OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
 _NEWTON_STEPS = 4
-_SEEN_MARGIN_VOXELS = 2
-_RIM_VOXELS = 4
+_SEEN_MARGIN_VOXELS, _RIM_VOXELS = 2, 4
 
 
 def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
     """Return the true surface at rest in the voxels `seen` (X, Y, Z) bool and a rim of 2 around them, world mm.
 
-    Vertices are exact to 1e-4 mm, faces counter-clockwise seen from the camera. Raises `InputError` where there is no
-    surface in these voxels.
+    Vertices are exact to 1e-4 mm, faces counter-clockwise seen from the camera. `InputError` where there is no surface.
     """
     # The spline is defined where the whole neighbourhood of a voxel is inside the grid.
     inner = (slice(_RIM_VOXELS, -_RIM_VOXELS),) * 3
@@ -59,7 +57,7 @@ def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
 def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
     """Render the phantom of `spec` into `folder`, calling `progress(frames done, frames in all)` after each frame.
 
-    Raises `InputError` for a folder that holds other files or cannot be written, and for an unusable path file.
+    Raises `InputError` for a folder that holds other files, and for an unusable path file.
     """
     folder = Path(folder)
     _check_free(folder)
@@ -111,13 +109,11 @@ def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None
 
 
 def _write_description(phantom: Phantom, file: Path) -> None:
-    files = ("path_file", "camera_file")
-    spec = {key: str(value) if key in files and value else value for key, value in asdict(phantom.spec).items()}
     description = {
         "made_by": f"scopemap {version('scopemap')}",
-        "spec": spec,
+        "spec": asdict(phantom.spec),
         "frames": len(phantom.poses),
         "exposure": None if phantom.exposure is None else np.asarray(phantom.exposure).tolist(),
         "voxel_mm": phantom.volume.voxel_mm,
     }
-    file.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(description, indent=2, default=str) + "\n", encoding="utf-8")

@@ -2,17 +2,10 @@
 
     python -m scopemap_bench.scripts.batch [--videos N] [--engines processes parts ray slurm s3]
 
-Short phantom videos are run one by one, and as a batch by each engine with two workers. Meanwhile
-
-- the process that runs the poisoned video is killed (SIGKILL) in each attempt, and that of one other video once;
-- `processes`: the whole command is killed, and given again;
-- `parts`: three commands at once, `--part 1/3`, `2/3` and `3/3`, of which the second is killed and given again;
-- `ray`: of a cluster of a head and two nodes, all on this machine, one node (its raylet) is killed;
-- `slurm`: jobs of submitit on this machine, of which one is killed with all it runs;
-- `s3`: the videos are at an address of a local server (moto), the engine is `processes`.
-
-Then the same command is given again. Exit code 1 where a result differs, a failure is not the one expected, or a file
-of a finished result is touched again. Needs Linux, and the extra `dev`.
+Short phantom videos are run one by one, and as a batch by each engine with two workers, on this machine (`s3`: by a
+local moto server). Meanwhile the process of the poisoned video is killed in each attempt, that of another video once,
+and what the engine's function states. Then the same command is given again. Exit code 1 where a result differs, a
+failure is not the one expected, or a file of a finished result is touched again. Needs Linux, and the extra `dev`.
 """
 
 from __future__ import annotations
@@ -170,9 +163,8 @@ def by_ray(videos: Path, out: Path) -> Iterator[Disturbed]:
     try:
         nodes = [cluster.add_node(num_cpus=1, memory=2 << 30, **given) for _ in range(2)]
         options = ("--engine", "ray", "--address", cluster.address, "--worker-cores", "1", "--worker-memory", "1GB")
-        yield Disturbed(
-            command(videos, out, *options), "a node", lambda process: nodes[0].kill_raylet(check_alive=False)
-        )
+        command_line = command(videos, out, *options)
+        yield Disturbed(command_line, "a node", lambda process: nodes[0].kill_raylet(check_alive=False))
     finally:
         cluster.shutdown()
 

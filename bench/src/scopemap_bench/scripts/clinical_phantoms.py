@@ -2,9 +2,8 @@
 
     python -m scopemap_bench.scripts.clinical_phantoms [--only NAME ...] [--seeds N] [--preset NAME] [--out FOLDER]
 
-First table: each phantom (120 frames of 320x256 px) has one difficulty, one run of the command line with scopenet. ATE
-is that of the largest submap after a Sim(3) alignment. Second table: phantoms through lenses of known kind and field of
-view, given as plain pictures: every fourth of 120 frames, as the estimate uses them.
+First table: phantoms of 120 frames with one difficulty each; ATE is that of the largest submap after a Sim(3)
+alignment. Second table: lenses of known kind and field of view, given as plain pictures, every fourth of 120 frames.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
 CAMERA = ("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15", *EXPOSURE)
 PHANTOMS = {
     "fast: ten pixels a frame, two turns of 30 degrees": (
-        *("--scene", "colon", "--set", "speed=6"),
-        *("--events", "turn:40-48,turn:80-88"),
+        *("--scene", "colon", "--set", "speed=6", "--events", "turn:40-48,turn:80-88"),
     ),
     "cut: 30 degrees between two frames": ("--scene", "colon", "--events", "turn:60-60"),
     "instruments, twice": ("--scene", "laparoscopy", "--events", "instrument:15-60,instrument:70-110"),

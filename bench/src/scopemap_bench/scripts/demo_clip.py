@@ -1,8 +1,7 @@
-"""The clip that `scopemap demo` reconstructs, with its truth: 60 frames of the phantom colon, as H.264.
+"""Writes the clip that `scopemap demo` reconstructs, 60 frames of the phantom colon, with its truth into the core
+package.
 
     python -m scopemap_bench.scripts.demo_clip [--out FOLDER]
-
-writes colon.mp4, camera.yaml and pose.txt into the core package.
 """
 
 from __future__ import annotations

@@ -2,34 +2,46 @@
 
     python -m scopemap_bench.scripts.depth_without_download --data FOLDER [--model FILE ...] [--size WxH ...]
 
-The scenes are described in `depth_scenes.py`. Of several --model (weights of the network) each has a row. The few
-constants of shading were chosen on these very frames; the network never saw them. Sigma is judged after median scaling,
-by errors that are Laplace distributed in log depth: 0.76 and 0.94 of the pixels are within 1 and 2 sigma where it is
-right. Last table: pixels masked as instruments, and IoU with `gt_masks`.
+Four scenes with true depth are seen by rectified pinholes; "wide" is trans_t1_a at 0.6 times the focal length. Dark
+surround, clipped depth and instruments do not count. Each --model (weights of the network) has a row. The few constants
+of shading were chosen on these very frames; the network never saw them. Sigma is judged after median scaling, by
+Laplace errors of log depth: 0.76 and 0.94 of the pixels are within 1 and 2 sigma where it is right. Last table: pixels
+masked as instruments, and IoU with `gt_masks`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
+import cv2
 import numpy as np
+import trimesh
 from scipy.stats import spearmanr
 
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.cameras.rectification import Rectifier, working_camera
 from scopemap.config import DepthSettings, MaskSettings
 from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.depth.shading import ShadingDepth
 from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.opening import open_sequence
 from scopemap.masking.mask_files import MaskFiles
 from scopemap.masking.masker import Masker
+from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.evaluation.depth import evaluate_depth, evaluate_depth_sequence, scale_jitter
-from scopemap_bench.scripts.depth_scenes import SCENES, Size
 from scopemap_bench.scripts.measuring import options_of, print_head, print_row
 
+Size: TypeAlias = tuple[int, int]
+"""Width and height, px."""
+
+_DARK_LEVEL, _CLIPPED_MM, _INSTRUMENT_MARGIN_PX = 12, 99.9, 9
+_ENDONERF_FOCAL_PX, _TRUTH_EVERY = 569.468, 6
 SIZES: tuple[Size, ...] = ((160, 128), (320, 256))
 Predicted = tuple[np.ndarray, np.ndarray | None]
 """Depth and, if known, its standard deviation, (H, W) mm each, NaN = unknown."""
@@ -37,18 +49,84 @@ Estimator = Callable[[Frame], Predicted]
 _SATURATED_LEVEL = 250
 
 
+def c3vd_frames(
+    folder: Path, size: Size, zoom: float = 1.0, count: int | None = None
+) -> Iterator[tuple[C3vdFolder, Frame]]:
+    """Yield rectified frames of a C3VD folder, with their true depth where it has any."""
+    source = C3vdFolder(folder)
+    assert source.camera is not None
+    rectifier = Rectifier(source.camera, working_camera(source.camera, size, zoom))
+    for item in source.frames(slice(count)):
+        rgb = rectifier.image(item.rgb)
+        frame = Frame(item.index, item.time_s, rgb, rectifier.target, rectifier.valid & (rgb.max(-1) > _DARK_LEVEL))
+        truth = source.truth(item.index)
+        if truth is not None and truth.depth_mm is not None:
+            frame = replace(frame, depth_mm=rectifier.nearest(truth.depth_mm))
+        yield source, frame
+
+
+def cecum(data: Path, size: Size) -> Iterator[tuple[Frame, np.ndarray]]:
+    """Yield frames 0 and 1 of cecum_t1_a with the true surface points that they see."""
+    folder = data / "endoscopy" / "c3vd"
+    for source, frame in c3vd_frames(folder / "cecum_t1_a", size, count=2):
+        cloud = trimesh.load(folder / "cecum_t1_a_gt_clouds" / f"{frame.index:04d}_depth_pcd.ply")
+        points = transform(inverse(source.poses[frame.index]), np.asarray(cloud.vertices))
+        depth_mm = drawn(points[(points[:, 2] > 0) & (points[:, 2] <= _CLIPPED_MM)], frame.camera)
+        yield frame, np.where(frame.valid, depth_mm, np.nan)
+
+
+def trans(data: Path, size: Size, zoom: float = 1.0) -> Iterator[tuple[Frame, np.ndarray]]:
+    """Yield the ten frames of trans_t1_a with their exact depth."""
+    for _, frame in c3vd_frames(data / "endoscopy" / "c3vd" / "trans_t1_a", size, zoom):
+        assert frame.depth_mm is not None
+        yield replace(frame, depth_mm=None), np.where(frame.valid, frame.depth_mm, np.nan)
+
+
+def endonerf(data: Path, size: Size) -> Iterator[tuple[Frame, np.ndarray]]:
+    """Yield frames of EndoNeRF pulling with their stereo depth, instruments left out. The camera is at rest."""
+    folder = data / "endoscopy" / "endonerf" / "pulling_soft_tissues"
+    camera = PinholeCamera(_ENDONERF_FOCAL_PX, _ENDONERF_FOCAL_PX, 319.5, 255.5, 640, 512).resized(*size)
+    for file in sorted((folder / "images").iterdir())[::_TRUTH_EVERY]:
+        number = file.name.split(".")[0]
+        rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+        # Some depth files have 16 bit, most 8: all are mm.
+        depth_mm = cv2.imread(str(folder / "depth" / f"{number}.depth.png"), cv2.IMREAD_UNCHANGED)
+        mask = cv2.imread(str(folder / "gt_masks" / f"{number}.mask.png"), cv2.IMREAD_GRAYSCALE)
+        instrument = cv2.dilate(mask, np.ones((_INSTRUMENT_MARGIN_PX,) * 2, np.uint8)) > 0
+        truth_mm = np.where((depth_mm > 0) & ~instrument, depth_mm, np.nan).astype(np.float32)
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        frame = Frame(int(number.split("-")[-1]), 0.0, rgb, camera, rgb.max(-1) > _DARK_LEVEL)
+        yield frame, np.where(frame.valid, cv2.resize(truth_mm, size, interpolation=cv2.INTER_NEAREST), np.nan)
+
+
+SCENES: dict[str, Callable[[Path, Size], Iterator[tuple[Frame, np.ndarray]]]] = {
+    "cecum clouds": cecum,
+    "trans_t1_a": trans,
+    "trans_t1_a wide": lambda data, size: trans(data, size, 0.6),
+    "endonerf pulling": endonerf,
+}
+"""By name: (frame, true depth (H, W) mm, NaN = unknown or not to be counted)."""
+
+
+def drawn(points_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """Return the depth (H, W) of points (N, 3) in the camera, the nearest where several share a pixel, else NaN."""
+    pixels = np.rint(camera.project(points_mm)).astype(int)
+    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(-1)
+    depth_mm = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    np.minimum.at(depth_mm, (pixels[inside, 1], pixels[inside, 0]), points_mm[inside, 2].astype(np.float32))
+    return np.where(np.isfinite(depth_mm), depth_mm, np.nan)
+
+
 @dataclass(frozen=True)
 class SceneScore:
     """Figures of a scene, means over its frames; NaN where there is nothing to measure.
 
-    Attributes
-    ----------
-    abs_rel, delta : after median scaling, mean |d - g| / g and share of pixels within a factor of 1.25.
-    metric_abs_rel : of the millimetres as predicted. one_scale_abs_rel : with one scale for all frames.
-    scale_log_std : standard deviation over the frames of ln median(g) / median(d).
-    saturated_ratio : abs_rel where a channel is 250 or more, over abs_rel elsewhere.
-    rank : Spearman's correlation of the relative error with sigma / d.
-    within_1_sigma, within_2_sigma : share of pixels with |ln d / g| below 1, 2 times sigma / d.
+    abs_rel, delta : after median scaling, mean |d - g| / g and share of pixels within a factor of 1.25. metric_abs_rel
+    : of the millimetres as predicted. one_scale_abs_rel : with one scale for all frames. scale_log_std : standard
+    deviation over the frames of ln median(g) / median(d). saturated_ratio : abs_rel where a channel is 250 or more,
+    over that elsewhere.
+    rank : Spearman's correlation of the relative error with sigma / d. within_1_sigma, within_2_sigma : share of pixels
+    with |ln d / g| below 1, 2 times sigma / d.
     """
 
     abs_rel: float

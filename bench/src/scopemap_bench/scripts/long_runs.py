@@ -3,9 +3,8 @@
     python -m scopemap_bench.scripts.long_runs [--frames 300 1200] [--size 320x256] [--preset default]
             [--live CLIP [--minutes 1] [--fps 15] [--camera FILE]]
 
-First table: a phantom's frames there and back until they are long enough, one run of the command line each: memory at
-each tenth of the time (the last ones are the adjustment, the fusion and the writing), ATE after a Sim(3) alignment.
-Second table: a clip, there and back, played as `scopemap live` plays it to a session in this process.
+First table: a phantom's frames there and back, one run of the command line each: memory at each tenth of the time, ATE
+after a Sim(3) alignment. Second table: a clip, there and back, played as `scopemap live` plays it to a session here.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
     python -m scopemap_bench.scripts.overview --data FOLDER [--out FOLDER] [--picture FILE] [--only NAME ...]
             [--presets NAME ...] [--repeat N]
 
-Every row is one run of the command line by a preset, measured by `scopemap evaluate`. Position errors are after a
-Sim(3) alignment. Frames per second are those of the whole command, the median of `--repeat`. `realtime` is run on five
-of the clips.
+A row is a run of the command line by a preset (`realtime` on five clips), measured by `scopemap evaluate` after a
+Sim(3) alignment. Frames per second are those of the whole command, the median of `--repeat`.
 """
 
 from __future__ import annotations

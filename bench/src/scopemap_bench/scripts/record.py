@@ -34,11 +34,8 @@ TABLES: dict[str, tuple[str, str]] = {
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),
     "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),
     "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
-    "ablations": (
-        f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations",
-        "ablations/tables/overview.md",
-    ),
-    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --inputs 600 --videos 6", ""),
+    "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),
+    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --videos 6", ""),
     "long-runs": (
         f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5",
         "",

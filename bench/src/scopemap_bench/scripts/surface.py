@@ -4,13 +4,11 @@
 
 First table: `scopemap evaluate --against-video` and `--truth`. Kept out: each tenth frame, compared with the surface of
 the others; depth is the median of |ln ratio|; in brackets is what the coloured points of the nearest fused frame reach.
-AbsRel is that of all depth maps with one scale. Runs of `overview --out FOLDER` are used again.
-
-Second table: `--camera-at-rest` on EndoNeRF's `pulling_soft_tissues`, whose camera does not move: median of
-|z - stereo| at the vertices of each frame's surface outside `gt_masks`, with one scale for all surfaces.
-
-Third table: laparoscopy phantoms, a part of whose tissue is pushed by 8 mm in the middle of three seconds. The mesh of
-all frames and that of `--surface-at` are compared with the frame of that second, where tissue moved by 2 mm or more.
+AbsRel is that of all depth maps with one scale. Runs of `overview --out FOLDER` are used again. Second table:
+`--camera-at-rest` on EndoNeRF's `pulling_soft_tissues`: median of |z - stereo| at the vertices of each frame's surface
+outside `gt_masks`, with one scale for all. Third table: laparoscopy phantoms, a part of whose tissue is pushed by 8 mm
+in the middle of three seconds: the mesh of all frames and that of `--surface-at` against the frame of that second,
+where tissue moved by 2 mm or more.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Poses in CLiMB's layouts: the submaps of a submission's run, and a sequence's reference by COLMAP.
 
-A run holds `camera_trajectory/cam_traj_map_000.txt`, one file per submap, with rows `timestamp, name_image, tx, ty, tz,
-qw, qx, qy, qz`, camera-to-world. A reference is `SEQUENCE/results_txt/images.txt`; `scales.csv` beside SEQUENCE has its
-mm per unit. Both count frames from 1; frames are numbered from 0 here. Source: EndoCartoScope/climb-challenge,
-README.md and submission_instructions/README.md.
+A run holds `camera_trajectory/cam_traj_map_000.txt`, a file per submap, of `timestamp, name_image, tx, ty, tz, qw, qx,
+qy, qz`, camera-to-world. A reference is `SEQUENCE/results_txt/images.txt`; `scales.csv` beside SEQUENCE has its mm per
+unit. Both count frames from 1, we from 0. Source: EndoCartoScope/climb-challenge, README.md,
+submission_instructions/README.md.
 """
 
 from __future__ import annotations
@@ -30,10 +30,7 @@ _IMAGE_NAME = re.compile(r"(\d{1,9})\D*?(\.\w+)?")
 
 
 def read_climb(path: Path, unit: Unit) -> Trajectory:
-    """Read the submaps of a submission's run, in `unit`, or a reference, which `scales.csv` brings to mm.
-
-    The submap with the smallest number is returned, the rest are its `others`.
-    """
+    """Read a submission's run, its first submap with `others`, or a reference, which `scales.csv` brings to mm."""
     if (path / "results_txt").is_dir():
         return read_climb_reference(path)
     files = [path] if path.is_file() else sorted(path.glob(CLIMB_FILES[0]))
@@ -70,10 +67,7 @@ def _scale_mm(sequence: Path) -> float | None:
 
 
 def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
-    """Return the poses of one submap's file; rows without a finite position are left out, as the evaluation does.
-
-    Raises `InputError`, with the line, for a row that the evaluation cannot score.
-    """
+    """Return the finite poses of a submap; `InputError`, with the line, for a row that the evaluation cannot score."""
     rows: dict[int, list[float]] = {}
     where: list[str] = []
     for number, line in enumerate(text_lines(file), start=1):

@@ -1,7 +1,7 @@
 """Numbered files of a data set, in a folder or in a tar archive, read one at a time.
 
-An archive is never unpacked to disk: its members are found while it is read on, and only regular files with a number in
-their own name are read, into memory. Going back in a compressed archive decompresses it from its start again.
+An archive is never unpacked to disk: only regular files with a number in their own name are read, into memory. Going
+back in a compressed archive decompresses it from its start again.
 """
 
 from __future__ import annotations
@@ -17,13 +17,8 @@ from scopemap.errors import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
 _MOST_MEMBERS, _LARGEST_HEADER_BYTES = 200_000, 1 << 20
-_HEADERS = (
-    tarfile.GNUTYPE_LONGNAME,
-    tarfile.GNUTYPE_LONGLINK,
-    tarfile.XHDTYPE,
-    tarfile.XGLTYPE,
-    tarfile.SOLARIS_XHDTYPE,
-)
+_LONG_NAMES = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK)
+_HEADERS = (*_LONG_NAMES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
 ARCHIVES = (".tar.gz", ".tgz", ".tar")
 """Endings of the archives that are read, the preferred first."""
 
@@ -35,10 +30,7 @@ class FolderFiles:
         self.path, self._files = path, dict(sorted(files.items()))
 
     def read(self, number: int, most_bytes: int | None = None) -> bytes | None:
-        """Return the content of the file with this number, None where there is none.
-
-        Raises `InputError` if it cannot be read or holds more than `most_bytes` (None: the limit of images).
-        """
+        """Return the content of this file, None where there is none; `InputError` above `most_bytes`."""
         file = self._files.get(number)
         if file is None:
             return None

@@ -1,10 +1,9 @@
-"""SCARED: one JSON of kinematics per frame (Allan et al., "Stereo correspondence and reconstruction of endoscopic data
-challenge", arXiv 2101.01133).
+"""SCARED: one JSON of kinematics per frame (Allan et al., arXiv 2101.01133).
 
 `camera-pose` is the 4x4 world-to-camera motion of the left camera, mm; the world is the left camera at the keyframe. So
 it is read by scared_toolkit, AF-SfMLearner, EndoSurf and SurgCUT3R. The number in a file's name is the frame's: from 0
-in SCARED, from 1 and with gaps in SCARED-C, whose `camera-calibration` is a file name instead of matrices. The unit of
-`timestamp` is not documented. It is taken for the power of ten of a second by which a frame lasts 10 to 100 ms.
+in SCARED, from 1 and with gaps in SCARED-C, whose `camera-calibration` is a file name. The unit of `timestamp` is not
+documented: it is taken for the power of ten of a second by which a frame lasts 10 to 100 ms.
 """
 
 from __future__ import annotations
@@ -30,18 +29,13 @@ _PLACES = ("frame_data", ".", "data/frame_data", "data/.", "image_02/data/frame_
 SCARED_FILES = tuple(f"{place}{end}" for place in _PLACES for end in (f"/{_PREFIX}*.json", *ARCHIVES))
 """Where the poses of a keyframe's folder are: a file of any of these names holds some."""
 
-_SHORTEST_STEP_POWER = -2
-_LARGEST_STAMP = 1e30
+_SHORTEST_STEP_POWER, _LARGEST_STAMP = -2, 1e30
 _LARGEST_FILE_BYTES = 1 << 20  # a file of poses and calibrations holds 2 kB
 
 
 @dataclass(frozen=True)
 class FrameData:
-    """The content of one `frame_data` file.
-
-    index : number of the frame. T_world_camera : (4, 4), mm, None where it cannot be used, which `fault` explains.
-    stamp : `timestamp`.
-    """
+    """The content of one `frame_data` file: number, pose (4, 4), mm, `timestamp`, and why there is no pose."""
 
     index: int
     T_world_camera: np.ndarray | None = None
@@ -65,10 +59,9 @@ def read_frame_data(files: NumberedFiles) -> list[FrameData]:
 
 
 def times_of(frames: list[FrameData]) -> tuple[dict[int, float], str]:
-    """Return the time of each frame, s, frame 0 at 0, and the unit of the stamps in words.
+    """Return the time of each frame (ascending), s, frame 0 at 0, and the unit of the stamps in words.
 
-    frames : in ascending order of index. Empty where stamps are missing, do not ascend, or step by a whole power of
-    ten: those merely count frames.
+    Empty where stamps are missing, do not ascend, or step by a whole power of ten: those merely count frames.
     """
     stamps = [frame.stamp for frame in frames]
     numeric = all(isinstance(stamp, int | float) and abs(stamp) < _LARGEST_STAMP for stamp in stamps)

@@ -1,10 +1,10 @@
 """Gaussian SLAM of the SplaTAM family: `params.npz` of SplaTAM, EndoGSLAM and Endo-2DTAM.
 
-All three save `cam_unnorm_rots` (1, 4, N), quaternions with the scalar first and of any length, and `cam_trans`
-(1, 3, N); together they take a point in the first camera to camera n (transform_to_frame in utils/slam_helpers.py).
-Lengths are in the unit of the depth they were fed. Which frame a column is, the file does not say: on C3VD EndoGSLAM
-and Endo-2DTAM run with `train_or_test="train"`, which holds out frames 7, 15, 23, ... (datasets/gradslam_datasets/
-c3vd.py), so that column 7 is frame 8. Their settings are in `config.py` beside the file, which is read but never run.
+All save `cam_unnorm_rots` (1, 4, N), quaternions with the scalar first and of any length, and `cam_trans` (1, 3, N);
+together they take a point in the first camera to camera n (transform_to_frame in utils/slam_helpers.py). Lengths are in
+the unit of the depth they were fed. On C3VD EndoGSLAM and Endo-2DTAM run with `train_or_test="train"`, which holds out
+frames 7, 15, 23, ... (datasets/gradslam_datasets/c3vd.py), so that column 7 is frame 8. Their settings are in
+`config.py` beside the file, which is read but never run.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 """Text files of poses that OneSLAM, Open3D and Endo-Depth-and-Motion write, and those of 7-Scenes.
 
-OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes alone to `poses_pred.txt`, as TUM rows
-camera-to-world under the line `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in the same form.
-
-A `.log` has a line of three integers per pose, then four lines of its 4x4 matrix. The form is Redwood's
-(redwood-data.org/indoor/fileformat.html); Open3D (io/file_format/FileLOG.cpp) writes `i i i+1` and the camera-to-world
-matrix. Endo-Depth-and-Motion (UZ-SLAMLab) writes `trajectory.log` with Open3D, but puts its world-to-camera matrices,
-in metres, there. The two look alike, so a `.log` is read only when its kind is named.
-
-7-Scenes (Shotton et al., CVPR 2013) has a file of 4 lines per frame, camera-to-world, metres.
+OneSLAM (github.com/arcadelab/OneSLAM, slam.py) writes its keyframes to `poses_pred.txt`, as TUM rows camera-to-world
+under `# frame_index tx ty tz qx qy qz qw`; its data sets hold `poses_gt.txt` in that form. A `.log` has a line of three
+integers per pose, then its 4x4 matrix (redwood-data.org/indoor/fileformat.html): Open3D writes camera-to-world,
+Endo-Depth-and-Motion (UZ-SLAMLab) world-to-camera in metres, so that its kind must be named. 7-Scenes (Shotton et al.,
+CVPR 2013) has a file of 4 lines per frame, camera-to-world, metres.
 """
 
 from __future__ import annotations

@@ -1,13 +1,16 @@
-"""Open3D's odometries from frame to frame: two on colour and depth, two on point clouds. MIT, extra `baselines`.
+"""The baselines' trackers: Open3D's odometries (MIT, extra `baselines`), Endo-Depth-and-Motion, standing still.
 
-steinbruecker: photometric term (Steinbruecker, Sturm and Cremers, "Real-time visual odometry from dense RGB-D images",
-ICCV Workshops 2011). park: photometric and geometric term (Park, Zhou and Koltun, "Colored point cloud registration
-revisited", ICCV 2017). point-to-point ICP (Besl and McKay, 1992), point-to-plane ICP (Chen and Medioni, 1992).
+Open3D, from frame to frame. steinbruecker: photometric term (Steinbruecker, Sturm and Cremers, ICCV Workshops 2011).
+park: photometric and geometric term (Park, Zhou and Koltun, ICCV 2017). point-to-point ICP (Besl and McKay, 1992),
+point-to-plane (Chen and Medioni, 1992). Its defaults are made for rooms in metres, so one of its units is 100 mm here.
+A frame is lost where no pixels correspond or the linear system is singular.
 
-Open3D's defaults are kept. They are made for rooms in metres, so one Open3D unit is 100 mm here: the depths of two
-corresponding pixels may differ by 0.03 units = 3 mm. Each frame is aligned to the last tracked one, starting from the
-identity. Open3D reports success and the identity where no pixels correspond or its linear system is singular; here the
-frame is lost then, with the reason.
+Endo-Depth-and-Motion (Recasens, Lamarca, Facil, Montiel and Civera, RA-L 2021, arXiv 2103.16525), re-derived: our
+tracker with the parts taken off that it does not have, by METHOD of arXiv 2508.11282, which grew out of it:
+Gauss-Newton on the residual lifted with the keyframe's depth, rotation before the whole motion, a keyframe every 2
+frames, two scales, a robust error. No code of that project was used. Ours to choose: Huber's threshold (1.345 robust
+standard deviations), no motion as the start, 30 steps per scale, half the working size for the rotation. A frame is
+lost only where the image or its overlap with the keyframe is nearly empty, or the result is not finite.
 """
 
 from __future__ import annotations
@@ -18,28 +21,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scopemap.config.tracking import TrackingConstants, TrackingSettings
 from scopemap.errors import SettingsError
 from scopemap.frame import Frame
 from scopemap.tracking.track import FrameTracker, Track
+from scopemap.tracking.tracker import Tracker
 
 UNIT_MM = 100.0
 """Length of one Open3D unit, mm."""
 
-_DEPTH_MAX_UNITS = 5.0
-_VOXEL_MM = 1.0
-_ICP_MAX_DISTANCE_MM = 3.0
+_DEPTH_MAX_UNITS, _VOXEL_MM, _ICP_MAX_DISTANCE_MM = 5.0, 1.0, 3.0
 _MIN_KNOWN_SHARE = 0.1  # of the image with known depth, the default of our own tracker
 _SINGULAR = "Open3D's linear system is singular: it took no step"
 
-RGBD_METHODS = {
-    "steinbruecker": "RGBDOdometryJacobianFromColorTerm",
-    "park": "RGBDOdometryJacobianFromHybridTerm",
-}
+RGBD_METHODS = {"steinbruecker": "RGBDOdometryJacobianFromColorTerm", "park": "RGBDOdometryJacobianFromHybridTerm"}
 ICP_METHODS = {
     "point-to-point": "TransformationEstimationPointToPoint",
     "point-to-plane": "TransformationEstimationPointToPlane",
 }
 """Open3D's classes by the name of the method."""
+
+_CONSTANTS: dict[str, Any] = {
+    **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "search_every": 1, "new_map_after": 0},
+    **{"corner_depth_sigma": 0.0, "min_keyframe_agreement": 0.0, "levels": 2, "finest_level": 0, "max_iterations": 30},
+    **{"huber": 1.345, "depth_weight": 0.0, "min_inlier_share": 0.0, "min_correlation": -1.0},
+    **{"max_step": 1e9, "solver": "gauss-newton", "rotation_first": True, "start": "identity"},  # no step is that long
+    **{"channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
+}
+SETTINGS = TrackingSettings(keyframe_every=2, constants=TrackingConstants(**_CONSTANTS))
+"""Settings of our tracker for this method; all others have no effect or only detect empty images."""
+_MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
 
 
 class _NoMotion(Exception):
@@ -54,12 +65,9 @@ class _Prepared(NamedTuple):
 
 
 class Open3dTracker(FrameTracker):
-    """A `FrameTracker` that aligns each frame to the last tracked one by an odometry of Open3D.
+    """Aligns each frame to the last tracked one by `method`; two runs agree to rounding, as threads sum in any order.
 
-    Masked pixels and pixels of unknown depth are not used. Two runs agree to rounding, not to the last bit: Open3D's
-    threads sum in any order.
-
-    method : a key of `RGBD_METHODS` or `ICP_METHODS`. Raises `SettingsError` where Open3D cannot be imported.
+    Raises `SettingsError` where Open3D cannot be imported.
     """
 
     def __init__(self, method: str) -> None:
@@ -91,10 +99,7 @@ class Open3dTracker(FrameTracker):
         return True
 
     def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Make a tracked frame the reference; False where too little of its depth is known.
-
-        `measured` makes no difference. Raises `ValueError` for a frame without pose.
-        """
+        """Make a tracked frame the reference; False where too little depth is known, `ValueError` without a pose."""
         if frame.T_world_camera is None:
             raise ValueError("a reference needs a pose")
         if (_known_depth_mm(frame) > 0).mean() < _MIN_KNOWN_SHARE:
@@ -135,10 +140,8 @@ class Open3dTracker(FrameTracker):
 
     def _rgbd_motion(self, current: _Prepared, reference: _Prepared) -> np.ndarray:
         odometry = self._open3d.pipelines.odometry
-        term, option = (
-            getattr(odometry, RGBD_METHODS[self._method])(),
-            odometry.OdometryOption(depth_max=_DEPTH_MAX_UNITS),
-        )
+        term = getattr(odometry, RGBD_METHODS[self._method])()
+        option = odometry.OdometryOption(depth_max=_DEPTH_MAX_UNITS)
         success, T, information = odometry.compute_rgbd_odometry(
             current.data, reference.data, self._intrinsics(current.frame), np.eye(4), term, option
         )
@@ -192,3 +195,34 @@ def _last_line(message: str) -> str:
     """Return the last line of a message, without terminal colours."""
     lines = re.sub(r"\x1b\[[0-9;]*m", "", message).strip().splitlines()
     return lines[-1].strip() if lines else "no reason given"
+
+
+def create_endo_depth_and_motion() -> FrameTracker:
+    """Return a tracker after Endo-Depth-and-Motion's paper; the benchmark gives it plain depth."""
+    return Tracker(SETTINGS)
+
+
+class StandingStill(FrameTracker):
+    """Returns the first pose for every frame; frames with too few usable pixels are lost, as for the other methods."""
+
+    def __init__(self) -> None:
+        self._first: int | None = None
+
+    def track(self, frame: Frame) -> Track:
+        """Return the identity; "lost" where less than a tenth of the image is usable."""
+        share = float(frame.valid.mean())
+        reference = frame.index if self._first is None else self._first
+        if share < _MIN_USABLE_SHARE:
+            return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", np.eye(4), reference)
+        if self._first is None:
+            self._first = frame.index
+            return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
+        return Track(frame.index, "ok", "", np.eye(4), reference)
+
+    def needs_keyframe(self) -> bool:
+        """Return False: it uses no keyframes."""
+        return False
+
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+        """Return False: it uses no keyframes."""
+        return False
