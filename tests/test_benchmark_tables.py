@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -225,9 +223,3 @@ def test_files_hold_what_the_tables_say(tmp_path: Path) -> None:
     bytes_before = [file.read_bytes() for file in files]
     write_tables(RESULTS, tmp_path, title="Colon_", notes=["hamlyn: *not* there"])
     assert [file.read_bytes() for file in files] == bytes_before
-
-
-def test_without_pandas_the_error_names_the_extra() -> None:
-    code = "import sys; sys.modules['pandas'] = None; import scopemap_bench.tables"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.splitlines()[-1].endswith("tables of runs need pandas: pip install -e bench")

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import trimesh
 
 from scopemap.actions.inputs import open_truth
@@ -37,7 +38,7 @@ from scopemap_bench.plan import ProtocolPlan, folder_name
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction, draw_registered_clouds
 from scopemap_bench.scoring import default_protocol, pose_groups, score
-from scopemap_bench.table import joined, pd, summarise
+from scopemap_bench.table import joined, summarise
 from scopemap_bench.tables import write_tables
 
 _MAX_DEPTHS = 6

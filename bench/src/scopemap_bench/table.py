@@ -13,13 +13,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from scopemap.errors import SettingsError
-from scopemap_bench.result import RunResult
+import pandas as pd
 
-try:
-    import pandas as pd
-except ImportError:  # the only door to pandas: `bench` and `compare` stop here, before they run anything
-    raise SettingsError("tables of runs need pandas: pip install -e bench") from None
+from scopemap_bench.result import RunResult
 
 Better = Literal["lower", "higher", "one", ""]
 """Which value of a column is the best: the lowest, the highest, the nearest to 1; empty: none is."""

@@ -15,9 +15,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+import pandas as pd
+
 from scopemap.errors import InputError
 from scopemap_bench.result import RunResult
-from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, joined, of_frames, pd, summarise
+from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, joined, of_frames, summarise
 
 PublishedTable = Literal["table1_pose_scared", "table2_methods_scared", "table3_ablation_scared"]
 

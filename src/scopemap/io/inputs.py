@@ -99,7 +99,7 @@ def _system(address: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        return fsspec.url_to_fs(address)  # type: ignore[no-any-return]
+        return fsspec.url_to_fs(address)
     except ImportError as error:
         raise InputError(f"reading {address} needs a package ({error}): pip install -e '.[cluster]'") from None
     except ValueError as error:  # an unknown protocol

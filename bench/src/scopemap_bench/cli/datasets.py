@@ -17,7 +17,7 @@ from scopemap.cli.progress import count_progress
 from scopemap.errors import InputError, ScopemapError
 
 if TYPE_CHECKING:
-    from scopemap_bench.datasets.checking import Finding
+    from scopemap.inspection.clip import Finding
 
 app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
 

@@ -16,7 +16,7 @@ import numpy as np
 from scopemap.errors import CalibrationError, ScopemapError
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.inspection.clip import Finding, Severity
-from scopemap.io.images import frame_number
+from scopemap.io.decoding import frame_number
 from scopemap_bench.datasets.survey import (
     OTHERS,
     RIGID_TOLERANCE,

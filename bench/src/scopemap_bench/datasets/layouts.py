@@ -15,7 +15,8 @@ import numpy as np
 from scopemap.cameras.formats.reading import stated_calibration
 from scopemap.errors import InputError
 from scopemap.frame import TruthQuality
-from scopemap.io.images import ImageFolder, by_number, image_files, numbered_images
+from scopemap.io.decoding import by_number
+from scopemap.io.images import ImageFolder, image_files, numbered_images
 from scopemap.trajectory.formats.poses import poses_by_row
 from scopemap.trajectory.formats.text import fields_of, text_lines
 

@@ -20,8 +20,8 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.parsing import calibration_bytes
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.decoding import read_decoded
-from scopemap.io.images import by_number, image_files
+from scopemap.io.decoding import by_number, read_decoded
+from scopemap.io.images import image_files
 from scopemap.trajectory.formats.poses import are_frame_numbers
 from scopemap.trajectory.formats.text import tum_poses
 from scopemap_bench.datasets.layouts import LayoutFolder, Place

@@ -22,8 +22,8 @@ import numpy as np
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import CalibrationError, InputError, reporting
 from scopemap.frame import TruthQuality
-from scopemap.io.decoding import decoded
-from scopemap.io.images import ImageFolder, decoded_image, frame_number, image_files, use_first_calibration
+from scopemap.io.decoding import decoded, frame_number
+from scopemap.io.images import ImageFolder, decoded_image, image_files, use_first_calibration
 from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
 from scopemap.io.video import VideoFile
 from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from struct import Struct
-from typing import IO
+from typing import IO, Any
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.calibration import LARGEST_SIDE_PX, check_plausible
@@ -255,7 +255,7 @@ def _check_end(stream: IO[bytes]) -> None:
         raise ValueError("bytes are left after the last entry; it is damaged")
 
 
-def _taken(stream: IO[bytes], form: Struct) -> tuple:
+def _taken(stream: IO[bytes], form: Struct) -> tuple[Any, ...]:
     """Return the next values, of the types in `form`."""
     return form.unpack(_bytes(stream, form.size))
 

@@ -102,7 +102,7 @@ class Dicom(Source):
 
     def media(self) -> str | None:
         """Return the video's stream; None where there is none."""
-        return self._video and self._video.media()
+        return None if self._video is None else self._video.media()
 
     def _selected(self, selection: slice) -> Iterator[tuple[int, np.ndarray | None]]:
         if len(self._headers) == 1:
