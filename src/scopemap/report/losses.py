@@ -49,10 +49,8 @@ def losses(frames: FrameTable) -> list[LostSegment]:
             begin_s, end_s = (float(frames["time_s"][row]) for row in (rows[0], rows[-1]))
             counts = Counter(map(LossCause, frames["cause"][rows].tolist()))
             # What began the loss counts, not that the camera is not found again later.
-            began = (
-                Counter({cause: n for cause, n in counts.items() if cause is not LossCause.NOT_FOUND_AGAIN}) or counts
-            )
-            cause = max(began, key=began.__getitem__)
+            began = [cause for cause in counts if cause is not LossCause.NOT_FOUND_AGAIN]
+            cause = max(began or counts, key=lambda cause: counts[cause])
             found.append(LostSegment(rows[0], rows[-1], begin_s, end_s, len(rows), cause))
     return found
 
