@@ -81,4 +81,4 @@ def test_flow_is_searched_from_the_guessed_motion() -> None:
 @pytest.mark.parametrize(("sharpness", "matches", "obscured"), [(0.5, 39, True), (0.5, 40, False), (0.2, 400, True)])
 def test_features_that_match_tell_a_bare_wall_from_smoke(sharpness: float, matches: int, obscured: bool) -> None:
     alignment = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 1.0, 0.5, 0.3, 1.0, 0.9, 5, matches=matches)
-    assert is_obscured(sharpness, alignment, SETTINGS.min_sharpness) == obscured
+    assert is_obscured(sharpness, alignment, SETTINGS.constants.min_sharpness) == obscured

@@ -126,8 +126,8 @@ def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
     # White letters are over-exposed, their edges are not.
     assert plain[letters].mean() > 0.1
     assert plain[~letters].mean() > 0.99
-    assert Config.load("default").mask.overlays
-    assert not Config.load("paper").mask.overlays
+    assert Config.load("default").mask.constants.overlays
+    assert not Config.load("paper").mask.constants.overlays
 
 
 @pytest.mark.real
