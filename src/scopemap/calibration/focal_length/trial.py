@@ -2,7 +2,7 @@
 
 The radius of a ray at the angle t from the axis is f tan t, f t or f sin t. Depth is scopenet's, without rays. The cost
 of a lens is that of its reprojection errors, px, by Cauchy's kernel, `_CORRELATED` of which count as one
-(scopemap_bench/scripts/focal_length.py). The costs give a probability over kinds and focal lengths.
+(chosen on phantoms and real clips with known lenses). The costs give a probability over kinds and focal lengths.
 """
 
 from __future__ import annotations
