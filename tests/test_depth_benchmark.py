@@ -108,7 +108,7 @@ SCENES = ("cecum clouds", "trans_t1_a", "endonerf pulling")
 @pytest.mark.parametrize(
     ("name", "stated"),
     [
-        ("shading x ray z", [(0.095, 0.97), (0.116, 0.84), (0.128, 0.84)]),
+        ("shading", [(0.095, 0.97), (0.116, 0.84), (0.128, 0.84)]),
         ("scopenet", [(0.101, 0.98), (0.107, 0.87), (0.104, 0.86)]),
     ],
 )

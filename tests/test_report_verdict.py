@@ -182,3 +182,7 @@ def test_the_documents_list_every_code() -> None:
     table = (DOCUMENT.parent / "formats.md").read_text(encoding="utf-8").split("### Notices")[1].split("\n## ")[0]
     listed = dict(re.findall(r"^\| `([a-z-]+)` \| (\w+) \|", table, flags=re.MULTILINE))
     assert listed == {code: kind.level for code, kind in KINDS.items()}
+
+
+def test_no_doubtful_notice_is_left_out_of_the_verdict() -> None:
+    assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and kind.plain == ""] == []

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from importlib import resources
 
 import numpy as np
 from scipy.special import stdtrit
@@ -231,74 +233,23 @@ def _free_surgs(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float
     return figures
 
 
-_ALL = (
-    Protocol(
-        "evo",
-        "evo_ape and evo_rpe with no, SE3 (-a) and Sim3 (-as) alignment on all matched frames, mm and deg, RPE over "
-        "1 frame.",
-        "MichaelGrupp/evo: evo/core/metrics.py",
-        _of_poses(_evo),
-    ),
-    Protocol(
-        "af",
-        "Snippets of 5 frames from every frame on (shorter at the end), relative motions multiplied without "
-        "inverting them, each snippet scaled by least squares, root of the summed squares divided by the number of "
-        "positions (not by its root) in mm, rotation as the mean angle with the first identity in rad, mean and "
-        "deviation over snippets.",
-        "ShuweiShao/AF-SfMLearner: evaluate_pose.py; BeileiCui/EndoDAC: evaluate_pose.py",
-        _of_poses(_af),
-    ),
-    Protocol(
-        "endogslam",
-        "Horn's SE3 alignment (no scale) of the translation columns of world-to-camera matrices, world = first "
-        "camera (as stored: whatever worlds the files have), mean of the residual norms in mm, not RMSE.",
-        "Loping151/EndoGSLAM: utils/eval_helpers.py",
-        _of_poses(_endogslam),
-    ),
-    Protocol(
-        "surgcut3r",
-        "First position aligned without any rotation (first_camera: both worlds moved to the first camera before), "
-        "least-squares scale, RMSE in mm: global over the path, local over successive windows of 16 frames, each "
-        "aligned on its own, the rest dropped.",
-        "chumo-xu/SurgCUT3R: unified_evaluation_framework/core/pose_evaluator.py",
-        _of_poses(_surgcut3r),
-    ),
-    Protocol(
-        "free-surgs",
-        "Sim3 alignment of world-to-camera matrices taken as poses, world = first camera (c2w: of camera-to-world "
-        "poses), ATE RMSE in mm, mean RPE over 1 frame in mm and deg.",
-        "wrld/Free-SurGS: train.py, utils/geometry_utils.py",
-        _of_poses(_free_surgs),
-    ),
-    Protocol(
-        "simcol",
-        "First cameras put onto each other, one least-squares scale between the translations from frame to frame, "
-        "median position error, median relative error over 1 frame in mm and deg.",
-        "anitarau/simcol: evaluation/eval_synthetic_pose.py",
-        _of_poses(_simcol),
-    ),
-    Protocol(
-        "robust-pose-estimator",
-        "Horn's SE3 alignment without scale on all matched frames, RMSE of the position in mm, mean of the relative "
-        "error over 1 frame in mm and rad.",
-        "aimi-lab/robust-pose-estimator: alley_oop/metrics/trajectory_metrics.py",
-        _of_poses(_robust_pose_estimator),
-    ),
-    Protocol(
-        "oneslam",
-        "evo after Sim3 alignment on all matched frames, RMSE in mm and deg, RPE over all pairs 1 mm apart (within "
-        "10 %) along the aligned estimate, not along the reference.",
-        "MUZAMMILATEO/OneSLAM: README.md",
-        _of_poses(_oneslam),
-    ),
-    Protocol(
-        "climb",
-        "Every submap aligned by its own Sim3, frames of an earlier submap left out, submaps with fewer than "
-        f"{LEAST_FRAMES} frames of the reference dropped, mean ATE in mm, mean RPE over 1, 10, 20 and 40 frames in "
-        "mm and deg, submaps weighted by their frames, TFR as the share of the reference's frames in percent.",
-        "EndoCartoScope/climb-challenge: evaluation/evaluation_utils.py, 79d7435",
-        climb_figures,
-    ),
-)
-PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
-"""The protocols by name."""
+def _described(measures: dict[str, Callable[[Trajectory, Trajectory], dict[str, float]]]) -> Iterator[Protocol]:
+    words = tomllib.loads((resources.files("scopemap_bench") / "protocols.toml").read_text(encoding="utf-8"))
+    for name, measure in measures.items():
+        description = words[name]["description"].format(least_frames=LEAST_FRAMES)
+        yield Protocol(name, description, words[name]["source"], measure)
+
+
+_OF_POSES = {
+    "evo": _evo,
+    "af": _af,
+    "endogslam": _endogslam,
+    "surgcut3r": _surgcut3r,
+    "free-surgs": _free_surgs,
+    "simcol": _simcol,
+    "robust-pose-estimator": _robust_pose_estimator,
+    "oneslam": _oneslam,
+}
+_MEASURES = {name: _of_poses(measure) for name, measure in _OF_POSES.items()} | {"climb": climb_figures}
+PROTOCOLS = {protocol.name: protocol for protocol in _described(_MEASURES)}
+"""The protocols by name; `protocols.toml` describes them."""

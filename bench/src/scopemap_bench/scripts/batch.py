@@ -51,7 +51,9 @@ def write_videos(folder: Path, count: int) -> None:
 def content(out: Path) -> dict[str, bytes]:
     """Return the files of a result by name, but those that state times."""
     files = {file.relative_to(out).as_posix(): file for file in out.rglob("*") if file.is_file()}
-    return {name: file.read_bytes() for name, file in files.items() if name not in OF_ITS_TIME}
+    # A run that was killed when its result was in place leaves `.unfinished`.
+    wanted = (name for name in files if name not in OF_ITS_TIME and not name.startswith(".unfinished"))
+    return {name: files[name].read_bytes() for name in wanted}
 
 
 def times(out: Path) -> dict[Path, int]:

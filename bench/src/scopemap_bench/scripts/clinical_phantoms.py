@@ -1,6 +1,6 @@
 """What clinical video does to a run, on phantoms with exact truth; and what a run makes of an unknown lens.
 
-    python -m scopemap_bench.scripts.clinical_phantoms [--only NAME ...] [--seeds N] [--preset NAME] [--out FOLDER]
+    python -m scopemap_bench.scripts.clinical_phantoms [--out FOLDER]
 
 First table: phantoms of 120 frames with one difficulty each; ATE is that of the largest submap after a Sim(3)
 alignment. Second table: lenses of known kind and field of view, given as plain pictures, every fourth of 120 frames.
@@ -9,7 +9,6 @@ alignment. Second table: lenses of known kind and field of view, given as plain 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -25,7 +24,7 @@ from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.scripts import measuring
 
-FRAMES = 120
+FRAMES, SEED = 120, 21
 EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
 CAMERA = ("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15", *EXPOSURE)
 PHANTOMS = {
@@ -54,20 +53,19 @@ LENSES = (
 )
 
 
-def print_phantoms(names: Iterable[str], seeds: Iterable[int], preset: str, folder: Path) -> None:
+def print_phantoms(folder: Path) -> None:
     """Render, run, measure and print the first table."""
-    heads = ("phantom, seed", "frames tracked", "frames in the largest submap", "submaps")
+    heads = ("phantom", "frames tracked", "frames in the largest submap", "submaps")
     measuring.print_head(*heads, "ATE RMSE mm", "rotation mean / max deg", "mesh to truth mm")
-    for name in names:
-        for seed in seeds:
-            stem = f"{name.split(':')[0].split(',')[0].replace(' ', '-')}-{seed}"
-            source = measuring.phantom(folder / stem, *PHANTOMS[name], "--frames", FRAMES, "--seed", seed)
-            run = measuring.run_once(source, folder / f"{stem}-{preset}", "--preset", preset)
-            facts, figures = measuring.provenance(run), measuring.evaluated(run, "--truth", source, "--align", "sim3")
-            tracked = facts["tracked"] + facts.get("in_other_maps", 0)
-            cells = [f"{name}, {seed}", f"{tracked} of {FRAMES}", facts["tracked"], measuring.submaps(run)]
-            cells += [measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures)]
-            measuring.print_row(*cells, measuring.cell(figures, ".2f", "mesh_accuracy_mm"))
+    for name, words in PHANTOMS.items():
+        stem = name.split(":")[0].split(",")[0].replace(" ", "-")
+        source = measuring.phantom(folder / stem, *words, "--frames", FRAMES, "--seed", SEED)
+        run = measuring.run_once(source, folder / f"{stem}-run")
+        facts, figures = measuring.provenance(run), measuring.evaluated(run, "--truth", source, "--align", "sim3")
+        tracked = facts["tracked"] + facts.get("in_other_maps", 0)
+        cells = [name, f"{tracked} of {FRAMES}", facts["tracked"], measuring.submaps(run)]
+        cells += [measuring.cell(figures, ".3f", "ate_rmse_mm"), measuring.rotation(figures)]
+        measuring.print_row(*cells, measuring.cell(figures, ".2f", "mesh_accuracy_mm"))
 
 
 def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:
@@ -101,18 +99,12 @@ def print_lenses(folder: Path) -> None:
 
 def main() -> None:
     """Print both tables."""
-    parser = measuring.options_of(__doc__, out=True)
-    parser.add_argument("--only", nargs="+", help="beginnings of phantoms' names; without the second table")
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--preset", default="default")
-    options = parser.parse_args()
+    options = measuring.options_of(__doc__, out=True).parse_args()
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
-        names = [name for name in PHANTOMS if name.startswith(tuple(options.only or ("",)))]
-        print_phantoms(names, range(21, 21 + options.seeds), options.preset, folder)
-        if not options.only:
-            print()
-            print_lenses(folder)
+        print_phantoms(folder)
+        print()
+        print_lenses(folder)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -37,16 +36,13 @@ from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.evaluation.depth import evaluate_depth, evaluate_depth_sequence, scale_jitter
 from scopemap_bench.scripts.measuring import options_of, print_head, print_row
 
-Size: TypeAlias = tuple[int, int]
-"""Width and height, px."""
-
-_DARK_LEVEL, _CLIPPED_MM, _INSTRUMENT_MARGIN_PX = 12, 99.9, 9
+Size = tuple[int, int]  # width and height, px
+_DARK_LEVEL, _CLIPPED_MM, _INSTRUMENT_MARGIN_PX, _SATURATED_LEVEL = 12, 99.9, 9, 250
 _ENDONERF_FOCAL_PX, _TRUTH_EVERY = 569.468, 6
 SIZES: tuple[Size, ...] = ((160, 128), (320, 256))
 Predicted = tuple[np.ndarray, np.ndarray | None]
 """Depth and, if known, its standard deviation, (H, W) mm each, NaN = unknown."""
 Estimator = Callable[[Frame], Predicted]
-_SATURATED_LEVEL = 250
 
 
 def c3vd_frames(
@@ -191,12 +187,6 @@ def shading() -> Estimator:
     return lambda frame: (estimator.estimate(frame).values, None)
 
 
-def shading_as_depth() -> Estimator:
-    """Return what shading takes for distance along the ray, as if it were depth."""
-    estimate = shading()
-    return lambda frame: (estimate(frame)[0] * np.linalg.norm(frame.camera.rays, axis=-1), None)
-
-
 def network(model: str) -> Estimator:
     """Return the embedded network, with the package's weights where `model` is empty."""
     estimator = ScopeNetDepth(model)
@@ -210,8 +200,7 @@ def network(model: str) -> Estimator:
 
 WITHOUT_WEIGHTS: dict[str, Callable[[], Estimator]] = {
     "constant depth": constant,
-    "shading as depth": shading_as_depth,
-    "shading x ray z": shading,
+    "shading": shading,
 }
 """By name: makes the estimator anew for each scene, as some remember its first frame."""
 

@@ -1,7 +1,6 @@
 """Time and memory of long runs, and of a live session that is played to at the clip's own speed.
 
-    python -m scopemap_bench.scripts.long_runs [--frames 300 1200] [--size 320x256] [--preset default]
-            [--live CLIP [--minutes 1] [--fps 15] [--camera FILE]]
+    python -m scopemap_bench.scripts.long_runs [--frames 300 1200] [--live CLIP [--minutes 1]]
 
 First table: a phantom's frames there and back, one run of the command line each: memory at each tenth of the time, ATE
 after a Sim(3) alignment. Second table: a clip, there and back, played as `scopemap live` plays it to a session here.
@@ -32,7 +31,7 @@ from scopemap_bench.scripts import measuring
 
 PERIOD = 300  # frames of the phantom
 EVERY_S = 1.0
-PARTS = 5  # of a live session
+PARTS, FPS = 5, 15  # of a live session
 MOST_READ = 250  # frames of the clip
 
 
@@ -48,10 +47,10 @@ def write_input(folder: Path, source: Path, count: int) -> None:
         (folder / camera.name).symlink_to(camera)
 
 
-def print_run(source: Path, out: Path, count: int, preset: str) -> None:
+def print_run(source: Path, out: Path, count: int) -> None:
     """Run a source in a process that is watched, and print its row."""
     started, seen = time.perf_counter(), []
-    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet", "--preset", preset))
+    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet"))
     while True:
         ended, status, used = os.wait4(process.pid, os.WNOHANG)
         if ended:
@@ -69,11 +68,11 @@ def print_run(source: Path, out: Path, count: int, preset: str) -> None:
     measuring.print_row(*cells, f"{ate_mm:.2f}")
 
 
-def write_loop(clip: Path, file: Path, fps: int, count: int) -> None:
-    """Write `count` frames of a clip, there and back, at a rate, as H.264."""
+def write_loop(clip: Path, file: Path, count: int) -> None:
+    """Write `count` frames of a clip, there and back, as H.264."""
     frames = [item.rgb for item in islice(open_sequence(clip).source.frames(slice(None)), MOST_READ)]
     with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "16", "preset": "veryfast"})
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": "16", "preset": "veryfast"})
         stream.height, stream.width = frames[0].shape[0] // 2 * 2, frames[0].shape[1] // 2 * 2
         stream.pix_fmt = "yuv420p"
         for index in measuring.there_and_back(count, len(frames)):
@@ -114,13 +113,13 @@ class LiveTable:
         self._tracked, self._dropped, self._cpu_s = 0, self._source.dropped, time.process_time()
 
 
-def print_live(file: Path, camera: Path | None, seconds: float) -> None:
+def print_live(file: Path, seconds: float) -> None:
     """Play a file to a session; print the table and what became of it."""
     config = Config.load("realtime", settings={"input.focal": "assume"})
     source = LiveSource(str(file))
     table = LiveTable(source, seconds)
     with tempfile.TemporaryDirectory() as folder:
-        sequence = sequence_of(source, camera=camera, settings=config.input)
+        sequence = sequence_of(source, settings=config.input)
         session = LiveSession(source, sequence, config, observers=(table.observe,), snapshots=Path(folder))
         reconstructor = session.run()
         table.end()
@@ -132,33 +131,29 @@ def print_live(file: Path, camera: Path | None, seconds: float) -> None:
 def measure_live(given: argparse.Namespace, folder: Path) -> None:
     """Write the clip's loop and play it."""
     file, seconds = folder / "loop.mp4", 60 * given.minutes
-    writing = Process(target=write_loop, args=(given.live, file, given.fps, round(seconds * given.fps)))
+    writing = Process(target=write_loop, args=(given.live, file, round(seconds * FPS)))
     writing.start()  # its memory is not that of the session
     writing.join()
-    print(f"\n{given.live.name} at {given.fps} frames/s for {given.minutes:g} minutes\n")
-    print_live(file, given.camera, seconds)
+    print(f"\n{given.live.name} at {FPS} frames/s for {given.minutes:g} minutes\n")
+    print_live(file, seconds)
 
 
 def main() -> None:
     """Render, run, print."""
     parser = measuring.options_of(__doc__)
     parser.add_argument("--frames", type=int, nargs="*", default=[300, 1200])
-    parser.add_argument("--size", default="320x256")
-    parser.add_argument("--preset", default="default")
     parser.add_argument("--live", type=Path, metavar="CLIP")
     parser.add_argument("--minutes", type=float, default=1.0)
-    parser.add_argument("--fps", type=int, default=15)
-    parser.add_argument("--camera", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         if given.frames:
-            drawn = measuring.phantom(folder / "phantom", "--frames", PERIOD, "--size", given.size)
+            drawn = measuring.phantom(folder / "phantom", "--frames", PERIOD, "--size", "320x256")
             heads = ("frames", "seconds", "processor time a frame, ms", "peak MB", "MB each tenth")
             measuring.print_head(*heads, "open files at most", "ATE mm")
         for count in sorted(given.frames):
             write_input(folder / f"input-{count}", drawn, count)
-            print_run(folder / f"input-{count}", folder / f"out-{count}", count, given.preset)
+            print_run(folder / f"input-{count}", folder / f"out-{count}", count)
         if given.live:
             measure_live(given, folder)
 

@@ -1,7 +1,6 @@
-"""What `scopemap run` reaches on real clips and phantoms: the overview of BENCHMARK.md and its picture of the speed.
+"""What `scopemap run` reaches on real clips and phantoms: the overview of BENCHMARK.md.
 
-    python -m scopemap_bench.scripts.overview --data FOLDER [--out FOLDER] [--picture FILE] [--only NAME ...]
-            [--presets NAME ...] [--repeat N]
+    python -m scopemap_bench.scripts.overview --data FOLDER [--out FOLDER] [--only NAME ...] [--repeat N]
 
 A row is a run of the command line by a preset (`realtime` on five clips), measured by `scopemap evaluate` after a
 Sim(3) alignment. Frames per second are those of the whole command, the median of `--repeat`.
@@ -27,7 +26,6 @@ PHANTOMS = {
 }
 REALTIME = ("C3VD cecum_t1_a", "colon phantom", "laparoscopy phantom", "colonoscopy video", "laparoscopy video")
 NO_TRUE_DEPTH = ("C3VD cecum_t1_a", "C3VD cecum_t1_a, Depth Anything's disparity")
-STAGES = ("focal length", "read", "preprocess", "match", "track", "back end", "fuse")
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,8 @@ def drawn(clip: Clip) -> Clip:
     return clip
 
 
-def measure(clip: Clip, preset: str, out: Path, repeat: int) -> dict[str, float]:
-    """Run a clip `repeat` times, print its row, and return the seconds per frame of each stage."""
+def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
+    """Run a clip `repeat` times and print its row."""
     run, elapsed_s = clip.run_folder(out, preset), []
     for _ in range(repeat):
         shutil.rmtree(run, ignore_errors=True)
@@ -96,45 +94,22 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> dict[str, float]
         measuring.cell(figures, ".2f", "mesh_accuracy_mm"),
         f"{frames / statistics.median(elapsed_s):.1f}",
     )
-    return {stage: facts["seconds"].get(stage, 0.0) / frames for stage in STAGES}
-
-
-def draw_speed(stages: dict[str, dict[str, float]], file: Path) -> None:
-    """Draw the time per frame of each stage for each clip as a PNG; the first stages overlap with tracking."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 0.5 * len(stages) + 1.4), layout="constrained", dpi=110)
-    axes = figure.add_subplot()
-    names, left = list(stages), [0.0] * len(stages)
-    for stage in STAGES:
-        width = [1e3 * stages[name][stage] for name in names]
-        axes.barh(names, width, left=left, label=stage)
-        left = [a + b for a, b in zip(left, width, strict=True)]
-    axes.invert_yaxis()
-    axes.set_xlabel('ms per frame, one thread; stages up to "track" run side by side')
-    axes.legend(ncols=len(STAGES), loc="lower center", bbox_to_anchor=(0.35, 1.0), frameon=False, fontsize="small")
-    figure.savefig(file)
 
 
 def main() -> None:
-    """Run, measure, print, draw."""
+    """Run, measure, print."""
     parser = measuring.options_of(__doc__, data=True, out=True)
-    parser.add_argument("--picture", type=Path, help="draw the time of each stage into this PNG")
     parser.add_argument("--only", nargs="+", default=["*"], help="names of clips; * is any text")
-    parser.add_argument("--presets", nargs="+", default=["default", "realtime"])
     parser.add_argument("--repeat", type=int, default=1, help="runs of each clip")
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as out:
-        stages = {}
         heads = ("clip", "frames in the result", "submaps", "ATE RMSE mm", "rotation mean / max deg")
         measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", "mesh to truth mm", "frames per s")
-        for preset in options.presets:
-            for name, clip in clips(options.data, out).items():
-                wanted = any(fnmatch(name, pattern) for pattern in options.only)
-                if wanted and (preset != "realtime" or name in REALTIME):
-                    stages[f"{name}, {preset}"] = measure(drawn(clip), preset, out, options.repeat)
-        if options.picture:
-            draw_speed(stages, options.picture)
+        known = clips(options.data, out)
+        wanted = [name for name in known if any(fnmatch(name, pattern) for pattern in options.only)]
+        rows = [(name, "default") for name in wanted] + [(name, "realtime") for name in wanted if name in REALTIME]
+        for name, preset in rows:
+            measure(drawn(known[name]), preset, out, options.repeat)
 
 
 if __name__ == "__main__":

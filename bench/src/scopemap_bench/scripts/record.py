@@ -29,7 +29,7 @@ MEASURED = ("src", "bench/src")
 SCRIPT = "python -m scopemap_bench.scripts"
 PLAN = "env SCOPEMAP_WEIGHTS_DIR=DATA/weights python -m scopemap bench"
 TABLES: dict[str, tuple[str, str]] = {
-    "overview": (f"{SCRIPT}.overview --data DATA --out OUT --picture docs/pictures/speed.png", ""),
+    "overview": (f"{SCRIPT}.overview --data DATA --out OUT", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),
     "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),

@@ -32,8 +32,6 @@ from scopemap_bench.scripts import batch, measuring
 
 PRESETS = ("default", "realtime")
 SMALL = ("--scene", "colon", "--frames", 24, "--size", "160x128")
-# Seconds and their checksums differ from run to run.
-_OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
 _WRITING = ("write_bytes", "write_text", "replace", "mkdir", "open")
 
 
@@ -87,13 +85,6 @@ def break_call(number: int) -> None:
     os.fsync = breaking(os.fsync)
 
 
-def content(out: Path) -> dict[str, bytes]:
-    """Return the files of a result by name, without those of a run that was killed when it was in place."""
-    files = [file for file in out.rglob("*") if file.is_file() and file.name not in _OF_ITS_TIME]
-    named = {str(file.relative_to(out)): file.read_bytes() for file in files}
-    return {name: value for name, value in named.items() if not name.startswith(".unfinished")}
-
-
 def undisturbed(folder: Path) -> Undisturbed:
     """Draw the phantom and run it by each preset."""
     source, wanted, seconds = measuring.phantom(folder / "phantom", *SMALL), {}, {}
@@ -102,7 +93,7 @@ def undisturbed(folder: Path) -> Undisturbed:
         started = time.monotonic()
         if run(source, folder / preset, preset):
             raise SystemExit(f"robustness: the undisturbed run by {preset} failed")
-        seconds[preset], wanted[preset] = time.monotonic() - started, content(folder / preset)
+        seconds[preset], wanted[preset] = time.monotonic() - started, batch.content(folder / preset)
     return Undisturbed(source, wanted, seconds)
 
 
@@ -120,12 +111,12 @@ def kill_until(known: Undisturbed, out: Path, kills: int, seed: int) -> Counter[
             os.kill(process, signal.SIGKILL)
             os.waitpid(process, 0)
             found["kills"] += 1
-            if (out / "provenance.json").is_file() and content(out) != known.wanted[preset]:
+            if (out / "provenance.json").is_file() and batch.content(out) != known.wanted[preset]:
                 found["TAKEN FOR WHOLE, BUT IS NOT"] += 1
         if not (out / "provenance.json").is_file():
             run(known.phantom, out, preset)
         found["runs"] += 1
-        found["equal" if content(out) == known.wanted[preset] else "NOT EQUAL"] += 1
+        found["equal" if batch.content(out) == known.wanted[preset] else "NOT EQUAL"] += 1
     return found
 
 
@@ -137,11 +128,11 @@ def fail_writing(known: Undisturbed, out: Path, failures: int) -> Counter[str]:
         shutil.rmtree(out, ignore_errors=True)
         code = run(known.phantom, out, preset, broken_call=n if n < 20 else 20 + 3 * (n - 20))
         found[{0: "call not reached", 3: "ended with one sentence"}.get(code, f"EXIT CODE {code}")] += 1
-        if (out / "provenance.json").is_file() and content(out) != known.wanted[preset]:
+        if (out / "provenance.json").is_file() and batch.content(out) != known.wanted[preset]:
             found["TAKEN FOR WHOLE, BUT IS NOT"] += 1
         if code:
             run(known.phantom, out, preset)
-        found["equal afterwards" if content(out) == known.wanted[preset] else "NOT EQUAL AFTERWARDS"] += 1
+        found["equal afterwards" if batch.content(out) == known.wanted[preset] else "NOT EQUAL AFTERWARDS"] += 1
     return found
 
 

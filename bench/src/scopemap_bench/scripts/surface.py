@@ -34,7 +34,7 @@ CLIPS = (
     *("colon phantom", "laparoscopy phantom", "colon phantom, breathing"),
 )
 AT_REST, AT_A_SECOND = "camera at rest", "surface at a second"
-POKED = ("--scene", "laparoscopy", "--frames", 90, "--events", "poke:35-55")
+POKED = ("--scene", "laparoscopy", "--frames", 90, "--events", "poke:35-55", "--seed", 32)
 SECONDS = {0: 0.0, 89: 89 / 30}
 MOVED_MM, GROWN_PX = 2.0, 9
 
@@ -102,13 +102,14 @@ def agreement_there(source: Path, run: Path, index: int) -> str:
     return f"{found.depth_error:.1%}, {found.ssim:.2f}"
 
 
-def print_at_a_second(seed: int, out: Path) -> None:
-    """Run a poked phantom as a whole and at its first and last second; print the rows of the third table."""
-    source = measuring.phantom(out / "phantoms" / f"poke-{seed}", *POKED, "--seed", seed)
-    whole = measuring.run_once(source, out / f"poke-{seed}-whole")
+def print_at_a_second(out: Path) -> None:
+    """Run a poked phantom as a whole and at its first and last second; print the third table."""
+    source = measuring.phantom(out / "phantoms" / "poke", *POKED)
+    whole = measuring.run_once(source, out / "poke-whole")
+    measuring.print_head("second", "all frames: depth, SSIM", "`--surface-at`: depth, SSIM")
     for index, second in SECONDS.items():
-        at = measuring.run_once(source, out / f"poke-{seed}-{index}", "--surface-at", second)
-        measuring.print_row(seed, f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
+        at = measuring.run_once(source, out / f"poke-{index}", "--surface-at", second)
+        measuring.print_row(f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
 
 
 def measure(options: argparse.Namespace, out: Path) -> None:
@@ -130,16 +131,13 @@ def measure(options: argparse.Namespace, out: Path) -> None:
         measuring.print_row(len(errors_mm), f"{scale:.3f}", f"{np.median(errors_mm):.2f}", spread)
     if AT_A_SECOND in wanted:
         print()
-        measuring.print_head("seed", "second", "all frames: depth, SSIM", "`--surface-at`: depth, SSIM")
-        for seed in options.seeds:
-            print_at_a_second(seed, out)
+        print_at_a_second(out)
 
 
 def main() -> None:
     """Run, measure, print."""
     parser = measuring.options_of(__doc__, data=True, out=True)
     parser.add_argument("--only", nargs="+", help=f"names of clips, '{AT_REST}', '{AT_A_SECOND}'")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[32], help="of the third table")
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as out:
         measure(options, out)
