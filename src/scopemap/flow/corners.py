@@ -30,6 +30,7 @@ _CONTRAST, _LEAST_CONTRAST = 50.0, 0.02  # grey levels of one local standard dev
 _LOW_RESOLUTION = 4  # at which the surround is computed: what it leaves out is as smooth
 _LEAST_EIGENVALUE = 1e-4
 _MAX_STEP_PX = 1.5  # from where flow has it
+_WARP_SMOOTHING_PX = 10.0  # of the flow by which patches are warped
 _PATCH_CONSISTENCY_PX = 0.5  # largest forward-backward error
 
 
@@ -220,20 +221,25 @@ def normalised_brightness(rgb: np.ndarray) -> np.ndarray:
 
 
 def refined_corners(
-    image_from: np.ndarray, image_to: np.ndarray, corners: np.ndarray, pixels: np.ndarray
+    image_from: np.ndarray, image_to: np.ndarray, corners: np.ndarray, pixels: np.ndarray, flow: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which corners (m,) int have a similar patch in the other image, and their pixels (m, 2) float64 there.
 
     image_from, image_to : (H, W) uint8, `normalised_brightness`. corners : (n, 2) x, y in the first. pixels : (n, 2)
-    in the second, as matched by flow.
+    in the second, as matched by flow (H, W, 2), px, from the first.
     """
     if not len(corners):
         return np.zeros(0, int), np.zeros((0, 2))
-    there, found = _aligned(image_from, image_to, corners, pixels, _THOROUGH)
-    back, found_back = _aligned(image_to, image_from, there, corners, _THOROUGH)
-    good = found & found_back & (np.linalg.norm(there - pixels, axis=1) <= _MAX_STEP_PX)
+    # What comes nearer grows: a patch that is only shifted lags behind. The other image is warped by the smooth flow.
+    x, y = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in image_from.shape[::-1]))
+    seen = cv2.GaussianBlur(flow, (0, 0), _WARP_SMOOTHING_PX) + np.stack([x, y], -1)
+    warped = cv2.remap(image_to, seen, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    start = corners + pixels - seen[corners[:, 1], corners[:, 0]]
+    there, found = _aligned(image_from, warped, corners, start, _THOROUGH)
+    back, found_back = _aligned(warped, image_from, there, corners, _THOROUGH)
+    good = found & found_back & (np.linalg.norm(there - start, axis=1) <= _MAX_STEP_PX)
     kept = np.flatnonzero(good & (np.linalg.norm(back - corners, axis=1) <= _PATCH_CONSISTENCY_PX))
-    return kept, there[kept].astype(np.float64)
+    return kept, bilinear(seen, there[kept].astype(np.float64))
 
 
 def _aligned(

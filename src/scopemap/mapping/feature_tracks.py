@@ -162,7 +162,7 @@ class FeatureTracks:
     def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: tuple[np.ndarray, np.ndarray]) -> None:
         """Add the observations of the host's corners in another keyframe; `flows` : to the other one, and back."""
         number, pixel = match_corners(host.corners, flows, other.valid, _CONSISTENCY_PX)
-        kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel)
+        kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel, flows[0])
         self._add_matches(host.first_point + number[kept], other.number, pixel)
 
 
