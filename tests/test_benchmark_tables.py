@@ -17,7 +17,7 @@ from sample_trajectories import as_trajectory, vector_a
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.poses import match, pose_report
 from scopemap_bench.evaluation.consistency import ConsistencyMeter
-from scopemap_bench.evaluation.depth import mean_depth_report, scale_jitter
+from scopemap_bench.evaluation.depth import mean_depth_report, metric_consistency, scale_jitter
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.surface import compare_surfaces, distance_figures
 from scopemap_bench.result import RunResult
@@ -166,7 +166,9 @@ def test_every_column_names_a_figure_that_is_measured() -> None:
     measured: dict[str, Any] = {
         "poses": pose_report(MATCHED),
         "paper": PAPER_FIGURES,
-        "depth": mean_depth_report([]) | {"jitter": scale_jitter(np.ones(3))},
+        "depth": mean_depth_report([])
+        | {"jitter": scale_jitter(np.ones(3))}
+        | {"metric_consistency": metric_consistency(np.ones(3), 1.0)},
         "consistency": ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report() | {"flow": "dis"},
         "surface": surface,
     }

@@ -141,6 +141,9 @@ def test_depth_and_its_consistency_are_measured_on_demand(tmp_path: Path) -> Non
     figures = figures_of(tmp_path / "run", "--truth", truth, "--depth", "median", "--consistency")
     assert figures["depth"]["abs_rel"] < 1e-3
     assert figures["depth"]["scaling"] == "median"
+    consistency = figures["depth"]["metric_consistency"]
+    assert len(consistency["frames"]) == 4
+    assert consistency["median"] == pytest.approx(1, abs=0.02)
     assert figures["consistency"]["frames"] == 4
     assert figures["consistency"]["tae_reference"]["percent"] < 2
     provenance = (tmp_path / "run/provenance.json").read_text()

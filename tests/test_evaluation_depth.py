@@ -17,6 +17,7 @@ from scopemap_bench.evaluation.depth import (
     evaluate_depth_sequence,
     fit_sequence,
     mean_depth_report,
+    metric_consistency,
     scale_jitter,
 )
 
@@ -170,6 +171,14 @@ def test_one_scale_for_the_sequence_shows_the_flicker_that_a_scale_per_image_hid
         assert report.jitter["frames"] == 3
         assert report.jitter["log_step"] == pytest.approx(np.log(1.1))
         assert report.jitter["log_std"] == pytest.approx(np.log(1.1) * np.sqrt(2) / 3)
+
+
+def test_metric_consistency_is_the_truth_over_depth_in_the_scale_of_the_path() -> None:
+    scales = evaluate_depth_sequence(flickering([2.0, 2.2, 1.8]), scaling="median").scales
+    found = metric_consistency(np.append(scales, np.nan), path_scale=2.0)
+    assert found["frames"] == pytest.approx([1.0, 1.1, 0.9])
+    assert (found["least"], found["median"], found["most"]) == pytest.approx((0.9, 1.0, 1.1))
+    assert metric_consistency(np.array([np.nan]), path_scale=2.0) == {}
 
 
 def test_sequence_median_is_the_ratio_of_the_pooled_medians() -> None:

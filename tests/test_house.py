@@ -172,7 +172,8 @@ def _total(modules: list[_Module]) -> int:
 CEILINGS = {
     "core": (lambda: _total(MODULES), 29_850),
     "core, net": (lambda: _net(MODULES), 18_400),
-    "bench": (lambda: _total(BENCH_MODULES), 11_000),
+    # 50 lines for the metric consistency of depth and path, which no figure showed.
+    "bench": (lambda: _total(BENCH_MODULES), 11_050),
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 30_500),
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),

@@ -46,7 +46,7 @@ def score(
         figures |= {"surface": surface} if surface else {}
     depth = DepthReader(folder)
     if depth.present and protocol.depth:
-        figures |= _depth(depth, sequence, protocol)
+        figures |= _depth(depth, sequence, protocol, matched)
     if depth.present and protocol.consistency:
         figures |= _consistency(depth, sequence, estimate, protocol, flows)
     return figures
@@ -119,11 +119,18 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
     return surface.seen_by(sequence.camera, views) if views else surface
 
 
-def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consistency: bool) -> Figures:
+def depth_groups(
+    run: Path,
+    truth: Path,
+    scaling: DepthScaling | None,
+    *,
+    consistency: bool,
+    matched: MatchedTrajectories | None = None,
+) -> Figures:
     """Return "depth" (unless `scaling` is None) and "consistency" of a run's depth against the data set in `truth`.
 
-    Raises `InputError` where the run kept no depth, or has another camera than the data set, which must have true
-    depth.
+    matched : the aligned trajectory, for the metric consistency of depth with it. Raises `InputError` where the run
+    kept no depth, or has another camera than the data set, which must have true depth.
     """
     depth = DepthReader(run)
     if not depth.present:
@@ -134,7 +141,7 @@ def depth_groups(run: Path, truth: Path, scaling: DepthScaling | None, *, consis
     protocol = default_protocol(sequence)
     figures: Figures = {}
     if scaling is not None:
-        figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}))
+        figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}), matched)
         if not figures:
             raise InputError(f"{truth} has no true depth of the frames with depth in {run}")
     if consistency:
@@ -160,7 +167,9 @@ def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
     return pairs
 
 
-def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Figures:
+def _depth(
+    depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan, matched: MatchedTrajectories | None
+) -> Figures:
     report = depth_errors.evaluate_depth_sequence(
         _true_pairs(depth, sequence),
         scaling=protocol.depth_scaling,
@@ -169,7 +178,10 @@ def _depth(depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan) -> Fi
     )
     if not report.frames:
         return {}
-    return {"depth": report.mean | {"jitter": report.jitter}}
+    found = report.mean | {"jitter": report.jitter}
+    if matched is not None:
+        found["metric_consistency"] = depth_errors.metric_consistency(report.scales, matched.similarity.scale)
+    return {"depth": found}
 
 
 def _consistency(

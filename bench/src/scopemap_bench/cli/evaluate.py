@@ -102,7 +102,7 @@ def evaluate(
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
     if depth or consistency:
-        figures |= depth_groups(trajectory, truth, depth, consistency=consistency)
+        figures |= depth_groups(trajectory, truth, depth, consistency=consistency, matched=matched)
     figures |= own
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:

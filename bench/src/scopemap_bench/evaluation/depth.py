@@ -160,13 +160,17 @@ def mean_depth_report(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class DepthSequenceReport:
-    """Depth errors of a sequence: the `fit` of a sequence mode, each frame's report and their mean, unscaled jitter."""
+    """Depth errors of a sequence: the `fit` of a sequence mode, each frame's report and their mean, unscaled jitter.
+
+    scales : (N,) median of true over predicted depth of each frame, unscaled; NaN where nothing can be compared.
+    """
 
     scaling: DepthScaling
     fit: DepthFit
     mean: dict[str, Any]
     frames: tuple[dict[str, Any], ...]
     jitter: dict[str, float]
+    scales: np.ndarray
 
 
 def evaluate_depth_sequence(
@@ -191,7 +195,23 @@ def evaluate_depth_sequence(
     for predicted_mm, truth_mm in pairs():
         frames.append(evaluate_depth(predicted_mm, truth_mm, scaling=each, **options))
         scales.append(depth_scale(predicted_mm, truth_mm, truth_range_mm))
-    return DepthSequenceReport(scaling, fit, mean_depth_report(frames), tuple(frames), scale_jitter(np.array(scales)))
+    each_scale = np.array(scales, dtype=np.float64)
+    return DepthSequenceReport(
+        scaling, fit, mean_depth_report(frames), tuple(frames), scale_jitter(each_scale), each_scale
+    )
+
+
+def metric_consistency(scales: np.ndarray, path_scale: float) -> dict[str, Any]:
+    """Return how depth fits the path: median true over predicted depth per frame (N,), in the scale of the path.
+
+    path_scale : factor by which the Sim(3) alignment of the trajectory takes the run's lengths to true ones. 1 is
+    right; above, depth is too small for the path. median, least, most : over the frames, which `frames` lists.
+    """
+    ratios = scales[np.isfinite(scales)] / path_scale
+    if not len(ratios):
+        return {}
+    least, median, most = np.percentile(ratios, [0, 50, 100]).tolist()
+    return {"median": median, "least": least, "most": most, "frames": ratios.tolist()}
 
 
 def depth_scale(

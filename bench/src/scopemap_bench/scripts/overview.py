@@ -24,22 +24,35 @@ PHANTOMS = {
     "tube phantom, no texture": ("--scene", "tube", "--frames", 120, "--seed", 13),
     "colon phantom, breathing": ("--scene", "colon", "--frames", 120, "--seed", 14, "--deform"),
 }
+CONSISTENCY = "true depth / depth in the path's scale: median / least / most"
 REALTIME = ("C3VD cecum_t1_a", "colon phantom", "laparoscopy phantom", "colonoscopy video", "laparoscopy video")
-NO_TRUE_DEPTH = ("C3VD cecum_t1_a", "C3VD cecum_t1_a, Depth Anything's disparity")
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One row: its name, the input, whether it has a truth, and further arguments of `scopemap run`."""
+    """One row: name, input, whether that has a truth, further arguments of `scopemap run`, folder of true depth."""
 
     name: str
     source: Path
     has_truth: bool = True
     arguments: tuple[str, ...] = ()
+    true_depth: Path | None = None
 
     def run_folder(self, out: Path, preset: str = "default") -> Path:
         """Return the folder of its run by a preset."""
         return out / preset / re.sub(r"\W+", "-", self.name)
+
+    def truth(self, folder: Path) -> Path:
+        """Return the folder with the truth: the input, or links to it and to its true depth in a new folder."""
+        if self.true_depth is None:
+            return self.source
+        folder.mkdir(parents=True, exist_ok=True)
+        links = {file.name: file for file in self.source.iterdir()}
+        links |= {f"{int(file.name[:4])}_depth.png": file for file in self.true_depth.glob("*_depth.png")}
+        for name, file in links.items():
+            if not (folder / name).exists():
+                (folder / name).symlink_to(file.resolve())
+        return folder
 
 
 def clips(data: Path, out: Path) -> dict[str, Clip]:
@@ -50,8 +63,8 @@ def clips(data: Path, out: Path) -> dict[str, Clip]:
     room = ("fusion.voxel_mm=10", "fusion.truncation_mm=40", "fusion.max_depth_mm=4000")
     room_settings = tuple(word for setting in room for word in ("--set", setting))
     found = [
-        Clip("C3VD cecum_t1_a", cecum),
-        Clip("C3VD cecum_t1_a, Depth Anything's disparity", cecum, arguments=disparity),
+        Clip("C3VD cecum_t1_a", cecum, true_depth=c3vd / "cecum_t1_a_true_depth"),
+        Clip("C3VD cecum_t1_a, Depth Anything's disparity", cecum, True, disparity, c3vd / "cecum_t1_a_true_depth"),
         Clip("C3VD trans_t1_a (10 frames), true depth", trans, arguments=("--depth", f"files:{trans}")),
         Clip("7-Scenes kitchen, measured depth", kitchen, arguments=("--depth", f"files:{kitchen}", *room_settings)),
         *(Clip(name, out / "phantoms" / re.sub(r"\W+", "-", name)) for name in PHANTOMS),
@@ -78,9 +91,8 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
         elapsed_s.append(time.perf_counter() - started)
     facts, figures = measuring.provenance(run), {}
     if clip.has_truth:
-        against = ("--truth", clip.source, "--align", "sim3")
-        # A clip without true depth refuses to measure it.
-        figures = measuring.evaluated(run, *against, *(() if clip.name in NO_TRUE_DEPTH else ("--depth", "median")))
+        truth = clip.truth(out / "truth" / run.name)
+        figures = measuring.evaluated(run, "--truth", truth, "--align", "sim3", "--depth", "median")
     frames = facts["frames"]
     rpe = [measuring.cell(figures, ".3f", name) for name in ("rpe_10_mm", "rpe_10_deg")]
     measuring.print_row(
@@ -90,7 +102,8 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
         measuring.cell(figures, ".3f", "ate_rmse_mm"),
         measuring.rotation(figures),
         " / ".join(filter(None, rpe)),
-        measuring.cell(figures.get("depth", {}), ".3f", "abs_rel"),
+        measuring.cell(depth := figures.get("depth", {}), ".3f", "abs_rel"),
+        measuring.cell(depth.get("metric_consistency", {}), ".3f", "median", "least", "most"),
         measuring.cell(figures, ".2f", "mesh_accuracy_mm"),
         f"{frames / statistics.median(elapsed_s):.1f}",
     )
@@ -104,7 +117,7 @@ def main() -> None:
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as out:
         heads = ("clip", "frames in the result", "submaps", "ATE RMSE mm", "rotation mean / max deg")
-        measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", "mesh to truth mm", "frames per s")
+        measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", CONSISTENCY, "mesh to truth mm", "frames per s")
         known = clips(options.data, out)
         wanted = [name for name in known if any(fnmatch(name, pattern) for pattern in options.only)]
         rows = [(name, "default") for name in wanted] + [(name, "realtime") for name in wanted if name in REALTIME]
