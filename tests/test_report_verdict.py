@@ -41,6 +41,16 @@ def surface(**figures: float) -> dict[str, float]:
     return GOOD_SURFACE | figures
 
 
+def moving(frames: int) -> Notice:
+    place = {"most": 3, "share": 0.4, "x": 0.5, "y": 0.5}
+    return Notice("tissue-moves", {"frames": frames, "measured": 60, "threshold": 0.1} | place)
+
+
+def adjusted(keyframes: int, rotation_deg: float) -> Notice:
+    facts = {"keyframes": keyframes, "rotation_deg": rotation_deg, "sigma_px": 0.2, "depth_change": 0.1}
+    return Notice("mapping-adjusted", facts | {"loops": 0, "maps": 1})
+
+
 def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     found = verdict(run_of([0] * 100))
     assert found.word == "good"
@@ -111,6 +121,11 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("camera-at-rest")), "hardly moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
         (notices(Notice("input-interlaced")), "is interlaced"),
+        (notices(Notice("camera-contradicted", {"change": -0.08})), "another focal length (-8%)"),
+        (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
+        (notices(moving(30)), "moves on its own in 30 of 60"),
+        (notices(adjusted(16, 3.1)), "by up to 3 degrees"),
+        (notices(adjusted(100, 6.1)), "by up to 6 degrees"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],
 )
@@ -119,6 +134,11 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
     assert found.word == "doubtful"
     assert found.reasons[0].level == "doubtful"
     assert words in found.reasons[0].text
+
+
+def test_tissue_that_moves_in_few_frames_and_a_usual_adjustment_are_no_doubt() -> None:
+    assert verdict(run_of([0] * 60, **notices(moving(29), adjusted(16, 2.9)))).word == "good"
+    assert verdict(run_of([0] * 60, **notices(adjusted(100, 5.9)))).word == "good"
 
 
 def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:

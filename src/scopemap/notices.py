@@ -50,6 +50,11 @@ KINDS: dict[str, _Kind] = {
         "only a calibration corrects it (--camera)",
         "The lens bends straight lines: shapes are bent, too. A calibration mends it",
     ),
+    "camera-contradicted": _Kind(
+        "doubtful",
+        "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration",
+        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Check the calibration",
+    ),
     "camera-at-rest": _Kind(
         "doubtful",
         "the camera is at rest while the tissue moves: errors of the path say little here",
@@ -101,9 +106,10 @@ KINDS: dict[str, _Kind] = {
         "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
     ),
     "mapping-depth-disagrees": _Kind(
-        "info",
+        "doubtful",
         "mapping: poses are as tracked{merged}; depths of keyframes would disagree by {adjusted:.0%}, as tracked by "
         "{tracked:.0%}",
+        "The path is as tracked: an adjustment of all views would have made distances disagree",
     ),
     "depth-triangulated": _Kind(
         "info",

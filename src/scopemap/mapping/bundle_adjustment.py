@@ -34,6 +34,7 @@ from scopemap.mapping.bundle_problem import (
     Points,
     Reprojection,
     State,
+    UnknownLens,
     jacobians,
     reproject,
 )
@@ -45,6 +46,9 @@ _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
+# Standard deviations of ln f and of the distortion where only the focal length is asked for.
+_ASKED_SIGMA = np.array([0.3, 1e-4])
+_SIGNIFICANT = 3.0
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
@@ -133,6 +137,21 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     if problem.correlated > 1:
         state = _with_points(problem, state)
     return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
+
+
+def log_focal_asked(problem: BundleProblem, found: BundleSolution) -> float:
+    """Return ln of the focal length that the observations ask for, all else adjusted with it, over the one used.
+
+    0 where it is not different by three standard deviations; NaN without observations, and with more keyframes than are
+    adjusted at once.
+    """
+    if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
+        return float("nan")
+    free = replace(problem, start=found.state, lens=UnknownLens(problem.focal_px, _ASKED_SIGMA))
+    state = adjust(free).state
+    deviation = np.sqrt(np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)[-2, -2])
+    change = float(state.lens[0] - problem.tracked.lens[0])
+    return change if abs(change) > _SIGNIFICANT * deviation else 0.0
 
 
 def errors_px(problem: BundleProblem, state: State) -> np.ndarray:

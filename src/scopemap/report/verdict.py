@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from scopemap.io.run_folder import RunFolder
-from scopemap.notices import notices_of
+from scopemap.notices import Notice, notices_of
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.losses import in_words, losses
 from scopemap.report.submap_summaries import doubt_words, submaps_in_time
@@ -26,6 +26,10 @@ GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
 """Mean share of what the frames see that the surface covers."""
 GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
+MOST_MOVING = 0.5
+"""Share of the frames in which tissue moves on its own."""
+TURN_DEG, TURN_PER_KEYFRAME_DEG = 3.0, 0.6
+"""Rotations by which an adjustment may turn keyframes: what tracking drifts by, a random walk over the keyframes."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,8 @@ class Verdict:
 
 def verdict(run: Result) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
-    found = [*_of_end(run), *_of_notices(run), _of_frames(run), *_of_maps(run), *_of_surface(run), *_of_camera(run)]
+    found = [*_of_end(run), *_of_notices(run), *_of_adjustment(run), _of_frames(run), *_of_maps(run)]
+    found += [*_of_surface(run), *_of_camera(run)]
     order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
     reasons = sorted(found, key=lambda reason: order.index(reason.level))
     level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
@@ -173,7 +178,26 @@ def _of_notices(run: Result) -> list[Reason]:
     shown = "as seen at one moment" if "fusion-at-one-moment" in codes else "a mean"
     whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
     more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
-    return [Reason(notice.code, notice.level, notice.plain + more.get(notice.code, "")) for notice in found]
+    return [Reason(notice.code, _level_of(notice), notice.plain + more.get(notice.code, "")) for notice in found]
+
+
+def _level_of(notice: Notice) -> Level:
+    """Return the level of a notice: what moves in most of the frames is no shortcoming of a few."""
+    values = notice.values
+    most_move = notice.code == "tissue-moves" and values["frames"] >= MOST_MOVING * values["measured"]
+    return "doubtful" if most_move else notice.level
+
+
+def _of_adjustment(run: Result) -> list[Reason]:
+    """Return whether the adjustment turned keyframes farther than tracking drifts."""
+    found = (notice.values for notice in notices_of(run.provenance) if notice.code == "mapping-adjusted")
+    turned = [v["rotation_deg"] for v in found if v["rotation_deg"] > _most_turned_deg(v["keyframes"])]
+    text = "The adjustment turned the camera by up to {:.0f} degrees: more than tracking drifts by."
+    return [Reason("adjusted-far", "doubtful", text.format(max(turned)))] if turned else []
+
+
+def _most_turned_deg(keyframes: int) -> float:
+    return float(max(TURN_DEG, TURN_PER_KEYFRAME_DEG * np.sqrt(keyframes)))
 
 
 def _of_end(run: Result) -> list[Reason]:

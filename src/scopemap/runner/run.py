@@ -215,7 +215,8 @@ class _Finishing:
         frames = frames_of_submap(number, submaps, self.frames)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         notices = self.notices + motion_notices(frames, config)
-        notices += [part.notice for part in (seen_at, submap.correction, depths) if part is not None] + fused.notices
+        notices += [] if submap.correction is None else submap.correction.notices
+        notices += [part.notice for part in (seen_at, depths) if part is not None] + fused.notices
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
         notices += [] if masks is None else masks.notices
         medians_mm = known_mm[np.isfinite(known_mm)].tolist() if median_mm is None else [median_mm]
