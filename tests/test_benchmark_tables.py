@@ -125,8 +125,9 @@ def test_published_rows_are_the_files(name: str, file: str) -> None:
     printed = cells(tables(RESULTS, paper_units=True)[name], source="published")
     expected = list(csv.DictReader(text.splitlines()))
     assert len(printed) == len(expected) > 0
-    heads = {"T_avg_mm": "T_avg mm", "R_avg": "R_avg rad", "RPE_mm": "RPE interval not stated mm", "TLR": "TLR"}
-    heads |= {"T_fin_mm": "T_fin mm", "R_max": "R_max rad", "T_below_avg_percent": "T<T_avg %"}
+    heads = {"t_avg_mm": "T_avg mm", "r_avg_rad": "R_avg rad", "rpe_unstated_mm": "RPE interval not stated mm"}
+    heads |= {"t_fin_mm": "T_fin mm", "r_max_rad": "R_max rad", "t_below_avg_percent": "T<T_avg %", "tlr": "TLR"}
+    heads = {f"paper.{name}": head for name, head in heads.items()}
     for row, want in zip(printed, expected, strict=True):
         for column in set(want) & set(heads):
             assert float(row[heads[column]].partition(" ± ")[0]) == pytest.approx(float(want[column]), abs=5e-4)

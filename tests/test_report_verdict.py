@@ -125,6 +125,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(adjusted(16, 3.1)), "by up to 3 degrees"),
+        (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in 3 of 6 keyframes only"),
         (notices(adjusted(100, 6.1)), "by up to 6 degrees"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],
@@ -138,7 +139,8 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
 
 def test_tissue_that_moves_in_few_frames_and_a_usual_adjustment_are_no_doubt() -> None:
     assert verdict(run_of([0] * 60, **notices(moving(29), adjusted(16, 2.9)))).word == "good"
-    assert verdict(run_of([0] * 60, **notices(adjusted(100, 5.9)))).word == "good"
+    confirmed = Notice("depth-triangulated", {"triangulated": 4, "keyframes": 6})
+    assert verdict(run_of([0] * 60, **notices(adjusted(100, 5.9), confirmed))).word == "good"
 
 
 def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:

@@ -27,25 +27,6 @@ _SECTIONS = {"tracking": "poses", "consistency": "consistency", "depth": "depth"
 _OWN_GROUPS = {"paper", *_SECTIONS.values()}
 _FACTS = ("machine", "device", "commit", "versions", "truth")
 _UNITS = {"_mm": "mm", "_deg": "deg", "_rad": "rad", "_percent": "%", "_px": "px", "_s": "s"}
-# The paper's columns and the figures of `paper_figures`. The interval of its RPE is not stated: it is none of ours.
-_PUBLISHED_COLUMNS = {
-    "framework": "method",
-    "variant": "method",
-    "T_avg_mm": "paper.t_avg_mm",
-    "T_avg_std": "paper.t_std_mm",
-    "R_avg": "paper.r_avg_rad",
-    "R_avg_std": "paper.r_std_rad",
-    "RMSE_mm": "paper.rmse_mm",
-    "T_fin_mm": "paper.t_fin_mm",
-    "R_fin": "paper.r_fin_rad",
-    "RPE_mm": "paper.rpe_unstated_mm",
-    "RPE_std": "paper.rpe_unstated_std_mm",
-    "T_max_mm": "paper.t_max_mm",
-    "R_max": "paper.r_max_rad",
-    "T_below_avg_percent": "paper.t_below_avg_percent",
-    "R_below_avg_percent": "paper.r_below_avg_percent",
-    "TLR": "paper.tlr",
-}
 
 
 def benchmark_tables(results: Iterable[RunResult], *, paper_units: bool = False) -> tuple[Table, ...]:
@@ -123,9 +104,12 @@ def _paper_tables(rows: pd.DataFrame, paper_units: bool) -> Iterator[Table]:
 
 
 def published_rows(table: PublishedTable) -> pd.DataFrame:
-    """Return the rows of one of the paper's tables, in its order, with the columns of `summarise`: mm and rad."""
+    """Return the rows of one of the paper's tables, in its order, with the columns of `summarise`: mm and rad.
+
+    The interval of its RPE is not stated: it is none of ours.
+    """
     with (resources.files("scopemap_bench") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
-        rows = pd.read_csv(file).rename(columns=_PUBLISHED_COLUMNS)
+        rows = pd.read_csv(file)
     empty = dict.fromkeys(("depth", "frames tracked", "sequences", "failure"), "")
     return rows.assign(competes=False, alignment="not stated", source="published", **empty)
 

@@ -28,6 +28,8 @@ GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
 MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""
+LEAST_TRIANGULATED = 0.5
+"""Share of the keyframes above which several views agree on depth."""
 TURN_DEG, TURN_PER_KEYFRAME_DEG = 3.0, 0.6
 """Rotations by which an adjustment may turn keyframes: what tracking drifts by, a random walk over the keyframes."""
 
@@ -189,11 +191,21 @@ def _level_of(notice: Notice) -> Level:
 
 
 def _of_adjustment(run: Result) -> list[Reason]:
-    """Return whether the adjustment turned keyframes farther than tracking drifts."""
-    found = (notice.values for notice in notices_of(run.provenance) if notice.code == "mapping-adjusted")
-    turned = [v["rotation_deg"] for v in found if v["rotation_deg"] > _most_turned_deg(v["keyframes"])]
-    text = "The adjustment turned the camera by up to {:.0f} degrees: more than tracking drifts by."
-    return [Reason("adjusted-far", "doubtful", text.format(max(turned)))] if turned else []
+    """Return whether the adjustment turned keyframes farther than tracking drifts, and whether views agree on depth."""
+    found = []
+    for notice in notices_of(run.provenance):
+        values = notice.values
+        if notice.code == "mapping-adjusted" and values["rotation_deg"] > _most_turned_deg(values["keyframes"]):
+            text = (
+                f"The adjustment turned the camera by up to {values['rotation_deg']:.0f} degrees: more than tracking "
+            )
+            found.append(Reason("adjusted-far", "doubtful", f"{text}drifts by."))
+        if notice.code == "depth-triangulated":
+            count, keyframes = values["triangulated"], values["keyframes"]
+            if count <= LEAST_TRIANGULATED * keyframes:
+                text = f"Several views agree on depth in {count} of {keyframes} keyframes only."
+                found.append(Reason("depth-unconfirmed", "doubtful", text))
+    return found
 
 
 def _most_turned_deg(keyframes: int) -> float:
