@@ -61,4 +61,5 @@ def test_the_adjustment_does_not_bring_the_drift_back() -> None:
         assert not correction.refused
         factor = np.log([correction.depth_factor(n) for n in range(40)]) + log_scale
         spread.append(np.ptp(factor))
-    assert spread[0] < 0.6 * spread[1], spread
+    # The drift to be removed is 1.17.
+    assert spread[0] < min(0.06, spread[1]), spread
