@@ -233,7 +233,7 @@ def refined_corners(
     # What comes nearer grows: a patch that is only shifted lags behind. The other image is warped by the smooth flow.
     x, y = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in image_from.shape[::-1]))
     seen = cv2.GaussianBlur(flow, (0, 0), _WARP_SMOOTHING_PX) + np.stack([x, y], -1)
-    warped = cv2.remap(image_to, seen, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped = cv2.remap(image_to, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     start = corners + pixels - seen[corners[:, 1], corners[:, 0]]
     there, found = _aligned(image_from, warped, corners, start, _THOROUGH)
     back, found_back = _aligned(warped, image_from, there, corners, _THOROUGH)
