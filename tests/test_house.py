@@ -171,7 +171,7 @@ def _total(modules: list[_Module]) -> int:
 
 CEILINGS = {
     # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment.
-    "core": (lambda: _total(MODULES), 29_880),
+    "core": (lambda: _total(MODULES), 29_890),
     "core, net": (lambda: _net(MODULES), 18_420),
     "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),

@@ -142,14 +142,17 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
 def log_focal_asked(problem: BundleProblem, found: BundleSolution) -> float:
     """Return ln of the focal length that the observations ask for, all else adjusted with it, over the one used.
 
-    0 where it is not different by three standard deviations; NaN without observations, and with more keyframes than are
-    adjusted at once.
+    0 where it is not different by three standard deviations; NaN where it is undetermined, and with more keyframes than
+    are adjusted at once.
     """
     if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
         return float("nan")
     free = replace(problem, start=found.state, lens=UnknownLens(problem.focal_px, _ASKED_SIGMA))
     state = adjust(free).state
-    deviation = np.sqrt(np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)[-2, -2])
+    try:
+        deviation = np.sqrt(np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)[-2, -2])
+    except np.linalg.LinAlgError:  # undetermined
+        return float("nan")
     change = float(state.lens[0] - problem.tracked.lens[0])
     return change if abs(change) > _SIGNIFICANT * deviation else 0.0
 

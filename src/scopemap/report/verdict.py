@@ -180,7 +180,9 @@ def _of_notices(run: Result) -> list[Reason]:
     shown = "as seen at one moment" if "fusion-at-one-moment" in codes else "a mean"
     whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
     more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
-    return [Reason(notice.code, _level_of(notice), notice.plain + more.get(notice.code, "")) for notice in found]
+    levels = [n.level if "camera-at-rest-stated" in codes else _level_of(n) for n in found]
+    texts = [n.plain + more.get(n.code, "") for n in found]
+    return [Reason(n.code, level, text) for n, level, text in zip(found, levels, texts, strict=True)]
 
 
 def _level_of(notice: Notice) -> Level:
@@ -197,9 +199,9 @@ def _of_adjustment(run: Result) -> list[Reason]:
         values = notice.values
         if notice.code == "mapping-adjusted" and values["rotation_deg"] > _most_turned_deg(values["keyframes"]):
             text = (
-                f"The adjustment turned the camera by up to {values['rotation_deg']:.0f} degrees: more than tracking "
+                f"The adjustment turned keyframes by up to {values['rotation_deg']:.0f} degrees: tracking drifts less."
             )
-            found.append(Reason("adjusted-far", "doubtful", f"{text}drifts by."))
+            found.append(Reason("adjusted-far", "doubtful", text))
         if notice.code == "depth-triangulated":
             count, keyframes = values["triangulated"], values["keyframes"]
             if count <= LEAST_TRIANGULATED * keyframes:
