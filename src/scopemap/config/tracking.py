@@ -24,6 +24,10 @@ class TrackingConstants:
     # A frame becomes a keyframe early where its inlier share times overlap falls below this share of what it was for
     # the keyframe's first frame; 0: off.
     min_keyframe_agreement: float = 0.7
+    # A camera that has moved less since the keyframe, rad and translation over depth, needs no other one: its views
+    # triangulate nothing, and their errors are alike. 0: off.
+    min_keyframe_motion: float = 0.02
+    keyframe_patience: int = 3  # frames that a keyframe waits longer where the picture is not clear
     levels: int = 5  # of the pyramid, factor 0.5
     finest_level: int = 1  # 0: full working size, 1: half
     max_iterations: int = 30  # per pyramid level
@@ -45,6 +49,7 @@ TRACKING: dict[str, dict[str, Any]] = {
     "paper": {
         **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "new_map_after": 0, "corner_depth_sigma": 0.0},
         **{"min_keyframe_agreement": 0.0, "finest_level": 0, "depth_weight": 0.0, "min_correlation": -1.0},
+        **{"min_keyframe_motion": 0.0, "keyframe_patience": 0},
         **{"start": "identity", "channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
     },
     "least-squares": {"huber": 1e6},

@@ -10,7 +10,7 @@ import numpy as np
 from scopemap.config import TrackingSettings
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse
+from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.tracking.keyframe_alignment import (
     MAX_EXTRAPOLATION,
@@ -33,12 +33,12 @@ _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with 
 _WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
 _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a keyframe
 _REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
-_CLEAR, _PATIENCE = 0.8, 3  # of the best quality since the keyframe: below it the next one waits so many frames more
+_CLEAR = 0.8  # of the best quality since the keyframe: below it the next one waits
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
 class KeyframeChoice:
-    """When the next keyframe is due: by the frames since the last one, and by how well they still fit it."""
+    """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
 
     def __init__(self, settings: TrackingSettings) -> None:
         self._settings = settings
@@ -46,6 +46,7 @@ class KeyframeChoice:
         self._quality = self._best_quality = 0.0
         self._first_agreement: float | None = None
         self._last: Alignment | None = None
+        self._depth_mm = 1.0
 
     def see(self, frame: Frame) -> None:
         """Count a frame."""
@@ -58,9 +59,9 @@ class KeyframeChoice:
         if self._first_agreement is None:
             self._first_agreement = alignment.agreement
 
-    def change(self) -> None:
-        """Take another keyframe as the current one."""
-        self._first_agreement = None
+    def change(self, depth_mm: float) -> None:
+        """Take another keyframe, of this mean depth, as the current one."""
+        self._first_agreement, self._depth_mm = None, depth_mm
 
     def begin(self) -> None:
         """Begin with a new keyframe."""
@@ -69,11 +70,19 @@ class KeyframeChoice:
     def is_due(self, alignment: Alignment | None = None) -> bool:
         """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
         alignment = alignment or self._last
-        patience = _PATIENCE if self._quality < _CLEAR * self._best_quality else 0
-        if self.frames_since >= self._settings.keyframe_every + patience:
+        constants = self._settings.constants
+        patience = constants.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
+        if self.frames_since >= self._settings.keyframe_every + patience and self._has_moved(alignment):
             return True
-        least = self._settings.constants.min_keyframe_agreement * (self._first_agreement or 0.0)
+        least = constants.min_keyframe_agreement * (self._first_agreement or 0.0)
         return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
+
+    def _has_moved(self, alignment: Alignment | None) -> bool:
+        if alignment is None:
+            return True
+        T = alignment.motion.T_current_reference
+        moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
+        return bool(moved >= self._settings.constants.min_keyframe_motion)
 
 
 class Tracker(FrameTracker):
@@ -261,7 +270,7 @@ class Tracker(FrameTracker):
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         self._keyframe, self._last = keyframe, None
-        self._choice.change()
+        self._choice.change(keyframe.depth_mm)
         self._aligner.set_keyframe(keyframe)
 
     def _rejection(self, alignment: Alignment) -> TrackingLoss | None:
