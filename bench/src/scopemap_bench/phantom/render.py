@@ -117,8 +117,8 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
     if spec.path_file is None:
         # Every `speed`-th pose of a path that is as much longer.
         frames = ((spec.frames or DEFAULT_FRAMES) - 1) * spec.speed + 1
-        if spec.path != "wander":
-            path = straight_path(frames, _ALONG_MM[spec.path], spec.seed)
+        if spec.route != "wander":
+            path = straight_path(frames, _ALONG_MM[spec.route], spec.seed)
         elif spec.scene in _OPEN:
             path = sweep_path(frames, spec.loop, spec.seed)
         else:
