@@ -300,6 +300,23 @@ def test_made_up_paths_move_like_a_hand(seed: int, frames: int, loop: bool) -> N
         assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
 
 
+@pytest.mark.parametrize(("route", "axis", "share"), [("sideways", 0, 1 / 3), ("withdrawal", 2, None)])
+def test_straight_routes_go_where_they_are_told(route: str, axis: int, share: float | None) -> None:
+    scene = "abdominal_wall" if share else "colon"
+    seen = prepare(PhantomSpec(scene=scene, route=route, seed=5, width=64, height=48))  # type: ignore[arg-type]
+    way = np.ptp(seen.poses[:, :3, 3], axis=0)
+    assert way[axis] > 4 * np.delete(way, axis).max()
+    assert np.linalg.norm(np.diff(seen.poses[:, :3, 3], axis=0), axis=1).max() < 1.0
+    if share:
+        depth_mm = light(seen, 100)[1].depth_mm
+        assert way[axis] / np.median(depth_mm) == pytest.approx(share, rel=0.25)
+        assert np.ptp(depth_mm) < 0.25 * np.median(depth_mm)
+    else:
+        assert seen.poses[-1, 2, 3] == pytest.approx(-52, abs=3)
+    with pytest.raises(SettingsError, match="route wander"):
+        replace(seen.spec, loop=True)
+
+
 @pytest.mark.parametrize("make", [lumen_path, sweep_path])
 def test_loop_closes_exactly_and_goes_somewhere(make: object) -> None:
     poses = make(300, True, 4)  # type: ignore[operator]

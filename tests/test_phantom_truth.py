@@ -17,7 +17,7 @@ from scopemap_bench.phantom.writer import seen_surface
 SMALL = {"width": 96, "height": 80, "frames": 12}
 
 
-@pytest.fixture(scope="module", params=["colon", "laparoscopy", "tube"])
+@pytest.fixture(scope="module", params=["colon", "laparoscopy", "abdominal_wall", "tube"])
 def phantom(request: pytest.FixtureRequest) -> Phantom:
     return prepare(PhantomSpec(scene=request.param, **SMALL))
 

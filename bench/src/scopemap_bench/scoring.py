@@ -155,7 +155,7 @@ def default_protocol(sequence: Sequence) -> ProtocolPlan:
     return ProtocolPlan(depth_range_mm=DEPTH_RANGES_MM.get(name, ProtocolPlan().depth_range_mm))
 
 
-def _true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
+def true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
     """Return a factory of (estimated, true) depth of the frames that have both."""
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -171,7 +171,7 @@ def _depth(
     depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan, matched: MatchedTrajectories | None
 ) -> Figures:
     report = depth_errors.evaluate_depth_sequence(
-        _true_pairs(depth, sequence),
+        true_pairs(depth, sequence),
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
         clip_prediction=protocol.clip_depth,
@@ -188,7 +188,7 @@ def _consistency(
     depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan, flows: Path | None = None
 ) -> Figures:
     """Measure depth over time, after one scale factor for all frames where true depth is known."""
-    scale = depth_errors.fit_sequence(_true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    scale = depth_errors.fit_sequence(true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())

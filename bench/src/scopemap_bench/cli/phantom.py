@@ -15,7 +15,7 @@ from scopemap.cli.progress import count_progress
 
 def phantom(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="new or empty folder, or one of an earlier phantom")],
-    scene: Annotated[str, typer.Option(help="colon | laparoscopy | tube")] = "colon",
+    scene: Annotated[str, typer.Option(help="colon | laparoscopy | abdominal_wall | tube")] = "colon",
     frames: Annotated[int | None, typer.Option(help="number of frames; default 200, or all of --path")] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="image size, px")] = "320x256",
     seed: Annotated[int, typer.Option(help="of everything random")] = 0,
@@ -32,7 +32,7 @@ def phantom(
     ] = "",
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="fov_deg, noise, texture, shutter, h264_crf, ..."),
+        typer.Option("--set", metavar="KEY=VALUE", help="route, fov_deg, noise, texture, shutter, ..."),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,

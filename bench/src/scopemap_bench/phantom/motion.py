@@ -49,6 +49,14 @@ def sweep_path(frames: int, loop: bool, seed: int) -> np.ndarray:
     return _poses(positions, look + np.radians(_sway(frames, loop, rng, (3.0, 3.0, 4.0))), loop)
 
 
+def straight_path(frames: int, along_mm: np.ndarray, seed: int) -> np.ndarray:
+    """Return a hand-like path along a line, by `along_mm` (3,) in all, slow at both ends, (frames, 4, 4)."""
+    rng = np.random.default_rng((seed, 1))
+    share = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, frames))
+    positions = share[:, None] * along_mm + _sway(frames, False, rng, (1.5, 1.5, 1.0))
+    return _poses(positions, np.radians(_sway(frames, False, rng, (2.0, 2.0, 2.0))), False)
+
+
 def turned(poses: np.ndarray, first: int, last: int, back: bool = False) -> np.ndarray:
     """Return poses (N, 4, 4) that turn by 30 degrees about their y axis over frames `first` to `last`, and stay so."""
     before = first - 1

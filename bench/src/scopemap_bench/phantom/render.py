@@ -19,6 +19,7 @@ from scopemap_bench.phantom.motion import (
     lumen_path,
     poke,
     push,
+    straight_path,
     sweep_path,
     touching,
     turned,
@@ -43,6 +44,9 @@ _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 _METERING_SHARE = 8
 # Where a frame shows what is poked, over its height and width.
 _POKED_AT = 0.5, 0.68
+# Scenes of an open cavity, and the share by which their organs rise.
+_OPEN = {"laparoscopy": 1.0, "abdominal_wall": 0.3}
+_ALONG_MM = {"sideways": np.array([22.0, 0, 0]), "withdrawal": np.array([0, 0, -52.0])}
 _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
 
@@ -79,7 +83,7 @@ def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
 def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotion:
     """Breathing and pushes of the tissue."""
     parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
-    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene == "laparoscopy" else "lumen"]
+    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene in _OPEN else "lumen"]
     for event in _events(spec, "push"):
         parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
     parts += [_poke(spec, event, poses[min(event.first, len(poses) - 1)], volume) for event in _events(spec, "poke")]
@@ -113,7 +117,9 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
     if spec.path_file is None:
         # Every `speed`-th pose of a path that is as much longer.
         frames = ((spec.frames or DEFAULT_FRAMES) - 1) * spec.speed + 1
-        if spec.scene == "laparoscopy":
+        if spec.route != "wander":
+            path = straight_path(frames, _ALONG_MM[spec.route], spec.seed)
+        elif spec.scene in _OPEN:
             path = sweep_path(frames, spec.loop, spec.seed)
         else:
             path = lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
@@ -139,7 +145,7 @@ def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearanc
     if spec.scene == "colon":
         volume, base = colon_volume(poses, spec.seed), _COLON_RGB
     else:
-        volume, base = laparoscopy_volume(poses, spec.seed)
+        volume, base = laparoscopy_volume(poses, spec.seed, _OPEN[spec.scene])
     return volume, Appearance(base, spec.texture, spec.gloss, spec.seed)
 
 
@@ -162,7 +168,7 @@ def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
     for event in _events(phantom.spec, "instrument"):
-        tool = instrument(time, event.first, event.last, phantom.spec.scene == "laparoscopy", phantom.spec.seed)
+        tool = instrument(time, event.first, event.last, phantom.spec.scene in _OPEN, phantom.spec.seed)
         radiance, surface = insert(tool, radiance, surface, camera)
     return radiance * vignette(camera), surface
 

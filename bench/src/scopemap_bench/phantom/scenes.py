@@ -50,8 +50,11 @@ class Tint:
         return np.stack(channels, -1) / 255
 
 
-def laparoscopy_volume(poses: np.ndarray, seed: int) -> tuple[Volume, Tint]:
-    """Return the free space and the colours of a cavity with organs, at least 25 mm in front of poses (N, 4, 4)."""
+def laparoscopy_volume(poses: np.ndarray, seed: int, rise: float = 1.0) -> tuple[Volume, Tint]:
+    """Return the free space and the colours of a cavity with organs, at least 25 mm in front of poses (N, 4, 4).
+
+    rise : how far organs and relief rise from the floor, share of the usual; a small one makes it nearly plane.
+    """
     frame = _frame(poses)
     local = (poses[:, :3, 3] - frame[:3, 3]) @ frame[:3, :3]
     half = _WALL_MM + float(np.linalg.norm(local[:, :2], axis=1).max())
@@ -67,7 +70,7 @@ def laparoscopy_volume(poses: np.ndarray, seed: int) -> tuple[Volume, Tint]:
         points = np.indices(value[block].shape, np.float32).reshape(3, -1).T * _VOXEL_MM
         points[:, 0] += start * _VOXEL_MM
         points = (points + (origin - frame[:3, 3])) @ frame[:3, :3]
-        distances = _distances(points, half, depth, behind, seed)
+        distances = _distances(points, half, depth, behind, seed, rise)
         nearest = distances.min(0)
         melt = np.exp(-_MELT_PER_MM * (distances - nearest))
         total = melt.sum(0)
@@ -88,14 +91,14 @@ def _frame(poses: np.ndarray) -> np.ndarray:
     return T_world_cavity
 
 
-def _distances(p: np.ndarray, half: float, depth: float, behind: float, seed: int) -> np.ndarray:
+def _distances(p: np.ndarray, half: float, depth: float, behind: float, seed: int, rise: float) -> np.ndarray:
     """Distance (K, N), mm, roughly, from points (N, 3) in cavity axes to floor, wall and each organ."""
     radii = np.array([half, half, 0.5 * (depth + behind) + 30.0])
     wall = -_ellipsoid(p, np.array([0.0, 0.0, 0.5 * (depth - behind)]), radii, 0.0)
-    distances = np.stack([depth - p[:, 2], wall, *_organs(p, depth, seed)])
+    distances = np.stack([depth - p[:, 2], wall, *(rise * d for d in _organs(p / [1, 1, rise], depth / rise, seed))])
     # Noise costs most of the time; away from the surface it would not be seen.
     near = np.abs(distances.min(0)) < _RELIEF_MM
-    distances[:, near] += _relief(p[near], len(distances) - 2, seed)
+    distances[:, near] += rise * _relief(p[near], len(distances) - 2, seed)
     return distances
 
 

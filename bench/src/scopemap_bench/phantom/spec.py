@@ -15,7 +15,8 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.errors import SettingsError
 
-SceneName = Literal["colon", "laparoscopy", "tube"]
+SceneName = Literal["colon", "laparoscopy", "abdominal_wall", "tube"]
+RouteName = Literal["wander", "sideways", "withdrawal"]
 EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push", "poke"]
 
 DEFAULT_FRAMES = 200
@@ -41,11 +42,14 @@ class Event:
 class PhantomSpec:
     """Parameters of a phantom.
 
-    scene : colon (folded, closed tube), laparoscopy (organs in a cavity) or tube (straight and featureless).
+    scene : colon (folded, closed tube), laparoscopy (organs in a cavity), abdominal_wall (the same,
+    nearly plane) or tube (straight and featureless).
     frames : None: every pose of `path_file`, or 200. width, height : image size, px. seed : of everything random.
     fov_deg : horizontal field of view of a pinhole, degrees; a `camera_file` has its own, scaled to the image size.
     path_file : camera path to follow (`read_poses`), None: a hand-like path is generated, which is `speed` times faster
     than usual, and with `loop` ends in exactly its first pose.
+    route : of a generated path. wander: forward in a lumen, to and fro over a cavity; sideways: by 22 mm, a third of
+    the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo. gloss : of wet highlights, 1 =
@@ -65,6 +69,7 @@ class PhantomSpec:
     camera_file: Path | None = None
     seed: int = 0
     path_file: Path | None = None
+    route: RouteName = "wander"
     deform: bool = False
     loop: bool = False
     speed: int = 1
@@ -99,6 +104,9 @@ class PhantomSpec:
             "shutter must be between 0 and 1": 0 <= self.shutter <= 1,
             "indirect must be between 0 and 1": 0 <= self.indirect <= 1,
             "h264_crf must be between 0 and 51": self.h264_crf is None or 0 <= self.h264_crf <= 51,
+            f"route must be one of {', '.join(get_args(RouteName))}": self.route in get_args(RouteName),
+            "only the route wander goes with loop or path_file": self.route == "wander"
+            or not (self.loop or self.path_file),
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
             "a turn does not go with loop": not (self.loop and any(event.kind == "turn" for event in self.events)),
             "loop needs a generated path of at least 3 frames, not a path file": not self.loop
