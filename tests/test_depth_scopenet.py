@@ -6,6 +6,7 @@ import math
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,8 +18,9 @@ from scopemap.cameras.rectification import Rectifier
 from scopemap.config import DepthSettings
 from scopemap.depth.backends import create_depth
 from scopemap.depth.scopenet import estimator as module
+from scopemap.depth.scopenet.colours import one_colour
 from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
-from scopemap.depth.scopenet.planes import input_planes
+from scopemap.depth.scopenet.planes import LINEAR, input_planes
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 from scopemap.io import weights
@@ -88,6 +90,37 @@ def test_depth_is_distance_times_the_rays_z_and_sigma_that_of_laplace(
     np.testing.assert_allclose(estimate.sigma, depth_mm * math.sqrt(2) * np.exp(told[1]), rtol=1e-5)
 
 
+def test_averaged_depth_is_the_mean_of_two_looks_of_which_one_is_mirrored_and_larger(frame: Frame, file: Path) -> None:
+    one = ScopeNetDepth(str(file)).estimate(frame)
+    found = ScopeNetDepth(str(file), averaged=True).estimate(frame)
+    coloured, grey = one_colour(frame.rgb, frame.valid)
+    first = _told(_small(), input_planes(coloured, UNIT_RAYS, frame.valid))
+    mirrored = input_planes(grey[:, ::-1], UNIT_RAYS[:, ::-1] * np.float32([-1, 1, 1]), frame.valid[:, ::-1])
+    larger = np.stack([cv2.resize(np.ascontiguousarray(plane), (76, 62)) for plane in mirrored])
+    second = np.stack([cv2.resize(answer, (WIDTH, HEIGHT))[:, ::-1] for answer in _told(_small(), larger)])
+    log_distance, log_spread = (first + second) / 2
+    np.testing.assert_allclose(found.values, np.exp(log_distance) * UNIT_RAYS[..., 2], rtol=1e-4)
+    assert found.sigma is not None
+    np.testing.assert_allclose(found.sigma, found.values * math.sqrt(2) * np.exp(log_spread), rtol=1e-4)
+    assert np.abs(np.log(found.values / one.values)).max() > 1e-3
+
+
+def test_tissues_that_differ_in_green_and_blue_alone_look_the_same_in_one_colour() -> None:
+    red = np.tile(np.linspace(0.05, 0.45, 40), (30, 1))
+    pale, dark = np.array([1, 0.6, 0.5]), np.array([1, 0.25, 0.2])
+    light = red[..., None] * np.where(np.arange(30)[:, None, None] < 20, pale, dark)
+    rgb = np.rint(np.interp(light, LINEAR, np.arange(256))).astype(np.uint8)
+    valid = np.ones(red.shape, bool)
+    coloured, grey = one_colour(rgb, valid)
+    assert np.ptp(coloured.astype(int), axis=0).max() <= 1
+    np.testing.assert_array_equal(coloured[..., 0], rgb[..., 0])
+    assert np.ptp(grey.astype(int), axis=2).max() == 0
+    saturated = rgb.copy()
+    saturated[:5, :5] = (255, 130, 90)
+    np.testing.assert_array_equal(one_colour(saturated, valid)[0][:5, :5], saturated[:5, :5])
+    np.testing.assert_array_equal(one_colour(rgb, ~valid)[0], rgb)
+
+
 def test_what_is_shipped_is_what_the_model_card_describes() -> None:
     card = (Path(__file__).parents[1] / "docs" / "models" / "scopenet.md").read_text()
     assert weights.sha256_of(Path(module.__file__).parent / WEIGHTS_NAME) in card
@@ -97,6 +130,8 @@ def test_what_is_shipped_is_what_the_model_card_describes() -> None:
 def test_provenance_says_whose_weights_and_whether_the_rays_were_known(file: Path, calibrated: bool, rays: str) -> None:
     settings = chosen(DepthSettings, backend="scopenet", model=str(file))
     origin = create_depth(settings, SAME, "cpu", calibrated=calibrated).provenance()
+    averaged = create_depth(settings, SAME, "cpu", calibrated=calibrated, averaged=True).provenance()
+    assert averaged == origin | {"answers": "mean of two"}
     assert origin == {
         "depth": "scopenet",
         "model": str(file),

@@ -15,6 +15,7 @@ from tiny_phantom import write_tiny
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import FusionSettings
+from scopemap.estimators import create_estimators
 from scopemap.flow.corners import Correspondences2D3D
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import REGIONS, Frame
@@ -144,6 +145,12 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
         truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)
         assert len(vertices) > 5000
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_depth_is_averaged_where_no_parallax_corrects_it(pushed: Path, at_rest: bool) -> None:
+    config = Config.load(settings={"tracking.camera_at_rest": at_rest})
+    assert ("answers" in create_estimators(config, open_sequence(pushed)).depth.provenance()) == at_rest
 
 
 def test_a_killed_run_of_a_camera_at_rest_ends_in_the_same_bytes(

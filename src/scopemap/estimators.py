@@ -49,6 +49,7 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
         networks.device,
         sequence.depth_scale_mm,
         calibrated=sequence.calibrated,
+        averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
     )
     corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)
     return Estimators(

@@ -22,6 +22,7 @@ def create_depth(
     depth_scale_mm: float | None = None,
     *,
     calibrated: bool = True,
+    averaged: bool = False,
 ) -> DepthEstimator:
     """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
 
@@ -29,6 +30,7 @@ def create_depth(
     device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
+    averaged : whether ScopeNet may take three times as long, and err less.
 
     Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
     """
@@ -41,7 +43,7 @@ def create_depth(
     if settings.backend == "scopenet":
         from scopemap.depth.scopenet.estimator import ScopeNetDepth
 
-        return ScopeNetDepth(settings.model, rays_known=calibrated)
+        return ScopeNetDepth(settings.model, rays_known=calibrated, averaged=averaged)
     if settings.backend == "depth-pro":
         return _depth_pro(settings.model, settings, device)
     if settings.backend == "depth-anything":
