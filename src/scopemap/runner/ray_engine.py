@@ -114,7 +114,7 @@ class RayEngine:
                 with reporting(f"cannot {'start Ray' if place is None else f'connect to Ray at {place}'}"):
                     _check_reached(place)
                     options = own if place is None else {}
-                    # Without a dashboard, it counts usage and, even if told not to, asks the network which cloud this is.
+                    # Without a dashboard it counts usage, and asks which cloud this is even if told not to.
                     with _without(Node, "start_api_server"):
                         ray.init(place or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
                 if threading.current_thread() is threading.main_thread():
@@ -189,7 +189,7 @@ def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Wor
 
 @contextmanager
 def _without(kind: Any, name: str) -> Iterator[None]:
-    """Let a method of a class do nothing meanwhile, if it has that."""
+    """Let a method of a class do nothing meanwhile."""
     method = getattr(kind, name, None)
     setattr(kind, name, lambda *_, **__: None)
     try:
