@@ -54,6 +54,13 @@ def test_each_task_has_the_outcome_that_it_deserves(engine: Engine, tmp_path: Pa
     assert multiprocessing.active_children() == []
 
 
+def test_workers_switch_telemetry_off_by_themselves(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node need not have the environment of the machine that a batch was started on."""
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
+    ((_, outcome),) = engine(os.getenv, ["ORT_DISABLE_TELEMETRY"], ProcessLimits(1, seconds=90.0))
+    assert outcome.value == "1", outcome
+
+
 def test_what_is_begun_ends_with_who_waits_for_it(engine: Engine, tmp_path: Path) -> None:
     tasks = [("hang", tmp_path / "hangs"), ("work", tmp_path / "works")]
     with closing(engine(act, tasks, ProcessLimits(2, seconds=90.0))) as ended:
@@ -124,12 +131,13 @@ def test_ray_of_this_machine_is_reached_from_nowhere_else_and_tells_nobody(tmp_p
         "    return [line[1] for line in lines if line[3] == '0A']\n"
         "with RayEngine(WorkerNeeds(1, 0.5))._connected(1) as ray:\n"
         "    facts = ray.util.get_node_ip_address(), os.environ['RAY_USAGE_STATS_ENABLED']\n"
+        "    facts += ('dashboard' in ray._private.worker._global_node.all_processes,)\n"
         "    during = listening()\n"
         "for line in (facts, during, listening()):\n    print(*line)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True)
     facts, during, after = done.stdout.splitlines()
-    assert facts == "127.0.0.1 0"
+    assert facts == "127.0.0.1 0 False"
     new = set(during.split()) - set(after.split())
     loopback = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")
     assert new

@@ -177,7 +177,7 @@ CEILINGS = {
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 30_570),  # those of both; 40 for averaged depth
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_940),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_945),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 45),
 }

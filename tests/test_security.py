@@ -1,15 +1,13 @@
-"""A run opens no socket, a result has nothing of a patient's data, and what is installed has a known licence."""
+"""A result has nothing of a patient's data, and what is installed has a known licence."""
 
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
 
 import av
 import cv2
@@ -46,24 +44,6 @@ def test_telemetry_of_dependencies_is_off_before_they_are_imported() -> None:
     code = f"import os, sys, scopemap; print(*(os.environ[n] for n in {names}), 'onnxruntime' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1", "1", "0", "False"]
-
-
-def test_a_run_and_its_report_open_no_socket(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Of images without a calibration, with the embedded network: all that a newcomer's first run does."""
-
-    def forbidden(*_: object, **__: object) -> NoReturn:
-        raise AssertionError("a socket was opened")
-
-    source = only_images(write_tiny(tmp_path / "phantom"), tmp_path / "in")
-    for name in ("socket", "create_connection", "getaddrinfo", "gethostbyname"):
-        monkeypatch.setattr(socket, name, forbidden)
-    assert call("run", source, "--out", tmp_path / "out", "--quiet") == 0, capfd.readouterr().err
-    assert call("report", tmp_path / "out") == 0
-    assert call("verify", tmp_path / "out") == 0
-    with pytest.raises(AssertionError, match="a socket was opened"):
-        socket.socket()
 
 
 def _texts(folder: Path) -> str:

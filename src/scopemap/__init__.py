@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import os
+import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +19,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # sum in another order: results would depend on their number. Read when numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Nothing may leave the machine: these libraries send telemetry unless that is set before they are imported.
+_off = os.environ.get("ORT_DISABLE_TELEMETRY", "").lower() in ("1", "true", "yes", "on")
+if "onnxruntime" in sys.modules and not _off:
+    _advice = "import scopemap first, or set ORT_DISABLE_TELEMETRY=1"
+    warnings.warn(f"onnxruntime was imported before scopemap and may send telemetry: {_advice}", stacklevel=2)
 for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY"):
     os.environ[_switch] = "1"
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"

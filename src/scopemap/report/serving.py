@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from socketserver import TCPServer
 from typing import Any
 
 from scopemap.errors import InputError
@@ -40,10 +41,9 @@ class LocalServer:
         port: int = 0,
     ) -> None:
         try:
-            self._server = ThreadingHTTPServer((_ADDRESS, port), _handler(pages, actions or {}))
+            self._server = _Server((_ADDRESS, port), _handler(pages, actions or {}))
         except (OSError, OverflowError) as error:
             raise InputError(f"cannot serve on port {port}: {error}; choose another one") from None
-        self._server.daemon_threads = True
         self.url = f"http://localhost:{self._server.server_port}/"
         """Where the page is."""
         threading.Thread(target=self._server.serve_forever, name="serve", daemon=True).start()
@@ -52,6 +52,14 @@ class LocalServer:
         """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    """Does not ask for the name of 127.0.0.1: where no file of the machine knows it, a name server would be asked."""
+
+    def server_bind(self) -> None:
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = _ADDRESS, self.server_address[1]
 
 
 def live_page() -> Content:

@@ -88,12 +88,12 @@ class RayEngine:
     @contextmanager
     def _connected(self, processes: int) -> Iterator[Any]:
         """Yield the module ray, connected; all its actors end with the connection."""
-        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         if self.address is None:
             # Its word for a Ray of one machine, at 127.0.0.1; it is read where ray is imported.
             os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         try:
             import ray
+            from ray._private.node import Node
         except ImportError:
             raise InputError("--engine ray needs the extra `cluster`: pip install -e '.[cluster]'") from None
         place, needs = self.address, self.needs
@@ -114,7 +114,9 @@ class RayEngine:
                 with reporting(f"cannot {'start Ray' if place is None else f'connect to Ray at {place}'}"):
                     _check_reached(place)
                     options = own if place is None else {}
-                    ray.init(place or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
+                    # Without a dashboard it counts usage, and asks which cloud this is even if told not to.
+                    with _without(Node, "start_api_server"):
+                        ray.init(place or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(signal.SIGTERM, handler)  # Ray's own would replace that of the command
                 yield ray
@@ -183,6 +185,17 @@ def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Wor
             "(--worker-cores, --worker-memory, --worker-gpus)?"
         )
     return [worker for worker in workers if worker.answer in found or worker in over]
+
+
+@contextmanager
+def _without(kind: Any, name: str) -> Iterator[None]:
+    """Let a method of a class do nothing meanwhile."""
+    method = getattr(kind, name, None)
+    setattr(kind, name, lambda *_, **__: None)
+    try:
+        yield
+    finally:
+        setattr(kind, name, method)
 
 
 def _check_reached(address: str | None) -> None:
