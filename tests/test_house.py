@@ -170,9 +170,9 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 340 (230 net) for depth measured from two views: matching, calibration of the pair, the second view's way.
+    # 340 (231 net) for depth measured from two views: matching, calibration of the pair, the second view's way.
     "core": (lambda: _total(MODULES), 30_230),
-    "core, net": (lambda: _net(MODULES), 18_640),
+    "core, net": (lambda: _net(MODULES), 18_650),
     "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 30_880),  # those of both; 340 for two views
