@@ -32,7 +32,7 @@ def test_two_views_are_found(draw: Draw, layout: str, squeezed: bool, size: tupl
     assert (found.layout, found.squeezed, found.pixel_aspect) == (layout, squeezed, aspect)
     assert found.correlation > 0.6
     assert found.view_size(pictures[0].shape[1], pictures[0].shape[0]) == size
-    np.testing.assert_array_equal(found.first(pictures[0]), pictures[0][: size[1], : size[0]])
+    np.testing.assert_array_equal(found.views(pictures[0])[0], pictures[0][: size[1], : size[0]])
 
 
 def test_views_in_circles_are_found() -> None:

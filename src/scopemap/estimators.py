@@ -14,6 +14,7 @@ from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.depth.perceptual import create_perceptual
+from scopemap.depth.stereo import StereoDepth
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.flow.flows import create_flow
 from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
@@ -50,6 +51,7 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
         sequence.depth_scale_mm,
         calibrated=sequence.calibrated,
         averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
+        pair=sequence.pair,
     )
     corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)
     return Estimators(
@@ -85,11 +87,11 @@ def missing_weights(config: Config, *other_flows: str) -> list[str]:
 
 
 def largest_depth_mm(config: Config, estimators: Estimators) -> float:
-    """Return the largest depth that a result can hold, mm: of measured files theirs, else that of the settings.
+    """Return the largest depth that a result can hold, mm: of measured depth its own, else that of the settings.
 
     A back end may scale predicted depth; three standard deviations of that are included.
     """
-    if isinstance(estimators.depth, FilesDepth) and estimators.depth.measured_max_mm:
+    if isinstance(estimators.depth, FilesDepth | StereoDepth) and estimators.depth.measured_max_mm:
         return estimators.depth.measured_max_mm
     mapping, log_factor = config.mapping.constants, 0.0
     if config.mapping.method != "none":

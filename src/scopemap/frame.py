@@ -46,6 +46,8 @@ class Frame:
     weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
     quality : what the picture is worth beside those of recent frames, 0..1, as `PictureQuality` has it.
     instruments : (H, W) bool, where the depth network found some, which `valid` leaves out; None: not looked for.
+    views : both views of a stereo pair as in the input, left first, each (h, w, 3) uint8; None: one view, or depth is
+    known.
     depth_scale : factor of the estimated depth by which it agrees with the frames before, as `depth.mapis` finds it; 1
     where the estimator knows no scale, as of disparity.
     """
@@ -65,6 +67,7 @@ class Frame:
     instruments: np.ndarray | None = None
     quality: float = 1.0
     depth_scale: float = 1.0
+    views: tuple[np.ndarray, np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

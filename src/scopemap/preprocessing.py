@@ -98,7 +98,7 @@ class Preprocessing:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
                 fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
         raw = self.estimators.anchor.metric(estimate, shown)
-        small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm)
+        small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm, views=None)
         frame, fitted = with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
         return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
 
@@ -128,10 +128,10 @@ class Matching:
 def without_depth(frame: Frame) -> Frame:
     """Return a frame without a usable pixel, and with unknown depth."""
     nowhere, unknown_mm = np.zeros_like(frame.valid), np.full(frame.valid.shape, np.nan, np.float32)
-    return replace(frame, valid=nowhere, depth_mm=unknown_mm, depth_sigma_mm=None)
+    return replace(frame, valid=nowhere, depth_mm=unknown_mm, depth_sigma_mm=None, views=None)
 
 
 def with_depth(frame: Frame, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> Frame:
     """Return a frame with depth, and its standard deviation where there is one, from any size to the frame's."""
     sigma_mm = None if sigma_mm is None else resampled(sigma_mm, frame.camera)
-    return replace(frame, depth_mm=resampled(depth_mm, frame.camera), depth_sigma_mm=sigma_mm)
+    return replace(frame, depth_mm=resampled(depth_mm, frame.camera), depth_sigma_mm=sigma_mm, views=None)

@@ -102,4 +102,5 @@ def _input_settings(run: Path) -> InputSettings:
         settings = Config.load(file=file).input if file.is_file() else InputSettings()
     except SettingsError:  # of another version
         settings = InputSettings()
-    return settings.model_copy(update={"fps": None, "skip_duplicates": False})
+    left = {"stereo": "none"} if settings.second_view else {}
+    return settings.model_copy(update={"fps": None, "skip_duplicates": False} | left)

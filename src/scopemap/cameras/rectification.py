@@ -139,3 +139,16 @@ class DepthSensor:
         seen_mm = np.full((colour.height, colour.width), np.inf, dtype=np.float32)
         np.minimum.at(seen_mm, (pixels[inside, 1], pixels[inside, 0]), points[inside, 2].astype(np.float32))
         return np.where(np.isfinite(seen_mm), seen_mm, np.float32(np.nan))
+
+
+@dataclass(frozen=True)
+class StereoPair:
+    """Two cameras whose images have one size, the left one first.
+
+    T_right_left (4, 4), mm, takes points in the left camera to the right one. source : how they are known, one phrase.
+    """
+
+    left: CameraModel
+    right: CameraModel
+    T_right_left: np.ndarray
+    source: str

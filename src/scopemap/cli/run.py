@@ -39,8 +39,12 @@ def run(
     ] = None,
     fov: options.FieldOfView = None,
     stereo: Annotated[
-        Literal["auto", "none", "left-right", "top-bottom"] | None,
-        options.advanced(help="Two views in one image, of which the left or upper is used; auto: recognised."),
+        str | None,
+        options.advanced(
+            metavar="auto|none|left-right|top-bottom|use[:...]",
+            help="Two views in one image, of which the left or upper is used; auto: recognised. use: measure depth "
+            "from both, with --camera of the pair; use:left-right, use:top-bottom, use:FILE (of the right camera).",
+        ),
     ] = None,
     deinterlace: Annotated[
         bool,
@@ -65,7 +69,9 @@ def run(
     near_far: options.NearFar = None,
     depth: Annotated[
         str | None,
-        typer.Option(help="scopenet, shading, depth-anything, depth-pro or files:FOLDER (disparity or depth files)."),
+        typer.Option(
+            help="scopenet, shading, depth-anything, depth-pro, files:FOLDER (disparity or depth files), stereo."
+        ),
     ] = None,
     flow: Annotated[
         str | None,

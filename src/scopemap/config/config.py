@@ -109,10 +109,13 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a preset and of other sources, of which later ones win.
 
-    Another backend does not get the preset's weights, and a range of depth replaces an earlier anchor.
+    Another backend does not get the preset's weights, a range of depth replaces an earlier anchor, and the use of two
+    views an earlier backend.
     """
     flat = dict(preset)
     for source in others:
+        if str(source.get("input.stereo", "")).startswith("use"):
+            source = {"depth.backend": "stereo"} | source
         other_network = source.get("depth.backend") not in (None, preset.get("depth.backend"))
         if other_network and flat.get("depth.model") == preset.get("depth.model"):
             flat.pop("depth.model", None)

@@ -41,7 +41,10 @@ class DepthSettings(StageSettings):
 
     METHODS = DEPTH
     method: str = Field("scopemap", description="constants of the metric anchor")
-    backend: str = Field("scopenet", description="scopenet | shading | depth-anything | depth-pro | files:FOLDER")
+    backend: str = Field(
+        "scopenet",
+        description="scopenet | shading | depth-anything | depth-pro | files:FOLDER | stereo (of input.stereo=use)",
+    )
     model: str = Field(
         "", description="weights of the network: hub id or folder, for scopenet a .onnx file; empty: the default"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast, get_args
 
 from pydantic import Field
 
@@ -13,6 +14,8 @@ Box = tuple[
     Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
 ]
 """Left, top, width and height, px."""
+
+_Layout = Literal["auto", "none", "left-right", "top-bottom"]
 
 
 class InputSettings(Settings):
@@ -30,9 +33,12 @@ class InputSettings(Settings):
         "of the first frames; auto: Depth Pro's where it is in use, else flow, or a trial of "
         "lenses, where one of these tells it",
     )
-    stereo: Literal["auto", "none", "left-right", "top-bottom"] = Field(
+    stereo: str = Field(
         "auto",
-        description="two views in one image, of which the left or upper is used; auto: detected in a video",
+        pattern=r"^(auto|none|left-right|top-bottom|use(:.+)?)$",
+        description="two views in one image (auto, which detects them, none, left-right, top-bottom), of which the "
+        "left or upper is used; use: depth is measured from both, with a calibration of the pair; "
+        "use:left-right, use:top-bottom, use:FILE (a second video or folder, of the right camera)",
     )
     deinterlace: bool = Field(False, description="use one field of each interlaced image, interpolate the missing rows")
     redact: tuple[Box, ...] = Field(
@@ -48,6 +54,22 @@ class InputSettings(Settings):
     )
     fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
     skip_duplicates: bool = Field(True, description="leave out images of a video that repeat the one before")
+
+    @property
+    def uses_both_views(self) -> bool:
+        """Whether depth is to be measured from two views."""
+        return self.stereo.partition(":")[0] == "use"
+
+    @property
+    def layout(self) -> _Layout:
+        """How two views are in one image."""
+        told = self.stereo.partition(":")[2] or "auto" if self.uses_both_views else self.stereo
+        return cast(_Layout, told if told in get_args(_Layout) else "none")
+
+    @property
+    def second_view(self) -> Path | None:
+        """The file or folder of the right view, None where it is in the same images or not used."""
+        return Path(self.stereo.partition(":")[2]) if self.uses_both_views and self.layout == "none" else None
 
 
 @dataclass(frozen=True)

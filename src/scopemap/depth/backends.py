@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.cameras.rectification import Rectifier
+from scopemap.cameras.rectification import Rectifier, StereoPair
 from scopemap.config import DepthSettings
 from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.depth.files import FilesDepth
 from scopemap.depth.shading import ShadingDepth
-from scopemap.errors import SettingsError
+from scopemap.depth.stereo import StereoDepth
+from scopemap.errors import CalibrationError, SettingsError
 
 _FILES = "files:"
 
@@ -23,17 +24,28 @@ def create_depth(
     *,
     calibrated: bool = True,
     averaged: bool = False,
+    pair: StereoPair | CalibrationError | None = None,
 ) -> DepthEstimator:
-    """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro, files:FOLDER.
+    """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro,
+    stereo, files:FOLDER.
 
     rectifier : from the camera that depth files show the view of to the working camera.
     device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
     depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
     averaged : whether ScopeNet may take three times as long, and err less.
+    pair : the cameras of both views that the frames carry, or why they are not known; None where they carry one.
 
-    Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing.
+    Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing,
+    `CalibrationError` where the cameras of both views are not known.
     """
+    if (pair is None) != (settings.backend != StereoDepth.name):
+        found = f"{'one view' if pair is None else 'two views'} and depth.backend={settings.backend}"
+        raise SettingsError(f"two views (--stereo use) and depth.backend=stereo go together, found {found}")
+    if isinstance(pair, CalibrationError):
+        raise pair
+    if pair is not None:
+        return StereoDepth(pair, rectifier.target)
     folder = files_folder(settings)
     if folder is not None:
         return FilesDepth(folder, rectifier, settings, depth_scale_mm)

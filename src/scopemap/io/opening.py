@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.cameras.formats.calibration import Calibration, fitted
+from scopemap.cameras.formats.pair import NEEDS_PAIR, read_pair
 from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.rectification import Rectifier, working_camera, working_size
+from scopemap.cameras.rectification import Rectifier, StereoPair, working_camera, working_size
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.colmap import ColmapFolder
@@ -87,8 +88,9 @@ def sequence_of(
     """Return the frames of a reader as `open_sequence` returns those of a path."""
     settings = settings or InputSettings()
     with _errors_of_the_system(reader.path):
-        source = prepared(reader, settings)
+        source = _prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
+    pair = _pair_of(source, camera, settings.camera_fit) if settings.uses_both_views else None
     size_source = "chosen" if size is None else "given (--size)"
     size = size or working_size(source.width, source.height, settings.longest_side_px)
     working = f"the working size {size[0]}x{size[1]} px"
@@ -113,13 +115,19 @@ def sequence_of(
         selection=frames or slice(None),
         depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
         choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
+        pair=pair,
     )
 
 
 def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
     """Return the frames of an input as in the file, one view and field by `settings`; raises `InputError`."""
     with _errors_of_the_system(path):
-        return prepared(_reader(Path(path), dataset), settings or InputSettings())
+        return _prepared(_reader(Path(path), dataset), settings or InputSettings())
+
+
+def _prepared(reader: Source, settings: InputSettings) -> Source:
+    second = settings.second_view
+    return prepared(reader, settings, None if second is None else _reader(second, None))
 
 
 @contextmanager
@@ -225,6 +233,19 @@ def _folders_in(path: Path) -> list[Path]:
         names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
     inner = (path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
     return sorted(i for i in inner if not (i.is_symlink() and path.resolve().is_relative_to(i.resolve())))
+
+
+def _pair_of(source: Source, file: Path | str | None, camera_fit: str) -> StereoPair | CalibrationError:
+    """Return the cameras of both views, of a file or of that beside the images, or why they are not known."""
+    beside = None if source.calibration is None else source.calibration.file
+    if (file or beside) is None:
+        return CalibrationError(NEEDS_PAIR)
+    try:
+        pair = read_pair(Path(file or beside or ""), (source.width, source.height), camera_fit)
+    except CalibrationError as fault:
+        return fault
+    source.notes.append(f"stereo: depth is measured from both views: {pair.source}")
+    return pair
 
 
 def _calibration_of(

@@ -37,14 +37,15 @@ _KEPT = (
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
-def prepared(source: Source, settings: InputSettings) -> Source:
+def prepared(source: Source, settings: InputSettings, second: Source | None = None) -> Source:
     """Return the source with boxes blackened, one view and one field per picture; the source itself where it is so.
 
     With `stereo` = auto, the packing is detected in videos and folders of images of no data set; a warning names
-    interlaced ones. Raises `InputError` where `stereo` names the views of a data set, whose reader defines them, and
-    for a box outside of the pictures.
+    interlaced ones. Both views are kept where they are used; `second` holds the right one where it is another file.
+    Raises `InputError` where `stereo` names the views of a data set, whose reader defines them, where there are no two
+    views to be used, and for a box outside of the pictures.
     """
-    if settings.stereo in _LEFT and source.name not in OF_UNKNOWN_VIEWS:
+    if (settings.layout in _LEFT or settings.uses_both_views) and source.name not in OF_UNKNOWN_VIEWS:
         defines = f"the reader of the data set '{source.name}' defines the view"
         raise InputError(f"reading {source.path}: {defines}; leave input.stereo={settings.stereo} (--stereo) out")
     for box in settings.redact:
@@ -59,16 +60,26 @@ def prepared(source: Source, settings: InputSettings) -> Source:
         source.warnings.append(Notice("input-interlaced"))
     if note:
         source.notes.append(note)
-    if packed is None and not (settings.deinterlace or settings.redact):
+    if second is not None:
+        _check_second(source, second)
+    elif settings.uses_both_views and packed is None:
+        remedy = "give use:left-right, use:top-bottom or use:FILE, the right camera's video or folder"
+        raise InputError(f"reading {source.path}: --stereo use finds no two views in its pictures; {remedy}")
+    if packed is None and second is None and not (settings.deinterlace or settings.redact):
         return source
-    return PreparedSource(source, packed, settings)
+    return PreparedSource(source, packed, settings, second)
 
 
 class PreparedSource(Source):
-    """A source of which a part of each picture is used, of the views `packed` the left eye's; None: one view."""
+    """A source of which a part of each picture is used, of the views `packed` the left eye's; None: one view.
 
-    def __init__(self, source: Source, packed: Packing | None, settings: InputSettings) -> None:
-        self._source, self.packed, self._settings = source, packed, settings
+    Frames carry the right eye's view, too, where the settings use it: that of `packed`, or of `second`.
+    """
+
+    def __init__(
+        self, source: Source, packed: Packing | None, settings: InputSettings, second: Source | None = None
+    ) -> None:
+        self._source, self.packed, self._settings, self._second = source, packed, settings, second
         super().__init__(source.path)
         for attribute in _KEPT:
             setattr(self, attribute, getattr(source, attribute))
@@ -93,10 +104,22 @@ class PreparedSource(Source):
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, each with what is used of its picture."""
+        others = iter(()) if self._second is None else self._second.frames(selection)
+        other = next(others, None)
         for frame in self._source.frames(selection):
-            rgb = redacted(frame.rgb, self._settings.redact)
-            rgb = deinterlaced(rgb) if self._settings.deinterlace else rgb
-            yield replace(frame, rgb=rgb if self.packed is None else self.packed.first(rgb))
+            while other is not None and other.index < frame.index:
+                other = next(others, None)
+            rgb, right = self._used(frame.rgb), None
+            if self.packed is not None:
+                rgb, right = self.packed.views(rgb)
+                right = right if self._settings.uses_both_views else None
+            elif other is not None and other.index == frame.index:
+                right = self._used(other.rgb)
+            yield replace(frame, rgb=rgb, second=right)
+
+    def _used(self, rgb: np.ndarray) -> np.ndarray:
+        rgb = redacted(rgb, self._settings.redact)
+        return deinterlaced(rgb) if self._settings.deinterlace else rgb
 
 
 def redacted(rgb: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray:
@@ -134,22 +157,35 @@ def sample_pictures(source: Source) -> list[np.ndarray]:
     return found
 
 
+def _check_second(source: Source, second: Source) -> None:
+    """Let `source` tell what is found in the right view; `InputError` where its pictures have another size."""
+    sizes = [f"{one.width}x{one.height} px" for one in (source, second)]
+    if sizes[0] != sizes[1]:
+        raise InputError(f"reading {second.path}: the right view's pictures are {sizes[1]}, the left one's {sizes[0]}")
+    source.notes.append(f"stereo: the right view is {second.path}, its frames paired by their numbers")
+    if source.count != second.count:
+        source.warnings.append(f"stereo: {source.count} frames of the left view, {second.count} of the right one")
+    second.warnings = source.warnings
+
+
 def _packing(source: Source, settings: InputSettings, samples: list[np.ndarray]) -> tuple[Packing | None, str]:
     """Return the stereo packing, None for one view, and a note about it or ""."""
     width, height, aspect = source.width, source.height, source.pixel_aspect
-    packed, why = None, "as asked"
-    if settings.stereo in ("left-right", "top-bottom"):
-        packed = Packing(settings.stereo, squeezed_views(width, height, settings.stereo, aspect), float("nan"))
-    elif settings.stereo == "auto" and (packed := packing(samples, aspect)) is not None:
+    packed, why, shape = None, "as asked", suspected(width, height, aspect)
+    if settings.layout in ("left-right", "top-bottom"):
+        packed = Packing(settings.layout, squeezed_views(width, height, settings.layout, aspect), float("nan"))
+    elif settings.layout == "auto" and (packed := packing(samples, aspect)) is not None:
         why = f"the halves correlate by {packed.correlation:.2f}; --stereo none (input.stereo) uses the whole picture"
+    elif settings.stereo == "use" and shape is not None:
+        packed, why = Packing(shape, squeezed_views(width, height, shape, aspect), float("nan")), "by their shape"
     if packed is not None:
         pixels = "twice as wide" if packed.layout == "left-right" else "half as wide"
         squeezed = f", of pixels that are {pixels} as the picture has them" if packed.squeezed else ""
-        return packed, f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is used{squeezed}: {why}"
-    layout = suspected(width, height, aspect) if settings.stereo == "auto" and samples else None
-    if layout is None:
+        use = "left view, the other one the right" if settings.uses_both_views else "used"
+        return packed, f"stereo, {packed.layout}: {_LEFT[packed.layout]} of each picture is {use}{squeezed}: {why}"
+    if shape is None or settings.layout != "auto" or not samples:
         return None, ""
     return None, (
-        f"stereo: pictures of {width}x{height} px have the shape of two views, {layout}, but their halves do not show "
-        f"the same; used as one view (--stereo {layout} uses {_LEFT[layout]})"
+        f"stereo: pictures of {width}x{height} px have the shape of two views, {shape}, but their halves do not show "
+        f"the same; used as one view (--stereo {shape} uses {_LEFT[shape]})"
     )

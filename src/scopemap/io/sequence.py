@@ -12,7 +12,7 @@ from typing import Literal
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.cameras.rectification import Rectifier, working_camera
+from scopemap.cameras.rectification import Rectifier, StereoPair, working_camera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.frame import Frame, Truth
 from scopemap.io.frame_choice import FrameChoice, SkippedFrame
@@ -40,6 +40,7 @@ class Sequence:
     depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
     focal_sigma_px : standard deviation of an estimated focal length at the working size, None where none is known.
     choice : which of the selected frames are left out.
+    pair : the cameras of both views that each frame carries, or why they are not known; None where it carries one.
     """
 
     source: Source
@@ -54,6 +55,7 @@ class Sequence:
     depth_scale_mm: float | None = None
     focal_sigma_px: float | None = None
     choice: FrameChoice = field(default_factory=FrameChoice)
+    pair: StereoPair | CalibrationError | None = None
 
     @property
     def name(self) -> str:
@@ -120,7 +122,8 @@ class Sequence:
         for item in self.choice(pictures):
             if item.index > after:
                 rgb, valid = self.rectifier.image(item.rgb), self.rectifier.valid
-                yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name)
+                views = None if item.second is None else (item.rgb, item.second)
+                yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name, views=views)
             found += 1
         if found < 2:
             skipped = "".join(f"; frame {frame.index} {frame.reason}" for frame in self.skipped[-1:])

@@ -27,13 +27,14 @@ class SourceFrame:
     """One image as it is in the file, not rectified.
 
     index : number of the frame in the input. time_s : time stamp, s. rgb : (h, w, 3) uint8, sRGB. name : the file's
-    own name, or "".
+    own name, or "". second : the right view where both views of a stereo pair are used, as `rgb`; or None.
     """
 
     index: int
     time_s: float
     rgb: np.ndarray
     name: str = ""
+    second: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

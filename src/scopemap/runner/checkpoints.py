@@ -120,6 +120,7 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
         "depth.model": config.depth.model,
         "depth.anchor_model": config.depth.anchor_model,
         "depth files": folder if kind == "files" else "",
+        "second view": config.input.second_view or "",
     }
     facts = {
         # What is too large to be recognised by its content is recognised by its place.
@@ -127,6 +128,7 @@ def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> d
         "frames": str(sequence.selection),
         "camera": f"{sequence.rectifier.source} at {sequence.camera.width}x{sequence.camera.height}",
         "tracker": type(tracker).__name__,
+        "pair": str(sequence.pair),
     }
     # Names of weights on a hub are no files: the hashes of theirs are pinned.
     facts |= {f"content of {name}": input_checksum(Path(file)) for name, file in own_files.items() if file}

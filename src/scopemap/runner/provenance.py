@@ -67,7 +67,11 @@ def notices_of_end(frames: FrameTable, interrupted_at: int | None, forgotten: in
 def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
     """Raise `InputError` where the result would replace what the run reads."""
     kind, _, folder = config.depth.backend.partition(":")
-    for source in [sequence.path, *([Path(folder)] if kind == "files" else [])]:
+    for source in [
+        sequence.path,
+        *([Path(folder)] if kind == "files" else []),
+        *filter(None, [config.input.second_view]),
+    ]:
         if source.resolve().is_relative_to(out.resolve()):
             raise InputError(f"cannot write a run to {out}: its input {source} is in it; name another folder")
 

@@ -67,9 +67,10 @@ class Packing:
         """Return (width, height) of one view, px, in pictures of that size."""
         return (width // 2, height) if self.layout == "left-right" else (width, height // 2)
 
-    def first(self, picture: np.ndarray) -> np.ndarray:
-        """Return the left eye's view (h, w, 3) of a picture."""
-        return np.ascontiguousarray(halves(picture, self.layout)[0])
+    def views(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the left and the right eye's view (h, w, 3) of a picture."""
+        left, right = halves(picture, self.layout)
+        return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
 def halves(picture: np.ndarray, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
