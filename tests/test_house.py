@@ -173,7 +173,7 @@ CEILINGS = {
     # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment.
     "core": (lambda: _total(MODULES), 29_890),
     "core, net": (lambda: _net(MODULES), 18_420),
-    "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
+    "bench": (lambda: _total(BENCH_MODULES), 11_095),  # 65 for phantoms on which the scale of depth drifts
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 30_540),  # those of both
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
