@@ -49,11 +49,11 @@ PHANTOMS = {
     "motion blur, H.264, lagging exposure, scattered light": ("--scene", "colon", *CAMERA),
     "abdominal wall seen sideways, 600 frames": (
         *("--scene", "abdominal_wall", "--frames", 600, "--set", "route=sideways", "--set", "fov_deg=65"),
-        *("--set", "texture=0.4", "--set", "indirect=0.3", "--set", "h264_crf=30", *EXPOSURE),
+        *("--set", "texture=0.6", "--set", "indirect=0.15", "--set", "h264_crf=30", *EXPOSURE),
     ),
     "withdrawal along a straight colon, 184 frames": (
         *("--scene", "colon", "--frames", 184, "--set", "route=withdrawal", "--set", "gloss=2"),
-        *("--set", "texture=0.15", "--set", "indirect=0.5", "--set", "h264_crf=34"),
+        *("--set", "texture=0", "--set", "indirect=0.8", "--set", "h264_crf=36", *EXPOSURE),
     ),
 }
 SIZE, EVERY, LENS_FRAMES = (320, 256), 4, 120
