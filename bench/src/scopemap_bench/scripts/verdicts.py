@@ -1,18 +1,16 @@
-"""Whether the report's word can be believed: results with truth, good or not by the word and by the error.
+"""Whether the report's word can be believed: results with truth, by their word and by their error.
 
     python -m scopemap_bench.scripts.verdicts [--out FOLDER] [--data DATA]
 
-A result is right where the camera path is off by at most 3 % of its length (RMSE of positions after a Sim(3) alignment
-over the true path's length) and the surface by at most 5 % of its distance: what a frame's depth says of each pixel,
-in the scale of the path, against the true point, both seen from the camera and turned to fit each other (a constant
-tilt of all cameras is no error of shape), median over pixels, then over frames. With --data also real clips. Where
---out has a result it is not made again.
+A result is right where the path is off by at most 3 % (RMSE of positions after a Sim(3) alignment over the length of
+the true path) and the surface by at most 5 %: distance between a pixel's point by the run's depth, in the path's scale,
+and the true one over its distance; both as the camera sees them, turned to fit each other, for a constant tilt of all
+cameras bends no shape; median over pixels, then over frames. --data adds real clips. Results in --out are kept.
 """
 
 from __future__ import annotations
 
 import subprocess
-from collections import defaultdict
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -21,10 +19,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import ScopemapError
+from scopemap.errors import AlignmentError
 from scopemap.evaluation.poses import match
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import read_reference
@@ -34,16 +31,13 @@ from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.datasets.c3vd import CAMERA
 from scopemap_bench.scripts import measuring, overview
 
-MOST_PATH_ERROR, MOST_SURFACE_ERROR = 0.03, 0.05
-WORLDS = tuple(product(("colon", "laparoscopy"), (31, 32)))
-LENS = PinholeCamera(160.0, 160.0, 159.5, 127.5, 320, 256)
-"""Of the phantoms."""
-DIFFICULT = {
+MOST_PATH, MOST_SURFACE = 0.03, 0.05
+Words = tuple[object, ...]
+SCENES, SEEDS = ("colon", "laparoscopy"), (31, 32)
+CODED = ("shutter=0.8", "h264_crf=30", "indirect=0.15", "auto_exposure=true", "exposure_lag_frames=4")
+DIFFICULT: dict[str, Words] = {
     "blur, smoke": ("--events", "blur:20-26,smoke:40-46"),
-    "motion blur, H.264, lagging exposure": (
-        *("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15"),
-        *("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4"),
-    ),
+    "motion blur, H.264, lagging exposure": tuple(word for setting in CODED for word in ("--set", setting)),
     "breathing": ("--deform", "--set", "breath_frames=60"),
     "fluid over the lens": ("--events", "fluid:20-40"),
     "faint texture": ("--set", "texture=0.25"),
@@ -51,12 +45,12 @@ DIFFICULT = {
 
 
 class Case(NamedTuple):
-    """A run: the row of the table, its name, the phantom or the folder that it reads, further words of the run."""
+    """A run: row of the table, name, words that draw its phantom or a folder, further words of the run."""
 
     group: str
     name: str
-    source: tuple[object, ...] | Path
-    words: tuple[object, ...] = ()
+    source: Words | Path
+    words: Words = ()
 
 
 class Outcome(NamedTuple):
@@ -64,63 +58,47 @@ class Outcome(NamedTuple):
 
     case: Case
     word: str
-    path: float
-    surface: float
-    reasons: str
+    path: float = np.inf
+    surface: float = np.inf
+    reasons: str = ""
 
     @property
-    def right(self) -> bool:
-        """Whether both errors are small."""
-        return self.path <= MOST_PATH_ERROR and self.surface <= MOST_SURFACE_ERROR
+    def kind(self) -> tuple[bool, bool]:
+        """Whether it is called Good, and whether it is right."""
+        return self.word == "good", self.path <= MOST_PATH and self.surface <= MOST_SURFACE
 
 
-def typed(lens: PinholeCamera) -> tuple[str, str]:
-    """Return the words that state a lens."""
-    return "--camera", f"{lens.fx} {lens.fy} {lens.cx} {lens.cy}"
+def drawn(scene: str, seed: int, *more: object) -> Words:
+    """Return the words that draw a phantom of 320x256 px."""
+    return ("--scene", scene, "--seed", seed, "--frames", 100 if seed == 34 else 60, *more)
 
 
-def phantom_cases(out: Path) -> list[Case]:
-    """Return the runs of phantoms; calibration files are written to `out`."""
-    found = []
-    for scene, seed in (*WORLDS, ("colon", 33), ("laparoscopy", 33), ("colon", 34), ("laparoscopy", 34)):
-        frames = 60 if seed < 34 else 100
-        found.append(
-            Case(f"{scene}, as it is", f"{scene}-{seed}", ("--scene", scene, "--seed", seed, "--frames", frames))
-        )
-    found += [Case("tube, no texture", f"tube-{n}", ("--scene", "tube", "--seed", n, "--frames", 60)) for n in (31, 32)]
-    small, large = LENS.cropped(-80, -64, 480, 384), LENS.resized(640, 512)
-    for name, lens in (("small", small), ("large", large)):
-        write_calibration(lens, out / f"{name}.yaml")
-    changes: list[tuple[str, str, tuple[object, ...]]] = [
-        ("scale stated three times too large", "scaled", ("--near-far", "40:250")),
-        *(
-            (f"focal length off by {percent} %", f"focal{sign * percent:+d}", typed(replace(LENS, fx=f, fy=f)))
-            for percent in (2, 5, 10, 20)
-            for sign in (1, -1)
-            for f in (160 * (1 + sign * percent / 100),)
-        ),
-        *(
-            (
-                f"principal point off by {percent} % of the width",
-                f"point{percent}-{x}-{y}",
-                typed(LENS.cropped(x, y, 320, 256)),
-            )
-            for percent, px in ((5, 16), (10, 32))
-            for x, y in ((px, 0), (-px, 0), (0, px))
-        ),
-        *(("another lens's field of view", f"fov{fov}", ("--fov", fov)) for fov in (60, 115)),
-        *(("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)),
-        ("calibration of another size", "small", ("--camera", out / "small.yaml", "--camera-fit", "scale")),
-        ("calibration of another size", "large", ("--camera", out / "large.yaml", "--camera-fit", "crop:0,0")),
-    ]
-    for (group, name, words), (scene, seed) in product(changes, WORLDS):
-        if seed == WORLDS[0][1] or name.startswith(("focal+5", "focal-5", "focal+10", "focal-10")):
-            found.append(
-                Case(group, f"{scene}-{seed}-{name}", ("--scene", scene, "--seed", seed, "--frames", 60), words)
-            )
-    for (name, more), (scene, seed) in product(DIFFICULT.items(), WORLDS[::2]):
-        words = ("--scene", scene, "--seed", seed + 10, "--frames", 60, *more)
-        found.append(Case(name, f"{scene}-{name.split()[0].strip(',')}", words))
+def stated(focal_px: float = 160.0, x: float = 159.5, y: float = 127.5) -> Words:
+    """Return the words that state a lens, px; that of the phantoms by default."""
+    return ("--camera", f"{focal_px} {focal_px} {x} {y}")
+
+
+def phantom_cases() -> list[Case]:
+    """Return the runs of phantoms."""
+    plain = [*product(SCENES, (*SEEDS, 33, 34)), *product(["tube"], SEEDS)]
+    found = [Case(f"{scene}, as it is", f"{scene}-{seed}", drawn(scene, seed)) for scene, seed in plain]
+    changes: list[tuple[str, str, Words]] = [("scale stated three times too large", "scaled", ("--near-far", "40:250"))]
+    for percent, sign in product((2, 5, 10, 20), (1, -1)):
+        lens = stated(160 * (1 + sign * percent / 100))
+        changes.append((f"focal length off by {percent} %", f"focal{sign * percent:+d}", lens))
+    for (percent, px), (right, down) in product(((5, 16), (10, 32)), ((1, 0), (-1, 0), (0, 1))):
+        x, y = px * right, px * down
+        group, lens = f"principal point off by {percent} % of the width", stated(x=159.5 - x, y=127.5 - y)
+        changes.append((group, f"point{percent}-{x}-{y}", lens))
+    changes += [("another lens's field of view", f"fov{fov}", ("--fov", fov)) for fov in (60, 115)]
+    changes += [("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)]
+    changes.append(("calibration of another size", "small", stated(160 / 1.5)))
+    changes.append(("calibration of another size", "large", stated(320, 319.5, 255.5)))
+    for (group, name, words), scene, seed in product(changes, SCENES, SEEDS):
+        if seed == SEEDS[0] or name in ("focal+5", "focal-5", "focal+10", "focal-10"):
+            found.append(Case(group, f"{scene}-{seed}-{name}", drawn(scene, seed), words))
+    for (name, words), scene in product(DIFFICULT.items(), SCENES):
+        found.append(Case(name, f"{scene}-{name.split()[0].strip(',')}", drawn(scene, 41, *words)))
     return found
 
 
@@ -131,36 +109,32 @@ def real_cases(data: Path, out: Path) -> list[Case]:
     found = [Case("C3VD cecum_t1_a, in parts", name, clip, words) for name, words in parts]
     for name, factor, shift in (("focal+10", 1.1, 0), ("focal-10", 0.9, 0), ("focal-20", 0.8, 0), ("point", 1, 135)):
         lens = replace(CAMERA, polynomial=tuple(factor * term for term in CAMERA.polynomial), cx=CAMERA.cx + shift)
-        write_calibration(lens, out / f"cecum-{name}.yaml")
-        words = ("--camera", out / f"cecum-{name}.yaml", *parts[0][1])
-        found.append(Case("C3VD, another lens stated", f"cecum-{name}", clip, words))
+        write_calibration(lens, file := out / f"cecum-{name}.yaml")
+        found.append(Case("C3VD, another lens stated", f"cecum-{name}", clip, ("--camera", file, *parts[0][1])))
     return found
 
 
 def surface_error(run: Path, truth: Path, scale: float) -> float:
-    """Return how far a run's depth, times `scale`, is from the true points, as a share of their distance (median).
-
-    Infinite where no frame has both.
-    """
+    """Return a run's surface error, a share; infinite without depth of both. scale : of the path to the true one."""
     folder, sequence, errors = RunFolder(run), open_sequence(truth), []
     camera, true_lens, file = folder.camera, sequence.source.camera, folder.source_camera_file
     assert true_lens is not None
     assert file is not None
     lens = read_calibration(file, (true_lens.width, true_lens.height)).camera
     pixels = sequence.camera.project(true_lens.unproject(lens.project(camera.rays))).astype(np.float32)
+    inside = set(folder.frames["index"][folder.frames.place == 0].tolist())
     for frame, true in sequence:
-        depth_mm = folder.depth.read(frame.index)
+        depth_mm = folder.depth.read(frame.index) if frame.index in inside else None
         if depth_mm is None or true is None or true.depth_mm is None:
             continue
         points = true.depth_mm[..., None] * sequence.camera.rays
         points = cv2.remap(points, pixels[..., 0], pixels[..., 1], cv2.INTER_NEAREST, borderValue=(np.nan,) * 3)
         both = np.isfinite(points).all(-1) & (depth_mm > 0)
-        ours, points = scale * depth_mm[both, None] * camera.rays[both], points[both]
-        distance = np.linalg.norm(points, axis=1, keepdims=True)
-        ours, points = ours / distance, points / distance
+        distance_mm = np.linalg.norm(points[both], axis=1, keepdims=True)
+        points, ours = points[both] / distance_mm, scale * depth_mm[both, None] * camera.rays[both] / distance_mm
         left, _, right = np.linalg.svd(points.T @ ours)
         R = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-        errors.append(float(np.median(np.linalg.norm(ours @ R.T - points, axis=1))))
+        errors.append(np.median(np.linalg.norm(ours @ R.T - points, axis=1)))
     return float(np.median(errors)) if errors else np.inf
 
 
@@ -168,20 +142,19 @@ def outcome(case: Case, out: Path) -> Outcome:
     """Draw, run and measure a case."""
     source = case.source
     if not isinstance(source, Path):
-        name = case.name if not case.words else "-".join(case.name.split("-")[:2])
+        name = "-".join(case.name.split("-")[:2])
         source = measuring.phantom(out / "phantoms" / name, *source)
     try:
         run = measuring.run_once(source, out / "runs" / case.name, *case.words)
     except subprocess.CalledProcessError:
-        return Outcome(case, "no result", np.inf, np.inf, "")
-    said = verdict(RunFolder(run))
+        return Outcome(case, "no result")
+    said, truth = verdict(RunFolder(run)), read_reference(source)
+    assert truth is not None
     reasons = ", ".join(reason.code for reason in said.reasons if reason.level in ("bad", "doubtful"))
-    reference = read_reference(source)
-    assert reference is not None
     try:
-        matched = match(read_trajectory(run), reference, "sim3")
-    except ScopemapError:
-        return Outcome(case, said.word, np.inf, np.inf, reasons)
+        matched = match(read_trajectory(run), truth, "sim3")
+    except AlignmentError:
+        return Outcome(case, said.word, reasons=reasons)
     true, ours = (T[matched.tracked, :3, 3] for T in (matched.reference, matched.aligned))
     length_mm = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
     path = float(np.sqrt(((ours - true) ** 2).sum(1).mean()) / length_mm)
@@ -190,20 +163,18 @@ def outcome(case: Case, out: Path) -> Outcome:
 
 def print_table(outcomes: list[Outcome]) -> None:
     """Print a row for each group, the two shares, and what was misjudged."""
-    groups = defaultdict(list)
-    for found in outcomes:
-        groups[found.case.group].append(found)
     measuring.print_head("what", "runs", "Good, right", "Good, wrong", "not Good, right", "not Good, wrong")
-    for group, some in (groups | {"all": outcomes}).items():
-        kinds = [sum((o.word == "good", o.right) == kind for o in some) for kind in product((True, False), repeat=2)]
-        measuring.print_row(group, len(some), *kinds)
-    good, wrong = [o for o in outcomes if o.word == "good"], [o for o in outcomes if not o.right]
-    print(f"\nOf those called Good {sum(o.right for o in good) / max(len(good), 1):.0%} are right (wanted: 95 %).")
-    caught = sum(o.word != "good" for o in wrong)
-    print(f"Of the wrong ones {caught / max(len(wrong), 1):.0%} are not called Good (wanted: 90 %).\n")
+    kinds = list(product((True, False), repeat=2))
+    for group in dict.fromkeys([o.case.group for o in outcomes] + ["all"]):
+        some = [o.kind for o in outcomes if group in (o.case.group, "all")]
+        measuring.print_row(group, len(some), *map(some.count, kinds))
+    good_right, good_wrong, _, other_wrong = map([o.kind for o in outcomes].count, kinds)
+    print(f"\nOf those called Good {good_right / max(good_right + good_wrong, 1):.0%} are right (wanted: 95 %).")
+    caught = other_wrong / max(good_wrong + other_wrong, 1)
+    print(f"Of the wrong ones {caught:.0%} are not called Good (wanted: 90 %).\n")
     measuring.print_head("misjudged", "word", "path off", "surface off", "reasons")
     for o in outcomes:
-        if (o.word == "good") != o.right:
+        if o.kind[0] != o.kind[1]:
             measuring.print_row(o.case.name, o.word, f"{o.path:.1%}", f"{o.surface:.1%}", o.reasons)
 
 
@@ -214,8 +185,8 @@ def main() -> None:
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as out:
         out.mkdir(parents=True, exist_ok=True)
-        listed = phantom_cases(out) + (real_cases(options.data, out) if options.data else [])
-        print_table([outcome(case, out) for case in listed])
+        cases = phantom_cases() + (real_cases(options.data, out) if options.data else [])
+        print_table([outcome(case, out) for case in cases])
 
 
 if __name__ == "__main__":
