@@ -122,6 +122,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
         (notices(Notice("input-interlaced")), "is interlaced"),
         (notices(Notice("camera-contradicted", {"change": -0.08})), "another focal length (-8%)"),
+        (notices(Notice("camera-off-centre", {"x": 0.1, "y": 0.0})), "another centre of the lens"),
         (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(adjusted(16, 3.1)), "by up to 3 degrees"),

@@ -55,6 +55,13 @@ KINDS: dict[str, _Kind] = {
         "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration",
         "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Check the calibration",
     ),
+    "camera-off-centre": _Kind(
+        "doubtful",
+        "mapping: the views ask for another principal point than the one used (by {x:+.0%} and {y:+.0%} of the focal "
+        "length); check the calibration, and whether the pictures were cut",
+        "The motion asks for another centre of the lens: shapes are skewed. Check the calibration, and whether the "
+        "pictures were cut after it",
+    ),
     "camera-at-rest": _Kind(
         "doubtful",
         "the camera is at rest while the tissue moves: errors of the path say little here",
