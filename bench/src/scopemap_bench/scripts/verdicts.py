@@ -90,7 +90,9 @@ def phantom_cases() -> list[Case]:
         x, y = px * right, px * down
         group, lens = f"principal point off by {percent} % of the width", stated(x=159.5 - x, y=127.5 - y)
         changes.append((group, f"point{percent}-{x}-{y}", lens))
-    changes += [("another lens's field of view", f"fov{fov}", ("--fov", fov)) for fov in (60, 115)]
+    for view_deg in (60, 115):
+        lens = stated(160 / np.tan(np.radians(view_deg / 2)))
+        changes.append(("another lens's field of view", f"view{view_deg}", lens))
     changes += [("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)]
     changes.append(("calibration of another size", "small", stated(160 / 1.5)))
     changes.append(("calibration of another size", "large", stated(320, 319.5, 255.5)))
