@@ -49,7 +49,7 @@ WINDOW = 300
 # Prior standard deviations of ln f, of the distortion, which is held, and of the principal point over f.
 _RESIDUAL_SIGMA = np.array([0.3, 1e-4, 0.2, 0.2])
 _RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
-_SIGNIFICANT = 3.0
+_SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
@@ -143,7 +143,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
 def lens_residual(problem: BundleProblem, found: BundleSolution) -> tuple[float, float, float]:
     """Return what the observations ask of the lens, all else adjusted with it: changes of ln f, of cx and cy over f.
 
-    0 where it does not differ from the lens used by three standard deviations; NaN where it is undetermined, and with
+    0 where it does not differ from the lens used by five standard deviations; NaN where it is undetermined, and with
     more keyframes than are adjusted at once.
     """
     undetermined = (np.nan, np.nan, np.nan)
