@@ -170,14 +170,14 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 25 lines for the principal point, which the views are asked for beside the focal length.
-    "core": (lambda: _total(MODULES), 29_915),
-    "core, net": (lambda: _net(MODULES), 18_445),
+    # 50 lines for the principal point, which the views are asked for, too, and for what they do not tell of the lens.
+    "core": (lambda: _total(MODULES), 29_940),
+    "core, net": (lambda: _net(MODULES), 18_460),
     "bench": (lambda: _total(BENCH_MODULES), 11_230),  # 200 for the table of verdicts against errors
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 30_620),  # those of both; 80 for the table of verdicts
+    "tests": (lambda: _total(TESTS), 30_625),  # those of both; 80 for the table of verdicts
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_970),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_990),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 45),
 }

@@ -127,6 +127,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(adjusted(16, 3.1)), "by up to 3 degrees"),
         (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in 3 of 6 keyframes only"),
+        (notices(Notice("mapping-without-observations", {"keyframes": 1})), "no other view confirms"),
         (notices(adjusted(100, 6.1)), "by up to 6 degrees"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],

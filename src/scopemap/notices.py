@@ -64,6 +64,12 @@ KINDS: dict[str, _Kind] = {
         "The motion asks for another centre of the lens: shapes are skewed. Check the calibration, and whether the "
         "pictures were cut after it; if it is right, the tissue moves",
     ),
+    "camera-unconfirmed": _Kind(
+        "note",
+        "mapping: the views do not tell the focal length (standard deviation {sigma:.0%}): nothing but the calibration "
+        "supports it",
+        "The motion does not tell the focal length: were the calibration wrong, this result would not show it",
+    ),
     "camera-at-rest": _Kind(
         "doubtful",
         "the camera is at rest while the tissue moves: errors of the path say little here",

@@ -71,6 +71,18 @@ class BundleSolution(NamedTuple):
         return self.state.sigma_px
 
 
+class LensResidual(NamedTuple):
+    """What the observations ask of the lens: changes of ln f, and of cx and cy over f; NaN: undetermined.
+
+    A change is 0 where it is not significant. sigma : standard deviation of ln f.
+    """
+
+    log_focal: float = float("nan")
+    x: float = float("nan")
+    y: float = float("nan")
+    sigma: float = float("nan")
+
+
 def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
     """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`."""
     start, count = problem.begin, len(problem.T_camera_world)
@@ -140,27 +152,26 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
-def lens_residual(problem: BundleProblem, found: BundleSolution) -> tuple[float, float, float]:
-    """Return what the observations ask of the lens, all else adjusted with it: changes of ln f, of cx and cy over f.
+def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual:
+    """Return what the observations ask of the lens, all else adjusted with it.
 
-    0 where it does not differ from the lens used by five standard deviations; NaN where it is undetermined, and with
-    more keyframes than are adjusted at once.
+    Changes are significant from five standard deviations; all is NaN where it is undetermined, and with more keyframes
+    than are adjusted at once.
     """
-    undetermined = (np.nan, np.nan, np.nan)
     if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
-        return undetermined
+        return LensResidual()
     unit = np.array([1.0, 1.0, problem.focal_px, problem.focal_px])
     points = replace(problem.points, sigma=_RESIDUAL_DEPTH * problem.points.sigma)
     lens = UnknownLens(problem.focal_px, _RESIDUAL_SIGMA * unit)
     free = replace(problem, start=found.state, points=points, lens=lens)
-    state = adjust(free).state
+    state = adjust(free, max_iterations=40, min_decrease=1e-4).state  # a wrong lens may be far away
     try:
         covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)
     except np.linalg.LinAlgError:
-        return undetermined
+        return LensResidual()
     change, deviation = (state.lens - problem.tracked.lens) / unit, np.sqrt(np.diag(covariance)[-4:]) / unit
     log_focal, _, x, y = np.where(np.abs(change) > _SIGNIFICANT * deviation, change, 0.0).tolist()
-    return log_focal, x, y
+    return LensResidual(log_focal, x, y, float(deviation[0]))
 
 
 def errors_px(problem: BundleProblem, state: State) -> np.ndarray:

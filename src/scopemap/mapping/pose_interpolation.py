@@ -11,12 +11,15 @@ import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.mapping.bundle_adjustment import LensResidual
 from scopemap.mapping.depth_correction import DepthCorrectionField
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
 _FOCAL_CHANGE = 0.03
 """Of ln f, above which the views contradict the lens; a focal length off by 2 % bends little."""
+_FOCAL_SIGMA = 0.05
+"""Of ln f, above which the views say too little of the lens to confirm it."""
 _POINT_CHANGE = 0.05
 """Of the principal point over f: right lenses up to 0.03, one off by 5 % of the width 0.09 and more."""
 
@@ -44,7 +47,7 @@ class FrameCorrection:
     None where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's
     depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked :
     poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
-    lens_residual : what the observations ask of the lens, ln f, cx and cy over f, as `bundle_adjustment.lens_residual`.
+    lens_residual : what the observations ask of the lens.
     """
 
     index: np.ndarray
@@ -57,17 +60,19 @@ class FrameCorrection:
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
-    lens_residual: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    lens_residual: LensResidual = field(default_factory=LensResidual)
 
     @property
     def notices(self) -> list[Notice]:
         """What was adjusted and how well it fits, or why nothing was; and whether the views ask for another lens."""
-        log_focal, x, y = self.lens_residual
+        log_focal, x, y, sigma = self.lens_residual
         found = [self.notice]
         if abs(log_focal) > _FOCAL_CHANGE:
             found.append(Notice("camera-contradicted", {"change": math.expm1(log_focal)}))
         if math.hypot(x, y) > _POINT_CHANGE:
             found.append(Notice("camera-off-centre", {"x": x, "y": y}))
+        if sigma > _FOCAL_SIGMA:
+            found.append(Notice("camera-unconfirmed", {"sigma": sigma}))
         return found
 
     @property
